@@ -249,7 +249,10 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "Robot.from_urdf_text": (
         _robot_from,
-        lambda: {"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None, "inertias": "strict"},
+        lambda: {
+            **{"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None},
+            **{"inertias": "strict", "base": None, "root": None, "strict": False},
+        },
     ),
     "Robot.from_urdf": (forcegp.Robot.from_urdf, lambda: {"path": INPUTS.folder / "arm.urdf"}),
     "inverse_dynamics": (

@@ -77,7 +77,9 @@ class AnalyticalIdentification(Summary):
     @property
     def units(self) -> dict[str, str]:
         """By name."""
-        of_bodies = dict(zip(parameter_names(self.given.robot), UNITS * self.given.robot.nv, strict=True))
+        of_bodies = dict(
+            zip(parameter_names(self.given.robot), UNITS * len(self.given.robot.layout.bodies), strict=True)
+        )
         return of_bodies | {
             f"{field.name}.{joint.name}": _unit(field.unit, joint.type == "prismatic")
             for field in self.terms.fields

@@ -125,7 +125,7 @@ class Auto(Resuming, Import):
         content |= {"cpu_seconds": time.process_time() - begin}
         write_json(self.out / "payload.json", {} if payload is None else payload.to_dict())
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
-        write_text(self.out / "identified.urdf", identified.system.robot.to_urdf())
+        identified.system.robot.to_urdf(self.out / "identified.urdf")
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
         table = Table.grid(padding=(0, 2))
         table.add_column(style="bold", no_wrap=True)

@@ -120,7 +120,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
         write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
-            (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))
+            identified.robot.to_urdf(folder / "identified.urdf")
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*tables, *_report_of_regression(command, found, content, identified))
@@ -273,8 +273,7 @@ class Identify(IdentifyOptions):
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
         identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
-        urdf = posterior.system.robot.to_urdf()
-        self._write(posterior, {"identification.json": identification, "identified.urdf": urdf})
+        self._write(posterior, {"identification.json": identification}, posterior.system.robot)
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:

@@ -43,6 +43,7 @@ COMMANDS: Mapping[str, str] = {
     "demo": "simulate, learn, evaluate and draw, in a minute",
     "simulate": "make a dataset with ground truth",
     "import": "make a dataset from logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot",
+    "robot": "show a robot file: tree, limits, masses, repairs, and a picture",
     "check": "find mistakes in a log, with the correction of each",
     "prepare": "filter and differentiate a raw log, and report the signal lost",
     "fit": "learn the unknown forces from a dataset",

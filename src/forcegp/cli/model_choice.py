@@ -38,13 +38,20 @@ class FitOptions(LearningOptions):
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder to write."""
 
-    def _write(self, posterior: forcegp.models.Posterior, more: Mapping[str, str] | None = None) -> None:
-        """The model, `more` files by name with their text, and how it was made."""
+    def _write(
+        self,
+        posterior: forcegp.models.Posterior,
+        more: Mapping[str, str] | None = None,
+        identified: forcegp.Robot | None = None,
+    ) -> None:
+        """The model, `more` files by name with their text, the URDF of a robot, and how it was made."""
         content = {**self._given(), "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
             for name, text in (more or {}).items():
                 (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
+            if identified is not None:
+                identified.to_urdf(folder / "identified.urdf")
 
 
 @dataclass(frozen=True, kw_only=True)

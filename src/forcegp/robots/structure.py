@@ -11,9 +11,11 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.arguments import Inertials, checked_tensor
+from forcegp.robots.base import BaseChoice
 from forcegp.robots.inertia import log_cholesky_of_link
-from forcegp.robots.layout import WORLD, Layout, Tree, merged_inertias
-from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
+from forcegp.robots.layout import WORLD, Layout
+from forcegp.robots.tree import Tree, merged_inertias
+from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
@@ -73,6 +75,8 @@ class RobotStructure(Summary):
     urdf_text: str
     _locked: tuple[tuple[str, float], ...]
     _frames: dict[str, tuple[int, Tensor]]
+    base: BaseChoice = "fixed"
+    """How the root link is held."""
 
     @property
     def name(self) -> str:
@@ -86,14 +90,20 @@ class RobotStructure(Summary):
 
     @property
     def nv(self) -> int:
-        """Number of movable joints."""
+        """Number of coordinates: of the movable joints that mimic none."""
         return len(self.layout.joints)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """Movable joints in the order of q."""
+        """Movable joints in the order of q, without those that mimic one."""
         names = [field.name for field in fields(Joint)]
         return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
+
+    @property
+    def all_joints(self) -> tuple[JointDescription, ...]:
+        """Every joint of the file, fixed ones included, parents before children."""
+        places = {name: place for place, name in enumerate(self.layout.links)}
+        return tuple(sorted(self.description.joints, key=lambda joint: places[joint.child]))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -134,7 +144,7 @@ class RobotStructure(Summary):
         """One link by name."""
         require_known("link", name, self.name, self.layout.links, UnknownLink)
         body = self.layout.links[name].body
-        joint = None if body == WORLD else self.joint_names[body]
+        joint = None if body == WORLD else self.layout.bodies[body].name
         inertial = self.description.links[name] or MASSLESS
         rows = tuple(tuple(row) for row in inertial.inertia.tolist())
         return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
@@ -174,7 +184,7 @@ class RobotStructure(Summary):
         """``value`` in float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv) on the robot's device."""
         return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
 
-    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
+    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "bodies 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
         return merged_inertias(self.tree, self.layout, self.checked_inertials(inertials))
 
