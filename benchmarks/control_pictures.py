@@ -5,45 +5,83 @@ python -m benchmarks.control_pictures
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 import forcegp
 from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
 from benchmarks.excitation import LIMITS, Learner
-from benchmarks.tracking import GAINS, MIDDLE, RATE, controllers, excitation, followed, robot_of, rows_of, task_of
+from benchmarks.tracking import (
+    CONFIG,
+    GAINS,
+    MIDDLE,
+    RATE,
+    controllers,
+    error,
+    excitation,
+    fits,
+    followed,
+    robot_of,
+    rows_of,
+    task_of,
+)
 from forcegp import MechanicalSystem, PDGravity, Robot
 from forcegp.evaluation import contacts_figure, excitation_figure
-from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SERIES, SMALL, TRUTH, new_figure, quiet, save_figure
+from forcegp.evaluation.plots.style import (
+    IDENTIFIED,
+    KNOWN_PHYSICS,
+    MEASUREMENT,
+    PREDICTION,
+    QUANTILE,
+    SMALL,
+    TRUTH,
+    draw_band,
+    legend_below,
+    new_figure,
+    quiet,
+    save_figure,
+)
+from forcegp.models import StructuredPosterior
+from forcegp.simulation.joint_friction import JointFrictionLaw
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
 SEED, SECONDS, FRAMES_PER_SECOND = 1, 10.0, 12
 SHOWN = ("URDF", "learned")
+COLORS = {
+    "PD + gravity": MEASUREMENT,
+    "URDF": KNOWN_PHYSICS,
+    "Coulomb's and viscous friction": IDENTIFIED,
+    "learned": PREDICTION,
+    "true model": TRUTH,
+}
 
 
-def motions() -> tuple[Robot, dict[str, dict[str, np.ndarray]]]:
-    """Controller -> what the arm did."""
+def motions() -> tuple[Robot, StructuredPosterior, dict[str, dict[str, np.ndarray]]]:
+    """The arm, the model that learned, and controller -> what the arm did."""
     robot = robot_of()
     given, task = MechanicalSystem(robot), task_of(SEED)
     rows = rows_of(followed(robot, excitation(SEED), PDGravity(robot.compile(), **GAINS), 20.0), given, SEED)
     found = controllers(rows, given, robot, SEED)
-    return robot, {name: followed(robot, task, control, SECONDS) for name, control in found.items()}
+    done = {name: followed(robot, task, control, SECONDS) for name, control in found.items()}
+    return robot, fits(rows, given, SEED)["learned"], done
 
 
 def errors(done: dict[str, dict[str, np.ndarray]]) -> Figure:
     """Root mean square over the joints, over time."""
     figure = new_figure(8.0, 3.4)
     axes = figure.subplots()
-    colors = dict(zip(done, (MEASUREMENT, SERIES[1], SERIES[2], PREDICTION, TRUTH), strict=True))
     for name, motion in done.items():
         time = np.arange(len(motion["e"])) / RATE
         size = 1e3 * np.sqrt(np.mean(motion["e"] ** 2, axis=1))
         style = "--" if name == "true model" else "-"
-        axes.semilogy(time, np.maximum(size, 1e-2), style, color=colors[name], linewidth=1.4, label=name)
+        axes.semilogy(time, np.maximum(size, 1e-2), style, color=COLORS[name], linewidth=1.4, label=name)
     axes.set_ylim(0.1, 400.0)
     quiet(
         axes,
@@ -62,35 +100,101 @@ def links(robot: Robot, q: np.ndarray) -> np.ndarray:
     return torch.stack([kinematics.frame_pose(name)[..., :3, 3] for name in names], dim=1).numpy()
 
 
-def film(robot: Robot, done: dict[str, dict[str, np.ndarray]]) -> FuncAnimation:
-    """The arm under two controllers, beside the reference in grey."""
-    figure = new_figure(7.2, 3.6)
-    every = slice(None, None, RATE // FRAMES_PER_SECOND)
-    drawn = {}
-    for place, name in enumerate(SHOWN):
-        motion = done[name]
-        axes = figure.add_subplot(1, 2, place + 1, projection="3d")
-        arm, wanted = (links(robot, q[every]) for q in (motion["q"], motion["q"] + motion["e"]))
-        for values, color, width in ((wanted, "0.75", 6.0), (arm, SERIES[1] if name == "URDF" else PREDICTION, 2.5)):
-            (line,) = axes.plot(*values[0].T, "o-", color=color, linewidth=width, markersize=0.8 * width)
-            (trace,) = axes.plot(*values[:1, -1].T, color=color, linewidth=0.4 * width)
-            drawn[line, trace] = values
-        middle = np.concatenate([arm, wanted]).reshape(-1, 3)
-        low, high = middle.min(0), middle.max(0)
-        axes.set_box_aspect(high - low, zoom=1.55)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        axes.set_axis_off()
-        axes.view_init(elev=18, azim=-60)
-        error = 1e3 * float(np.sqrt(np.mean(motion["e"][RATE:] ** 2)))
-        axes.set_title(f"computed torque, {name}: {error:.3g} mrad", fontsize=SMALL, color=TRUTH)
+CURVES = (0, 1, 3)
+"""Joints whose friction is drawn beside the arms: those with the largest."""
+ARROW = 0.06
+"""Metres that stand for 1 Nm of learned friction, along the axis of its joint."""
+PALETTE, PIXELS = 64, 100
 
-    def draw(frame: int) -> list[object]:
+
+def film(robot: Robot, model: StructuredPosterior, done: dict[str, dict[str, np.ndarray]]) -> list[Image.Image]:
+    """The arm under two controllers, the reference in grey; learned friction as arrows, and as curves with bands."""
+    figure = new_figure(7.6, 4.5)
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
+    arms, below = halves
+    every = slice(None, None, RATE // FRAMES_PER_SECOND)
+    moving: list[Callable[[int], None]] = []
+    axes: Any = None
+    for place, name in enumerate(SHOWN):
+        axes = arms.add_subplot(1, 2, place + 1, projection="3d")
+        moving += draw_arm(axes, robot, done[name], name, every)
+    learned = done["learned"]
+    friction = model.predict(*(torch.tensor(learned[x][every]) for x in "qvu")).unknown_force
+    assert friction is not None, "models of joint friction predict it"
+    force = friction.mean.numpy()
+    moving += draw_arrows(axes, robot, learned["q"][every], force)
+    for axes, joint in zip(below.subplots(1, len(CURVES)), CURVES, strict=True):
+        moving.append(draw_friction(axes, robot, model, joint, learned["v"][every, joint]))
+    legend_below(below, axes)
+    frames = []
+    for frame in range(len(force)):
+        for move in moving:
+            move(frame)
+        canvas: Any = figure.canvas
+        canvas.draw()
+        shown = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        width, height = (round(size * PIXELS) for size in figure.get_size_inches())
+        frames.append(shown.resize((width, height), Image.Resampling.LANCZOS))
+    palette = frames[len(frames) // 2].quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=3)
+    return [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+
+
+def draw_arm(
+    axes: Any, robot: Robot, motion: dict[str, np.ndarray], name: str, every: slice
+) -> list[Callable[[int], None]]:
+    """The arm above its reference, each with the trace of its tool; returns what moves them."""
+    arm, wanted = (links(robot, q[every]) for q in (motion["q"], motion["q"] + motion["e"]))
+    drawn = {}
+    for values, color, width in ((wanted, "0.75", 6.0), (arm, COLORS[name], 2.5)):
+        (line,) = axes.plot(*values[0].T, "o-", color=color, linewidth=width, markersize=0.8 * width)
+        (trace,) = axes.plot(*values[:1, -1].T, color=color, linewidth=0.4 * width)
+        drawn[line, trace] = values
+    both = np.concatenate([arm, wanted]).reshape(-1, 3)
+    low, high = both.min(0), both.max(0)
+    axes.set_box_aspect(high - low, zoom=1.5)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_axis_off()
+    axes.view_init(elev=18, azim=-60)
+    axes.set_title(f"computed torque, {name}: {error(motion):.3g} mrad", fontsize=SMALL, color=TRUTH, y=0.97)
+
+    def move(frame: int) -> None:
         for (line, trace), values in drawn.items():
             line.set_data_3d(*values[frame].T)
             trace.set_data_3d(*values[max(0, frame - 20) : frame + 1, -1].T)
-        return [artist for pair in drawn for artist in pair]
 
-    return FuncAnimation(figure, draw, frames=len(next(iter(drawn.values()))))
+    return [move]
+
+
+def draw_arrows(axes: Any, robot: Robot, q: np.ndarray, force: np.ndarray) -> list[Callable[[int], None]]:
+    """The learned torque of every joint as a line along its axis, from the place of the joint."""
+    kinematics = robot.kinematics(torch.tensor(q))
+    moving = []
+    for j, joint in enumerate(robot.joints):
+        pose = kinematics.frame_pose(joint.child).numpy()
+        along = pose[:, :3, :3] @ np.asarray(joint.axis)
+        ends = np.stack([pose[:, :3, 3], pose[:, :3, 3] + ARROW * force[:, j, None] * along], axis=1)
+        (line,) = axes.plot(*ends[0].T, color=IDENTIFIED, linewidth=3.0, solid_capstyle="butt", zorder=10)
+        moving.append(lambda frame, line=line, ends=ends: line.set_data_3d(*ends[frame].T))
+    return moving
+
+
+def draw_friction(
+    axes: Axes, robot: Robot, model: StructuredPosterior, joint: int, velocity: np.ndarray
+) -> Callable[[int], None]:
+    """The learned friction of a joint over its velocity with its 95 % interval, and a dot where the joint is now."""
+    name = robot.joint_names[joint]
+    seen = model.training.v[:, joint].abs().max().item()
+    v = np.linspace(-1.3, 1.3, 241) * seen  # beyond what was seen, where intervals widen
+    curve, now = model.curve(name, v), model.curve(name, velocity).mean.numpy()
+    mean, half = curve.mean.numpy(), QUANTILE * curve.std.numpy()
+    law = np.zeros((len(v), robot.nv))
+    law[:, joint] = v
+    axes.plot(v, JointFrictionLaw(CONFIG).curve(law)[:, joint], color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
+    draw_band(axes, v, mean, half, alpha=0.4, label="95 % interval")
+    axes.plot(v, mean, color=PREDICTION, linewidth=1.2, label="learned friction (green on the arm)")
+    (dot,) = axes.plot(velocity[:1], now[:1], "o", color=IDENTIFIED, markersize=6.0, zorder=5)
+    quiet(axes, title=f"joint {joint + 1}", x="velocity [rad/s]", y="torque [Nm]" if joint == CURVES[0] else "")
+    return lambda frame: dot.set_data(velocity[frame : frame + 1], now[frame : frame + 1])
 
 
 def contacts() -> tuple[Figure, Figure]:
@@ -106,7 +210,8 @@ def contacts() -> tuple[Figure, Figure]:
     curves = new_figure(6.4, 3.6)
     axes = curves.subplots()
     period, window = round(EVERY * RATE), round(LASTING * RATE)
-    for color, (name, each) in zip((MEASUREMENT, SERIES[1], PREDICTION, TRUTH), made.items(), strict=False):
+    for name in (name for name in COLORS if name in made):
+        each = made[name]
         free = each.run(*qvu(found["free"])).distance.numpy()
         pushed = each.run(*qvu(found["3 N"])).distance.numpy()
         largest = pushed[: len(pushed) // period * period].reshape(-1, period)[:, : window + 1].max(axis=1)
@@ -115,7 +220,7 @@ def contacts() -> tuple[Figure, Figure]:
         rate = [3600.0 * (blocks > limit).mean() for limit in limits]
         share = [(largest > limit).mean() for limit in limits]
         style = "--" if name == "true model" else "-"
-        axes.plot(np.maximum(rate, 6.0), share, style, color=color, linewidth=1.6, label=name)
+        axes.plot(np.maximum(rate, 6.0), share, style, color=COLORS[name], linewidth=1.6, label=name)
     axes.set(xscale="log", xlim=(6.0, 3600.0), ylim=(0.0, 1.02))
     quiet(
         axes,
@@ -132,9 +237,11 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     for name, figure in zip(("monitor", "monitor-rates"), contacts(), strict=True):
         save_figure(figure, FOLDER / f"{name}.png")
-    arm, found = motions()
+    arm, model, found = motions()
     save_figure(errors(found), FOLDER / "tracking.png")
-    film(arm, found).save(FOLDER / "tracking.gif", PillowWriter(fps=FRAMES_PER_SECOND), dpi=80)
+    first, *others = film(arm, model, found)
+    more = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0, "optimize": True}
+    first.save(FOLDER / "tracking.gif", save_all=True, append_images=others, **more)
     learner = Learner(SEED)
     chosen = forcegp.excitation(learner.before, limits=LIMITS, start=MIDDLE, task=learner.task, seed=SEED)
     save_figure(excitation_figure(chosen), FOLDER / "excitation.png")

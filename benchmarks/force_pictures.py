@@ -52,10 +52,10 @@ from forcegp.evaluation.plots.style import (
     MEASUREMENT,
     NORMAL,
     PREDICTION,
-    SERIES,
     TRUTH,
     new_figure,
     quiet,
+    speed_colors,
     window,
 )
 from forcegp.priors.contact_friction import ExpectedFriction
@@ -101,7 +101,7 @@ def joint_forces() -> Any:
     seconds = torch.tensor(test.time - test.time[0])[:, None]
     drawn = _Line(seconds, force.mean[:, joint], force.std[:, joint])
     draw_curve(left, drawn, lambda _: torch.tensor(test.truth["Q_U"][:, joint]))
-    quiet(left, title="KUKA, joint 1: unknown torque, 100 points", x="time in s", y="torque in Nm")
+    quiet(left, title="KUKA, joint 1: unknown torque, 100 points", x="time [s]", y="torque [Nm]")
 
     def torque(q: torch.Tensor) -> torch.Tensor:
         return 2.0 * torch.sin(q) + 0.8 * torch.cos(2.0 * q)
@@ -114,7 +114,7 @@ def joint_forces() -> Any:
         draw_curve(axes, _Line(turn, there.mean[:, 0], there.std[:, 0]), torque, rows.q[:, 0])
         axes.set_xticks([-math.pi, 0.0, math.pi, 2.0 * math.pi, 3.0 * math.pi], ["−π", "0", "π", "2π", "3π"])
         axes.set_ylim(-4.5, 4.5)
-        quiet(axes, title=f"turntable, angles={angles}", x="joint position in rad", y="torque in Nm")
+        quiet(axes, title=f"turntable, angles={angles}", x="joint position [rad]", y="torque [Nm]")
     return finish(figure, left, *right)
 
 
@@ -137,7 +137,7 @@ def tool_forces() -> Any:
     features = torch.stack([speed, torch.zeros_like(speed)], -1)
     curve = plain.curve("force-tangent-1", features)
     draw_curve(left, curve, lambda v: -v, visited(plain, 0))
-    quiet(left, title="tool-friction, 20 points", x="velocity along tangent-1 in m/s", y="force along tangent-1 in N")
+    quiet(left, title="tool-friction, 20 points", x="velocity along tangent-1 [m/s]", y="force along tangent-1 [N]")
     tangents, visited_x = plane_of(posterior)
     x, place = across_the_strip()
     one_along = torch.tensor([1.0, 0.0], dtype=F64).expand(len(x), 2)
@@ -146,8 +146,8 @@ def tool_forces() -> Any:
     quiet(
         right,
         title="tool-forces across a rough strip, 300 points",
-        x="place x in m",
-        y="force at 1 m/s in N",
+        x="position x [m]",
+        y="force at 1 m/s [N]",
     )
     return finish(figure, left, right)
 
@@ -163,14 +163,14 @@ def contact_friction() -> Any:
     isotropic = ContactFriction()
     posterior = fitted(with_force(recording(1), isotropic, stribeck(4.0)), isotropic, 100)
     draw_curve(one, posterior.curve("sliding"), stribeck(4.0), visited(posterior, 0))
-    quiet(one, title="axes=isotropic: one curve, 100 points", x="sliding speed in m/s", y="force in N")
+    quiet(one, title="axes=isotropic: one curve, 100 points", x="sliding speed [m/s]", y="force [N]")
 
     grain = ContactFriction(axes="two-axis")
     posterior = fitted(with_force(recording(1), grain, stribeck(4.0), stribeck(2.0)), grain, 100)
     for name, level in (("tangent-1", 4.0), ("tangent-2", 2.0)):
         draw_curve(two, posterior.curve(name), stribeck(level))
         two.annotate(name, (0.5, level), (0.6, level - 1.0), fontsize=NORMAL, color=TRUTH)
-    quiet(two, title="axes=two-axis: a grain, 100 points", x="velocity along the tangent in m/s", y="force in N")
+    quiet(two, title="axes=two-axis: a grain, 100 points", x="velocity along the tangent [m/s]", y="force [N]")
 
     data = recording(1, friction="stribeck")
     config = KukaSurfaceConfig(friction="stribeck")
@@ -187,7 +187,7 @@ def contact_friction() -> Any:
         nominal.features[:, 0], nominal.mean, color=KNOWN_PHYSICS, linewidth=1.2, label="without load refinement"
     )
     three.set_ylim(0.0, 0.55)
-    quiet(three, title="load=true: a coefficient, 60 points", x="sliding speed in m/s", y="friction / normal force")
+    quiet(three, title="load=true: a coefficient, 60 points", x="sliding speed [m/s]", y="friction / normal force")
     return finish(figure, one, two, three)
 
 
@@ -207,7 +207,7 @@ def joint_ripple() -> Any:
         at = visited(posterior, index)
         curve = posterior.curve(joint, torch.linspace(at.min() - 0.8, at.max() + 0.8, 400, dtype=F64))
         draw_curve(axes, curve, cogging, at)
-        quiet(axes, title=f"joint {joint[-1]}, 25 points", x="joint position in rad", y="torque in Nm")
+        quiet(axes, title=f"joint {joint[-1]}, 25 points", x="joint position [rad]", y="torque [Nm]")
     return finish(figure, *grid)
 
 
@@ -232,16 +232,16 @@ def payload() -> Any:
     )
     left.set_xticks(range(len(counts)), [str(count) for count in counts])
     left.set_ylim(1.4, 1.6)
-    quiet(left, title="mass of the load", x="training points", y="mass in kg")
+    quiet(left, title="mass of the load", x="training points", y="mass [kg]")
     for axis in range(3):
         right.plot([-0.3 + axis, 0.3 + axis], [100.0 * place[axis]] * 2, color=TRUTH, linewidth=3.5, alpha=0.3)
     for number, (mean, std) in enumerate(found[:4]):
         at = np.arange(3) + 0.14 * (number - 1.5)
         label = f"{counts[number]} points"
-        color = SERIES[1:][number]
+        color = speed_colors()(number / 3)
         right.errorbar(at, 100.0 * mean[1:], 100.0 * BAND * std[1:], fmt="o", color=color, label=label, **style)
     right.set_xticks(range(3), ["x", "y", "z"])
-    quiet(right, title="its centre of mass in the axes of link 7", x="axis", y="place in cm")
+    quiet(right, title="its centre of mass in the axes of link 7", x="axis", y="position [cm]")
     return finish(figure, left, right)
 
 
@@ -256,7 +256,7 @@ def joint_accelerations() -> Any:
         axes.plot(seconds[:, 0], test.a[:, joint], ".", color=MEASUREMENT, markersize=2, label="measured", zorder=1)
         truth = torch.tensor(test.truth["a"][:, joint])
         draw_curve(axes, _Line(seconds, predicted.mean[:, joint], predicted.std[:, joint]), lambda _, a=truth: a)
-        quiet(axes, title=f"joint {joint + 1}, 100 points, mean=zero", x="time in s", y="acceleration in rad/s²")
+        quiet(axes, title=f"joint {joint + 1}, 100 points, mean=zero", x="time [s]", y="acceleration [rad/s²]")
     return finish(figure, *grid)
 
 
@@ -273,7 +273,7 @@ def no_forces() -> Any:
         axes.plot(seconds, truth, color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
         axes.plot(seconds, own, color=KNOWN_PHYSICS, linewidth=1.5, label="known physics alone")
         axes.margins(x=0)
-        quiet(axes, title=f"joint {joint + 1}", x="time in s", y="acceleration in rad/s²")
+        quiet(axes, title=f"joint {joint + 1}", x="time [s]", y="acceleration [rad/s²]")
     return finish(figure, *grid)
 
 
@@ -302,7 +302,7 @@ def friction_map() -> Any:
         curve = posterior.curve("sliding", place @ tangents)
         draw_curve(axes, _Line(x, curve.mean, curve.std), roughness, visited_x)
         axes.set_ylim(0.0, 6.0)
-        quiet(axes, title=f"{kernel}, 100 points", x="place x in m", y="coefficient in N/(m/s)")
+        quiet(axes, title=f"{kernel}, 100 points", x="position x [m]", y="coefficient [N/(m/s)]")
     return finish(figure, *grid)
 
 

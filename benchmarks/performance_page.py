@@ -16,13 +16,12 @@ SCALING = DOCS / "performance" / "scaling.json"
 
 INTRODUCTION = """# Performance
 
-Measured, never estimated: this page is written by `make bench` from [benchmarks/results.json](../../benchmarks/results.json),
-and never by hand. Every table can be had again by its command. Times are CPU seconds and medians unless it says otherwise;
-ratios compare both sides in the same process on one thread.
+All numbers are measured. `make bench` writes this page from [benchmarks/results.json](../../benchmarks/results.json), and the command above a table
+measures it again. Times are CPU seconds and medians unless stated otherwise; ratios compare both sides in the same process on one thread.
 
-What the engines are: [large-data.md](../how-to/large-data.md); predictors: [control-rate.md](../how-to/control-rate.md); compiled dynamics:
-[compiled-dynamics.md](../explanation/compiled-dynamics.md); updates: [incremental.md](../how-to/incremental.md);
-solvers that were tried and not taken: [solvers.md](../explanation/solvers.md). No GPU has been measured yet: [gpu.md](../how-to/gpu.md).
+The subjects are explained elsewhere: [engines](../how-to/large-data.md), [predictors](../how-to/control-rate.md),
+[compiled dynamics](../explanation/compiled-dynamics.md), [updates](../how-to/incremental.md) and [solvers](../explanation/solvers.md).
+No GPU has been measured yet ([GPU](../how-to/gpu.md)).
 """  # noqa: E501  # one line of the page each
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge}
@@ -35,7 +34,7 @@ def performance_page(results: Mapping[str, Any]) -> str:
         known = {key: meaning for key, meaning in MEANINGS[question].items() if key in results}
         if not known:
             continue
-        rows = ["| what | measured | asked | kept |", "|:---|---:|:---|:---|"]
+        rows = ["| what | measured | required | met |", "|:---|---:|:---|:---|"]
         for key, (bound, meaning) in known.items():
             rows.append(f"| {meaning} (`{key}`) | {results[key]:.4g} | {bound} | {kept(results[key], bound)} |")
         parts += [f"## {title}\n\n`python -m benchmarks {question}`\n", "\n".join(rows) + "\n"]

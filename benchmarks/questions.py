@@ -35,8 +35,8 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "nll_speedup_n400_tool_friction": (">= 40", "the same at N = 400, one contact, prior tool-friction (rank 2)"),
         "nll_vs_cholesky_n400": (
             "",
-            "the same at N = 400, one contact, against one dense Cholesky factor and gradients by hand: what deflation "
-            "itself is worth",
+            "the same at N = 400, one contact, against one dense Cholesky factor and gradients by hand: the gain of "
+            "deflation itself",
         ),
         "nll_vs_cholesky_n1000": ("", "the same at N = 1000"),
         "nll_memory_ratio_n1000": ("<= 0.333", "peak memory at N = 1000: deflated / dense"),
@@ -98,7 +98,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         "stream_mae_newest_b200": ("", "the same after all, with a budget of 200: the newest rows kept"),
         "stream_mae_random_b200": ("", "the same: random rows kept"),
         "stream_mae_farthest_b200": ("", "the same: rows kept that lie far apart in (q, v, u)"),
-        "stream_mae_information_b200": ("", "the same: rows kept that tell most beyond the others"),
+        "stream_mae_information_b200": ("", "the same: the most informative rows kept"),
         "stream_mae_divergence_b200": ("", "the same: rows kept that move the posterior most (the default)"),
         "stream_mae_hindsight_b200": (
             "",

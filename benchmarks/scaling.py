@@ -98,7 +98,7 @@ def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     for axes, (key, title, label) in zip(panels, quantities, strict=True):
         for color, (engine, found) in zip(SERIES, measured.items(), strict=False):
             counts, values = list(map(int, found)), [max(entry[key], 1e-2) for entry in found.values()]
-            named = f"{LABELS[engine]}: N^{slope(counts, values):.1f}" if key == "cpu_s" else None
+            named = f"{LABELS[engine]}: $N^{{{slope(counts, values):.1f}}}$" if key == "cpu_s" else None
             axes.loglog(counts, values, "o-", color=color, markersize=4, linewidth=1.6, label=named)
         quiet(axes, title=title, x="training rows N", y=label)
     figure.legend(fontsize=SMALL, frameon=False, loc="outside lower center", ncols=2)

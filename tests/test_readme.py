@@ -7,6 +7,7 @@ from pathlib import Path
 
 from benchmarks.force_pictures import PICTURES
 from tests.examples import run_example
+from tests.prose import sentences, words
 
 from forcegp import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.cli.main import parse_arguments
@@ -39,9 +40,70 @@ def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
 def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Path):
     readme = (repository / "README.md").read_text(encoding="utf-8")
     assert len(readme.split()) <= 700
+    assert max(len(words(sentence)) for sentence in sentences(readme)) <= 30
     answer = (repository / "docs" / "how-to" / "auto" / "answer.txt").read_text(encoding="utf-8")
     assert f"```text\n{answer}```" in readme
     assert f"```text\n{answer}```" in (repository / "docs" / "how-to" / "auto.md").read_text(encoding="utf-8")
+
+
+ROBOTS = {
+    "EMPS, one axis with dry friction": ("emps", "| model | nRMSE |", 1, 1.0),
+    "passive pendulum, masses 20 % wrong": ("passive-pendulum-motions", "| model | after 0.1 s |", 3, 1e3),
+    "driven double pendulum (DFKI)": ("double-pendulum-motions", "| model | after 0.1 s |", 3, 1e3),
+}
+"""Row of the README -> its report, the heading of the table, the column, and the factor of its unit."""
+COLUMNS = ("analytical", "independent-gp", "identified-acceleration-all", "joint-friction@identified")
+
+
+def test_the_results_of_real_robots_are_those_of_their_reports(repository: Path):
+    readme = (repository / "README.md").read_text(encoding="utf-8")
+    for robot, (folder, heading, column, factor) in ROBOTS.items():
+        report = repository / "docs" / "benchmarks" / "real-robots" / folder / "report.md"
+        rows = report.read_text(encoding="utf-8").partition(heading)[2].partition("\n\n")[0].splitlines()
+        measured = {cells[1].strip(): cells[column + 1] for cells in (row.split("|") for row in rows[2:])}
+        (shown,) = re.findall(rf"^\| {re.escape(robot)} \|[^|]*\|(.*)\|$", readme, re.MULTILINE)
+        for model, cell in zip(COLUMNS, shown.split("|"), strict=True):
+            expected = factor * float(measured[model].split("(")[0].strip(" *"))
+            assert abs(float(cell.strip(" *")) - expected) <= 0.01 * expected, (robot, model)
+
+
+def test_errors_of_tracking_are_those_of_the_benchmark(repository: Path):
+    page = (repository / "docs" / "benchmarks" / "control.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| computed torque, ([^|]*)\| \**([\d.]+)", page, re.MULTILINE)
+    (urdf, laws, learned, true) = (value for _, value in rows)
+    for name in ("README.md", "docs/start/features.md"):
+        shown = (repository / name).read_text(encoding="utf-8")
+        assert {f"{float(urdf):.0f} mrad", f"**{learned} mrad**"} <= set(re.findall(r"\**[\d.]+ mrad\**", shown)), name
+        assert f"{float(laws):.1f}" in shown
+        assert true in shown
+
+
+def test_the_times_of_the_features_are_those_of_the_benchmarks(repository: Path):
+    """docs/start/features.md repeats some numbers of benchmarks/results.json."""
+    measured = json.loads((repository / "benchmarks" / "results.json").read_text(encoding="utf-8"))
+    shown = (repository / "docs" / "start" / "features.md").read_text(encoding="utf-8")
+    for text in (
+        "{nll_speedup_n400:.1f} times faster than the dense formulation at N = 400",
+        "{nll_speedup_n1000:.1f} times at N = 1000",
+        "{nll_speedup_n400_three_constraints:.0f} times faster with three constraints",
+        "{nll_speedup_n400_tool_friction:.0f} times with the prior",
+        "deflation is {nll_vs_cholesky_n400:.1f} times faster with one contact",
+        "{compiled_mass_bias_vs_pinocchio_b10000:.2f} times as long as a C++ Pinocchio loop",
+        "inertial parameters take {compiled_inertial_gradient_vs_pinocchio_b10000:.2f} times",
+        "of 1000 states take {mass_bias_vs_pinocchio_b1000:.1f} times",
+        "takes {friction_predict_mean_ms:.2f} ms for the mean",
+        "{friction_predict_cov_ms:.2f} ms, with derivatives {friction_linearize_ms:.2f} ms",
+        "{predict_mean_ms:.2f}, {predict_cov_ms:.2f} and {predict_linearize_ms:.2f} ms",
+        "512 motions of 25 steps take {rollout_ms:.0f} ms",
+        "from 100 points: {c_mean_us:.0f} us, with covariance {c_cov_us:.0f} us",
+        "10,000 rows with a joint prior: {fit_n10000_cpu_s:.0f} CPU s",
+        "100,000 rows with tool friction: {fit_n100000_cpu_s:.0f} CPU s",
+        "in two processes: {joblib_speedup_8_restarts:.1f} times",
+    ):
+        assert text.format(**measured) in shown, text
+    page = (repository / "docs" / "paper" / "reproduction.md").read_text(encoding="utf-8")
+    (hours,) = re.findall(r"^(\S+ CPU-hours) for", page, re.MULTILINE)
+    assert f"It takes {hours}" in shown
 
 
 def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):

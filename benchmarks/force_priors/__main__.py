@@ -18,7 +18,7 @@ def main(words: list[str]) -> int:
     parser.add_argument("experiment", nargs="?", default=ALL, help="one of them by its name; default: all")
     parser.add_argument("--preset", default="forces", choices=PRESETS, help="forces: CPU-hours; smoke: small")
     parser.add_argument("--points", type=int, nargs="+", default=(), help="other numbers of training points")
-    parser.add_argument("--out", type=Path, help="folder of results; an unfinished one is gone on with")
+    parser.add_argument("--out", type=Path, help="folder of results; an unfinished run resumes")
     parser.add_argument("--docs", type=Path, help="write page, figures, JSON and CSV into this folder, too")
     parser.add_argument("--jobs", type=int, default=1, help="pieces of work at once, each on one core")
     given = parser.parse_args(words)

@@ -16,14 +16,22 @@ from benchmarks.force_priors.trials import (
     dots_figure,
     heading,
     only_test,
-    plain_ticks,
     score_table,
     trial_name,
     trials_on,
 )
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
 from forcegp.evaluation.metrics import formatted, markdown_table, medians
-from forcegp.evaluation.plots.style import QUIET, SERIES, legend_below, new_figure, quiet
+from forcegp.evaluation.plots.style import (
+    MEASUREMENT,
+    PREDICTION,
+    QUIET,
+    SERIES,
+    legend_below,
+    new_figure,
+    plain_ticks,
+    quiet,
+)
 from forcegp.experiments import published
 from forcegp.experiments.figures import draw_range
 from forcegp.jobs import JobStore
@@ -56,7 +64,7 @@ class DataEfficiency(ForceExperiment):
         panels = figure.subplots(1, 2)
         scores = {"mae": "against noisy accelerations", "mae_noise_free": "against noise-free ones"}
         for axes, (score, title) in zip(panels, scores.items(), strict=True):
-            for color, label in zip((SERIES[1], SERIES[0], SERIES[2]), EFFICIENT, strict=True):
+            for color, label in zip((MEASUREMENT, PREDICTION, SERIES[5]), EFFICIENT, strict=True):
                 trials = [trial for trial in summary["trials"] if trial["label"] == label and not trial["region"]]
                 draw_range(axes, {trial["points"]: only_test(trial)[score] for trial in trials}, color, label)
             axes.set(xscale="log", yscale="log")
@@ -65,7 +73,7 @@ class DataEfficiency(ForceExperiment):
         label = "S-GP + mean, published (2021)"
         panels[0].plot(list(paper), list(paper.values()), color=QUIET, linestyle="--", linewidth=1.0, label=label)
         perfect = published.NOISE_STD * (2.0 / pi) ** 0.5
-        panels[0].axhline(perfect, color=QUIET, linewidth=0.8, label="a perfect prediction")
+        panels[0].axhline(perfect, color=QUIET, linewidth=0.8, label="noise floor")
         for axes in panels:
             plain_ticks(axes.xaxis)
             plain_ticks(axes.yaxis)

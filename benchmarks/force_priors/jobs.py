@@ -11,7 +11,6 @@ import torch
 from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
-from forcegp.evaluation.plots.tool_path import tool_motion
 from forcegp.experiments.data import farthest, simulated
 from forcegp.experiments.fits import MODEL, START_FRICTION, search_report
 from forcegp.inference import OptimizerOptions
@@ -31,7 +30,8 @@ TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first
 
 def _tool_x(dataset: Dataset) -> np.ndarray:
     assert dataset.system is not None
-    return tool_motion(dataset.system, dataset.q, dataset.v)[0][:, 0]
+    kinematics = dataset.system.robot.kinematics(torch.tensor(dataset.q), torch.tensor(dataset.v))
+    return dataset.system.contacts[0].position(kinematics)[:, 0].numpy()
 
 
 def true_curves(posterior: Any) -> dict[str, Law]:

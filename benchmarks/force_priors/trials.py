@@ -7,13 +7,11 @@ from itertools import chain
 from textwrap import fill
 from typing import Any
 
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from typing_extensions import override
 
 from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, median_and_range, medians
-from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, quiet
+from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, plain_ticks, quiet
 from forcegp.experiments.data import TEST_SEED
 from forcegp.experiments.experiment import Experiment, Row
 from forcegp.experiments.fits import FitSettings, fit_cost
@@ -223,15 +221,6 @@ def dots_figure(groups: Mapping[str, Mapping[str, Mapping[str, Any]]], score: st
         plain_ticks(axes.xaxis)
         quiet(axes, title=fill(group, 44), x=label)
     return figure
-
-
-def plain_ticks(axis: Axis) -> None:
-    """Numbers such as 0.02 and 50 at 1, 2 and 5 times powers of ten of a logarithmic axis."""
-    low, high = axis.get_view_interval()
-    steps = (1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)
-    axis.set_major_locator(LogLocator(subs=steps))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def heading(label: str) -> str:

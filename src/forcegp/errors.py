@@ -3,7 +3,7 @@
 import contextlib
 import difflib
 from collections.abc import Collection, Iterator, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Kind = TypeVar("Kind")
 
@@ -21,7 +21,16 @@ class UnknownRow(InvalidInput, IndexError):
 
 
 class RobotModelError(ForceGPError):
-    """The robot description cannot be used; subclasses say why."""
+    """The robot description cannot be used; subclasses say why.
+
+    `remedy` holds the arguments of `Robot.from_urdf` under which this file is taken, by name; empty where the file must
+    be corrected first. `problems` are all that were found.
+    """
+
+    def __init__(self, seen: str, advice: str = "", remedy: Mapping[str, Any] | None = None):
+        super().__init__(seen + advice)
+        self.seen, self.advice, self.remedy = seen, advice, dict(remedy or {})
+        self.problems: tuple[str, ...] = (seen + advice,)
 
 
 class MalformedUrdf(RobotModelError):
@@ -57,7 +66,11 @@ class UnsafeXml(RobotModelError):
 
 
 class UnsupportedJoint(RobotModelError):
-    """Mimic, floating, planar or otherwise unsupported joint."""
+    """Floating, planar or otherwise unsupported joint, or one that mimics none that there is."""
+
+
+class UnstatedBase(RobotModelError):
+    """The file looks like a robot that is not bolted to the world, and nobody said that it is."""
 
 
 class MissingInertia(RobotModelError):
@@ -132,7 +145,7 @@ class CompilerError(ForceGPError):
 
 
 class BackendError(ForceGPError):
-    """Workers that cannot be had, have other versions, or died again and again."""
+    """A worker died: it was killed, or out of memory."""
 
 
 class MissingExtra(ForceGPError, ImportError):
@@ -143,16 +156,16 @@ class NumericalWarning(UserWarning):
     """Something was repaired (jitter added, say) and the result is still usable."""
 
 
-class WorkerWarning(UserWarning):
-    """A process at work died and its task began anew; the outcome is the same."""
-
-
 class OutdatedWarning(UserWarning):
     """Stored results were computed by other code or with other settings, and are computed anew."""
 
 
 class DataWarning(UserWarning):
     """The data can be used but look as if something was mistaken: a surface in the wrong place, say."""
+
+
+class RobotFileWarning(DataWarning):
+    """What was ignored, replaced or repaired in a robot file."""
 
 
 class ContactWarning(DataWarning):

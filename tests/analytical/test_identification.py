@@ -74,6 +74,18 @@ def test_exact_data_give_the_truth(likelihood):
         assert found.values[name] == pytest.approx(value, rel=0.02, abs=2e-3)
 
 
+def test_centres_of_mass_and_their_errors_follow_from_the_parameters():
+    found = identify_analytical(recorded(60, 2, noise=0.1), given(), friction=FRICTION)
+    centers, errors = found.centers_of_mass
+    small, spread = 1e-6, found._spread[: found.parameters.size].reshape(*found.parameters.shape, -1)
+    moved = found.parameters[..., None] + small * spread
+    slopes = (moved[:, 1:4] / moved[:, :1] - centers[..., None]) / small
+    np.testing.assert_allclose(np.linalg.norm(slopes, axis=-1), errors, rtol=1e-4)
+    robot = found.system.robot
+    for body, link in enumerate(("upper", "fore", "hand")):
+        np.testing.assert_allclose(centers[body], robot.link(link).center_of_mass, atol=1e-12)
+
+
 def test_what_predicts_is_what_is_written_down():
     found = identify_analytical(recorded(60, 2, noise=0.1), given(), friction=FRICTION)
     test = recorded(20, 3)

@@ -78,7 +78,7 @@ def test_evaluate_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert re.search(r"multiplier\) MAE \S+ N, RMS error \S+ %, \S+ % in the 95 % band; forces along the", told)
     assert "contact normal rest on the prior alone" in told
     names = {file.name for file in figures.iterdir()}
-    pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png", "normal_force.png"}
+    pictures = {"prediction.png", "normal_force.png"}
     assert names == pictures | {"evaluation.json", "config.json", "SHA256SUMS"}
     assert all((figures / name).read_bytes().startswith(PNG) for name in pictures)
     assert json.loads((figures / "evaluation.json").read_text())["rows"] == 480
@@ -122,7 +122,7 @@ def test_every_model_is_fitted_scored_and_shown_by_the_same_commands(workshop, f
     assert (scores["unknown_force_mae"] is None) == (scores["multiplier_mae"] is None) == black_box
     assert (scores["constraint_error"] > 1e-6) == black_box
     if model in DRAWN:
-        pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png"}
+        pictures = {"prediction.png"}
         pictures |= set() if black_box else {"normal_force.png"}
         assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json", "SHA256SUMS"}
     shown = forcegp("evaluate", run, "test.h5", "--every", 40, folder=workshop)
@@ -167,7 +167,7 @@ def test_the_demo_tells_the_whole_story_and_can_be_told_again(forcegp, tmp_path,
         assert 0 < model["fit"]["wall_seconds"] < results["wall_seconds"]
         assert model["published_mae"] is None  # the paper has no value for 12 points
         assert len(load_posterior(tmp_path / model["run"]).likelihood.training.q) == 12
-    assert (tmp_path / "demo" / "summary.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "demo" / "prediction.png").read_bytes().startswith(PNG)
     assert [entry.name for entry in tmp_path.iterdir()] == ["demo"]
 
     monkeypatch.chdir(tmp_path)
@@ -228,6 +228,6 @@ def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable,
         _, told = process.communicate(timeout=600)  # a guard against a hang
     assert process.returncode == 130
     last = told.decode().splitlines()[-1]
-    assert last == "forcegp: interrupted; finished pieces are kept, and the same command goes on from there."
+    assert last == "forcegp: interrupted; finished pieces are kept, and the same command resumes."
     assert b"Traceback" not in told
     assert list((tmp_path / "out" / "jobs").glob(finished))

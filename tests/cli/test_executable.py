@@ -29,7 +29,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
         ),
         "answer/validation/report.md",
     ),
-    "demo": (("--seconds", 0.5, "--points", 8, "--iterations", 2, "--out", "story"), "story/summary.png"),
+    "demo": (("--seconds", 0.5, "--points", 8, "--iterations", 2, "--out", "story"), "story/prediction.png"),
     "simulate": (("kuka-surface", "--seconds", 0.1, "--out", "simulated.h5"), "simulated.h5"),
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
     "check": (("log.h5", "--plots", "look"), "look/check.png"),

@@ -54,7 +54,7 @@ def test_every_force_that_the_truth_knows_is_scored_and_drawn(arm, forcegp, tmp_
     assert told["mae"] == pytest.approx(scores["multiplier_mae"], rel=1e-6)
     assert scores["normal_force_rests_on_prior"] is False
     assert scores["system"] == "model"
-    pictures = {"prediction.png", "tool_path.png", "likelihood.png", "summary.png", "forces.png", "normal_force.png"}
+    pictures = {"prediction.png", "forces.png", "normal_force.png"}
     assert {file.name for file in figures.iterdir()} == pictures | {"evaluation.json", "config.json", "SHA256SUMS"}
     assert all((figures / name).read_bytes().startswith(PNG) for name in pictures)
 

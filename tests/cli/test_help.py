@@ -15,6 +15,9 @@ from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 
 EVERY = pytest.mark.parametrize("command", COMMANDS)
 MOST_WORDS = 30
+TRANSLATED = re.compile(
+    r"\b(gone on with|goes on from|nobody|so many|so long|teach\w*|surest|shall|says?|knows?|tells?)\b"
+)
 
 
 @pytest.mark.parametrize("columns", [60, 100, 200])
@@ -84,6 +87,11 @@ def test_no_sentence_is_long(forcegp, command):
     for part in re.split(r"\n\n|\n(?=  \S)|\(default: ", prose):
         for sentence in re.split(r"(?<=[.!?])\s", part):
             assert len(sentence.split()) <= MOST_WORDS, sentence
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_words_are_those_of_the_field(forcegp, command):
+    assert not TRANSLATED.findall(forcegp(*command.split(), "--help").stdout)
 
 
 class Screen(io.TextIOWrapper):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tests.models.arm import NOISE, URDF, arm_data, arm_system
 
-from forcegp import Robot, load_posterior
+from forcegp import JointFriction, Robot, load_posterior
 from forcegp.cli.main import main
 from forcegp.mechanics import Actuation, RigidBodyBias, ViscousJointFriction
 from forcegp.models.identification.physical_parameters import PhysicalParameters
@@ -88,7 +88,30 @@ def test_estimates_come_from_all_points_or_the_report_names_both_numbers(forcegp
     assert found["standard_error"] < told["parameters"]["hand.mass"]["standard_error"]
 
 
+def test_the_unknown_forces_are_of_the_prior_that_is_named(forcegp, folder):
+    words = (
+        "identify",
+        "arm.h5",
+        "--learn",
+        "hand:mass",
+        "--prior",
+        "joint-friction",
+        "--points",
+        30,
+        "--out",
+        "friction",
+    )
+    done = forcegp(*words, folder=folder)
+    assert done.returncode == 0, done.stderr
+    posterior = load_posterior(folder / "friction")
+    assert isinstance(posterior.model.prior, JointFriction)
+    told = json.loads((folder / "friction" / "identification.json").read_text())["parameters"]["hand.mass"]
+    assert told["identified"] == pytest.approx(0.6, abs=5 * told["standard_error"])
+
+
 WRONG = [
+    ("--learn hand:mass --model analytical --prior joint", "leave --prior out"),
+    ("--learn hand:mass --prior jont", "no prior 'jont'"),
     ("--learn hnd:mass", "no link 'hnd' in arm; did you mean 'hand'?"),
     ("--learn hand:weight", "inertial parts mass, com, inertia, and 'weight' was asked of 'hand'"),
     ("--learn base:mass", "fixed in the world"),

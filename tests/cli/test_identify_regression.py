@@ -1,6 +1,7 @@
 """`forcegp identify --model least-squares|consistent` from end to end, and what begins with its folder."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,14 @@ def test_the_report_and_least_squares_that_belong_to_no_robot(forcegp, folder):
     assert "coulomb [Nm]" in done.stdout
     assert "base parameters, condition number" in done.stdout
     assert "Directions that the prior decides" in done.stdout
+    row = next(line for line in done.stdout.splitlines() if line.split()[:1] == ["hand"])
+    assert re.search(r"\d ± \S+( +-?\d+\.\d ± \S+,?){3} +\d+ of 10", row), row
+
+
+def test_a_prior_of_processes_is_refused(forcegp, folder):
+    done = forcegp("identify", "free.h5", "--model", "consistent", "--prior", "joint", "--out", "x", folder=folder)
+    assert done.returncode == 2
+    assert "--prior means nothing to --model consistent" in done.stderr
 
 
 @pytest.mark.parametrize(

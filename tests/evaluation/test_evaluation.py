@@ -116,18 +116,6 @@ def test_a_stored_model_scores_the_same(posterior, test_data, evaluation, tmp_pa
     assert again.nlpd == pytest.approx(evaluation.nlpd, rel=1e-9)
 
 
-def test_the_force_that_moves_the_robot_is_the_unknown_force_through_the_projector(posterior, test_data):
-    rows = test_data.rows(slice(0, 5))
-    predicted = predict_rows(posterior, rows)
-    states = [torch.tensor(values) for values in (rows.q, rows.v, rows.u)]
-    dynamics, prediction = arm_system().dynamics(*states), posterior.predict(*states)
-    projector = dynamics.M @ dynamics.H
-    expected = (projector @ prediction.unknown_force.mean[..., None])[..., 0]
-    np.testing.assert_allclose(predicted.moving_force, expected, atol=1e-9)
-    covariance = projector @ prediction.unknown_force.covariance @ projector.mT
-    np.testing.assert_allclose(predicted.moving_force_variance, covariance.diagonal(dim1=1, dim2=2), atol=1e-9)
-
-
 def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(without_mean, test_data):
     evaluation = evaluate(without_mean, test_data)
     predicted = predict_rows(without_mean, test_data)
@@ -145,7 +133,7 @@ def test_blocks_of_rows_join_seamlessly(posterior):
     assert calls == [(ROWS_PER_BLOCK, len(data)), (len(data), len(data))]
     ends = predict_rows(posterior, data.rows([0, ROWS_PER_BLOCK - 1, ROWS_PER_BLOCK, len(data) - 1]))
     rows = [0, ROWS_PER_BLOCK - 1, ROWS_PER_BLOCK, len(data) - 1]
-    for name in ("mean", "variance", "negative_log_density", "moving_force", "A", "b"):
+    for name in ("mean", "variance", "negative_log_density", "A", "b"):
         np.testing.assert_allclose(getattr(whole, name)[rows], getattr(ends, name), rtol=1e-8, atol=1e-9)
 
 

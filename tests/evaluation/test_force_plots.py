@@ -54,8 +54,8 @@ def test_every_curve_has_a_panel_that_names_it_with_its_units(friction, data, tm
         "joint-friction: bend",
         "contact-friction: sliding",
     ]
-    assert (panels[0].get_xlabel(), panels[0].get_ylabel()) == ("velocity in rad/s", "torque in Nm")
-    assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed in m/s", "force in N")
+    assert (panels[0].get_xlabel(), panels[0].get_ylabel()) == ("velocity [rad/s]", "torque [Nm]")
+    assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed [m/s]", "force [N]")
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [
         "learned",
@@ -122,7 +122,7 @@ def test_tool_forces_are_slices_that_resist(tool, data):
         assert np.polyfit(velocity, mean, 1)[0] > 0.0  # resists
         at, truth = line(axes, "true")
         np.testing.assert_allclose(truth, VISCOUS * at, atol=1e-2)
-        assert axes.get_ylabel() == "resisting force in N"
+        assert axes.get_ylabel() == "resisting force [N]"
 
 
 def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, posterior, data):
@@ -167,7 +167,7 @@ def test_the_normal_force_is_drawn_with_its_truth_and_its_errors(friction, data,
     every = friction.predict(data.q, data.v, data.u).multiplier
     inside = np.abs(every.mean.numpy() - data.truth["lambda"]) <= norm.ppf(0.975) * every.std.numpy()
     assert f"{100 * inside.mean():.0f} % inside" in errors.texts[0].get_text()
-    assert force.get_ylabel() == "normal force in N"
+    assert force.get_ylabel() == "normal force [N]"
     save_figure(figure, tmp_path / "normal.png")
     assert imread(tmp_path / "normal.png")[..., :3].std() > 0.02
 

@@ -156,9 +156,7 @@ def _options(**arguments: Any) -> Any:
     from forcegp.inference import OptimizerOptions
 
     made = OptimizerOptions(**arguments)
-    if (isinstance(made.iterations, int) and made.iterations > 50) or (
-        isinstance(made.adam_steps, int) and made.adam_steps > 50
-    ):
+    if isinstance(made.iterations, int) and made.iterations > 50:
         return None
     return forcegp.StructuredGP(INPUTS.data.system).fit(INPUTS.data, points=6, restarts=1, options=made)
 
@@ -247,13 +245,14 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "tolerance": 1e-8,
             "gradient_tolerance": 1e-4,
             "memory": 5,
-            "adam_steps": 0,
-            "adam_rate": 0.1,
         },
     ),
     "Robot.from_urdf_text": (
         _robot_from,
-        lambda: {"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None, "inertias": "strict"},
+        lambda: {
+            **{"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None},
+            **{"inertias": "strict", "base": None, "root": None, "strict": False},
+        },
     ),
     "Robot.from_urdf": (forcegp.Robot.from_urdf, lambda: {"path": INPUTS.folder / "arm.urdf"}),
     "inverse_dynamics": (

@@ -33,6 +33,7 @@ VALID = {
     ),
     "auto": ("auto", "log.csv", "--robot", "arm.urdf", "--step", "0", "--out", "out"),
     "payload": ("payload", "test.h5", "--friction", "none-such"),
+    "robot": ("robot", "arm.urdf"),
     "check": ("check", "test.h5"),
     "prepare": ("prepare", "test.h5", "--cutoff", "20", "--out", "out.h5"),
     "fit": ("fit", "train.h5", *SMALL, "--out", "out"),
@@ -52,10 +53,12 @@ VALID = {
 """Command lines that are done at once, or refused at once."""
 LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
 """Nobody may ask for so many seconds of simulation, say, in a test."""
+NEVER = ("debug", "browser")
+"""Options of which one does not tell one failure from another, and one serves until someone ends it."""
 MORE = {"--help", "--no-checks", "--no-hyperprior"}
 OPTIONS = {
     name: sorted(
-        {"--" + item.name.replace("_", "-") for item in fields(command_class(name)) if item.name != "debug"} | MORE
+        {"--" + item.name.replace("_", "-") for item in fields(command_class(name)) if item.name not in NEVER} | MORE
     )
     for name in COMMANDS
 }

@@ -157,7 +157,7 @@ WRONG = {
     "MechanicalSystem": {"contacts": torch.tensor(1.0)},
     "MechanicalSystem ": {"baumgarte": 5.0},
     "OptimizerOptions": {"iterations": None},
-    "OptimizerOptions ": {"adam_steps": 1.5},
+    "OptimizerOptions ": {"patience": 1.5},
     "OptimizerOptions  ": {"memory": "x"},
     "fit": {"options": "fast"},
     "fit ": {"start": 1},

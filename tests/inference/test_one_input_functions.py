@@ -184,17 +184,6 @@ def test_a_table_holds_a_margin_beyond_its_centers_and_is_nan_elsewhere():
     assert (one.low, one.high) == (2.25, 3.75)
 
 
-def test_kinks_are_smooth_in_a_table_of_the_exact_form():
-    given = latents("friction", normal(20, seed=3))
-    exact, smooth = one_input_form(given, 0), one_input_form(given, 0, smooth=True, tolerance=1e-4)
-    s = torch.linspace(smooth.low, smooth.high, 5001, dtype=torch.float64)
-    close(smooth.values(s), exact.values(s), 1e-4)
-    for form, continuous in ((exact, False), (smooth, True)):
-        inner = form.knots[1:-1]
-        left, right = form.evaluate(inner - 1e-12)[1], form.evaluate(inner)[1]
-        assert ((left - right).abs().max() < 1e-6 * right.abs().max()) == continuous
-
-
 def test_functions_without_any_weight_have_a_table():
     form = one_input_form(latents("periodic", normal(5, seed=3), weights=torch.zeros(5, dtype=torch.float64)), 0)
     assert (form.values(torch.tensor([0.3], dtype=torch.float64)) == 0.0).all()

@@ -71,7 +71,7 @@ def test_several_parameters_of_any_shape_come_back_in_shape():
 
 def test_what_the_caller_owns_is_not_changed():
     initial = {"x": start()["x"].requires_grad_()}
-    result = minimize_objective(rosenbrock, initial, OptimizerOptions(adam_steps=3))
+    result = minimize_objective(rosenbrock, initial)
     assert torch.equal(initial["x"].detach(), start()["x"])
     assert initial["x"].grad is None
     assert not result.parameters["x"].requires_grad
@@ -90,7 +90,6 @@ def test_progress_is_told_every_iteration():
     result = minimize_objective(
         rosenbrock,
         start(),
-        OptimizerOptions(adam_steps=4),
         progress=lambda iteration, value: told.append((iteration, value)),
     )
     assert told == list(enumerate(result.history))[1:]
@@ -98,7 +97,7 @@ def test_progress_is_told_every_iteration():
 
 def test_every_evaluation_counts():
     calls = []
-    result = minimize_objective(lambda p: calls.append(1) or rosenbrock(p), start(), OptimizerOptions(adam_steps=3))
+    result = minimize_objective(lambda p: calls.append(1) or rosenbrock(p), start())
     assert result.evaluations == len(calls)
 
 
@@ -139,55 +138,11 @@ def test_an_objective_that_ignores_everything():
 
 def test_no_parameters_at_all():
     """A model with everything fixed: the value is still wanted."""
-    result = minimize_objective(lambda parameters: tensor(3.0)[0], {}, OptimizerOptions(adam_steps=2))
+    result = minimize_objective(lambda parameters: tensor(3.0)[0], {})
     assert result.value == 3.0
     assert result.parameters == {}
     assert result.converged
     assert result.status == "no parameters to search for"
-
-
-# ---------------------------------------------------------------- Adam
-
-
-def test_adam_warms_up():
-    result = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=30, adam_rate=0.02, iterations=0))
-    assert len(result.history) == 31
-    assert result.value < result.history[0]
-    assert result.value == min(result.history)
-
-
-def test_adam_is_that_of_torch():
-    x = start()["x"].requires_grad_()
-    adam, values = torch.optim.Adam([x], lr=0.05), []
-    for _ in range(8):
-        adam.zero_grad()
-        rosenbrock({"x": x}).backward()
-        adam.step()
-        values.append(float(rosenbrock({"x": x}).detach()))
-    result = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=8, adam_rate=0.05, iterations=0))
-    assert result.history[1:] == pytest.approx(values)
-
-
-def test_lbfgs_goes_on_from_the_best_point_of_adam():
-    """Adam with a huge rate jumps about; what it found best is not lost."""
-    options = OptimizerOptions(adam_steps=10, adam_rate=2.0)
-    wild = minimize_objective(rosenbrock, start(), OptimizerOptions(adam_steps=10, adam_rate=2.0, iterations=0))
-    result = minimize_objective(rosenbrock, start(), options)
-    assert not falling(result.history[:11])
-    assert result.history[11] <= wild.value
-    assert falling(result.history[11:])
-    assert result.value < 1e-6
-
-
-def test_adam_ends_where_the_objective_cannot_be_evaluated():
-    def half(parameters):
-        if parameters["x"][0] < 0.0:
-            raise NumericalError("left of zero")
-        return (parameters["x"] - 0.5).square().sum()
-
-    result = minimize_objective(half, {"x": tensor(3.0)}, OptimizerOptions(adam_steps=20, adam_rate=2.0))
-    assert len(result.history) < 20
-    assert float(result.parameters["x"][0]) == pytest.approx(0.5, abs=1e-4)
 
 
 # ---------------------------------------------------------------- where the objective cannot be evaluated
@@ -295,10 +250,8 @@ def test_other_errors_pass():
     "wrong",
     [
         {"iterations": -1},
-        {"adam_steps": -1},
         {"tolerance": -1.0},
         {"tolerance": math.nan},
-        {"adam_rate": 0.0},
         {"memory": 0},
         {"patience": -1},
     ],

@@ -1,4 +1,4 @@
-"""Prepared kernel functions against the posterior that they were prepared from."""
+"""Sums of kernel functions as C against the posterior that they were made of."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Graph
 from forcegp.codegen.library import Purpose, RowFunction, aligned, compile_library
 from forcegp.inference import ExactPosterior, LatentKernels
-from forcegp.inference.prepared_kernels import PreparedKernels, SharedCenters
+from forcegp.inference.prepared_kernels import SharedCenters, kernel_groups, kernel_sums
 
 SHARED = [1, 3, 4]
 """Latents with the same centres; one of them has one length scale for all features."""
@@ -28,11 +28,6 @@ def latent() -> ExactPosterior:
     return ExactPosterior.condition(built, features, *given.data)
 
 
-@pytest.fixture(scope="module")
-def prepared(latent) -> PreparedKernels:
-    return PreparedKernels.of(latent)
-
-
 def points(latent: ExactPosterior, count: int = 6) -> list[torch.Tensor]:
     one = 5.0 + normal(count, 3, seed=70)
     return [one if c in SHARED else normal(count, 3, seed=71 + c) for c in range(5)]
@@ -42,29 +37,17 @@ def close(actual: torch.Tensor, expected: torch.Tensor) -> None:
     torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_latents_are_grouped_by_their_centers(prepared):
-    assert [group.latents for group in prepared.groups if isinstance(group, SharedCenters)] == [(0,), tuple(SHARED)]
-    assert [group.latents for group in prepared.groups if not isinstance(group, SharedCenters)] == [(2,)]
-
-
-def test_means_and_kernel_functions(latent, prepared):
-    z = points(latent)
-    mean, cross = prepared.mean(prepared.inputs(z))
-    close(mean, latent.mean(z))
-    for group, found in zip(prepared.groups, cross, strict=True):
-        for place, c in enumerate(group.latents):
-            close(found[:, place], latent.kernels.dense[c].cross(z[c], latent.features[c]))
-    close(
-        prepared.diagonal(prepared.inputs(z)),
-        torch.stack([k.diagonal(x) for k, x in zip(latent.kernels.dense, z, strict=True)], dim=-1),
-    )
+def test_latents_are_grouped_by_their_centers(latent):
+    groups = kernel_groups(latent)
+    assert [group.latents for group in groups if isinstance(group, SharedCenters)] == [(0,), tuple(SHARED)]
+    assert [group.latents for group in groups if not isinstance(group, SharedCenters)] == [(2,)]
 
 
 @pytest.mark.parametrize("lanes", [1, 8])
-def test_the_sums_as_c_have_values_slopes_and_roots(latent, prepared, lanes, tmp_path):
+def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
     """Every group in a program of its own, whose inputs are the features."""
     purpose = Purpose("a test", "MOVE", "give up")
-    for group, part in zip(prepared.groups, prepared.sums(), strict=True):
+    for group, part in zip(kernel_groups(latent), kernel_sums(latent), strict=True):
         graph = Graph(part.features)
         values = part.call(graph, graph.inputs, True)
         slopes = [node for row in jacobian(graph, values, graph.inputs) for node in row]

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from forcegp.atomic_files import write_json
-from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
+from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.jobs import JobStore
 
 KIND = "forcegp reproduce"
@@ -76,20 +76,6 @@ def test_overwrite_starts_anew(results):
     again = JobStore.open(results.folder, KIND, {"preset": "paper"}, overwrite=True)
     assert not again.has("a", "10")
     assert JobStore.open(results.folder, KIND, {"preset": "paper"}, overwrite=False) == again
-
-
-def test_results_of_before_are_not_used_and_one_sentence_says_so(tmp_path):
-    (tmp_path / "cells" / "a").mkdir(parents=True)
-    (tmp_path / "cells" / "a" / "cell.json").write_text("{}")
-    old = {"kind": KIND, "format_version": 1, "forcegp_version": "0.1.0", "preset": "smoke"}
-    (tmp_path / "reproduction.json").write_text(json.dumps(old))
-    with pytest.raises(InvalidInput, match=r"another preset \('smoke', not 'paper'\)"):
-        JobStore.open(tmp_path, KIND, {"preset": "paper"})
-    with pytest.warns(OutdatedWarning, match="computed anew, and the old results stay in .*cells"):
-        results = JobStore.open(tmp_path, KIND, {"preset": "smoke"})
-    assert not results.has("a", "10")
-    assert (tmp_path / "cells" / "a" / "cell.json").read_text() == "{}"
-    JobStore.open(tmp_path, KIND, {"preset": "smoke"})  # without a word
 
 
 def test_folders_of_something_else_are_refused(tmp_path):

@@ -11,7 +11,7 @@ from tests.data import samples
 from tests.models.arm import arm_data
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import evaluate, likelihood_figure, prediction_figure, summary_figure, tool_path_figure
+from forcegp.evaluation import evaluate, prediction_figure
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import load_posterior, save_posterior
 from forcegp.models.protocol import Model, Posterior
@@ -146,11 +146,7 @@ class ModelConformance:
         assert (evaluation.multiplier_mae is not None) == speaks
         bare = dataclasses.replace(test, truth={}, noise_std=None, system=None)
         assert evaluate(fitted, bare).mae == evaluation.mae
-        panels = {prediction_figure: 6, summary_figure: 8, tool_path_figure: 3}
-        for draw, count in panels.items():
-            assert len(draw(fitted, test).axes) == count
-        (axes,) = likelihood_figure({fitted.description: fitted.result.history}, objective=fitted.objective).axes
-        assert f"{axes.get_title(loc='left')} [{axes.get_ylabel()}]".endswith(fitted.objective)
+        assert len(prediction_figure(fitted, test).axes) == 6
 
     def test_training_rows_among_the_test_rows_are_noticed(self, fitted, data):
         assert any("training rows" in warning for warning in evaluate(fitted, data).warnings)

@@ -5,8 +5,8 @@ from functools import partial
 import pytest
 from tests.parallel import tasks
 
-from forcegp.errors import BackendError, WorkerWarning
-from forcegp.parallel import MOST_DEATHS, Serial
+from forcegp.errors import BackendError
+from forcegp.parallel import Serial
 
 
 class BackendConformance:
@@ -52,17 +52,9 @@ class BackendConformance:
         with pytest.warns(UserWarning, match="look here"):
             assert list(backend.map(tasks.warn, [1])) == [1]
 
-    def test_tasks_of_a_pool_are_submitted_while_others_are_at_work(self, backend):
-        """Each task needs the outcome of the one before."""
-        numbers = [1, 2, 3]
-        with backend.pool() as pool:
-            pool.submit("a", lambda shared, extra: sum(shared) + extra, numbers, 10)
-            [(key, future)] = pool.finished()
-            assert (key, future.result(), len(pool)) == ("a", 16, 0)
-            pool.submit("b", lambda extra, shared: sum(shared) + extra, future.result(), numbers)
-            [(key, future)] = pool.finished()
-            assert (key, future.result()) == ("b", 22)
-            assert pool.free > 0
+    def test_tasks_are_submitted_with_their_arguments(self, backend):
+        future = backend.submit(lambda shared, extra: sum(shared) + extra, [1, 2, 3], 10)
+        assert future.result() == 16
 
 
 class WorkersConformance(BackendConformance):
@@ -76,18 +68,8 @@ class WorkersConformance(BackendConformance):
         assert len(counts) > 1
         assert set(counts) == {1}
 
-    def test_a_worker_that_is_killed_is_replaced_and_the_run_completes(self, backend, tmp_path):
-        arguments = [tmp_path / "marker", *(tmp_path / f"done{index}" for index in range(3))]
-        for path in arguments[1:]:
-            path.touch()  # these survive at once
-        with pytest.warns(WorkerWarning, match="a process died while task"):
-            found = list(backend.map(tasks.die_once, arguments))
-        assert found == ["survived"] * 4
-
-    @pytest.mark.nightly
-    @pytest.mark.filterwarnings("ignore:a process died while:forcegp.errors.WorkerWarning")
-    def test_a_task_that_always_kills_its_worker_ends_in_an_error(self, backend, tmp_path):
-        with pytest.raises(BackendError, match=rf"{MOST_DEATHS + 1} times"):
+    def test_a_worker_that_is_killed_is_an_error_and_the_next_call_has_another(self, backend, tmp_path):
+        with pytest.raises(BackendError, match=r"processes broke off, .*try fewer jobs"):
             list(backend.map(tasks.die, [tmp_path]))
-        assert len(list(tmp_path.iterdir())) == MOST_DEATHS + 1
+        assert len(list(tmp_path.iterdir())) == 1
         assert list(backend.map(tasks.slow_first, [0, 1])) == [0, 1]

@@ -41,17 +41,8 @@ class TypedError(ValueError):
         self.code = code
 
 
-def die_once(marker):
-    """SIGKILL the worker at the first attempt; a file remembers it."""
-    try:
-        Path(marker).touch(exist_ok=False)
-    except FileExistsError:
-        return "survived"
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def die(folder):
-    """SIGKILL the worker at every attempt; files count them."""
+    """SIGKILL the worker; files count the attempts."""
     (Path(folder) / str(os.getpid())).touch()
     os.kill(os.getpid(), signal.SIGKILL)
 

@@ -88,7 +88,7 @@ class PriorConformance:
         model = StructuredGP(data.system, cls.prior)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NumericalWarning)  # so few iterations settle nothing
-            return model.fit(data, restarts=1, options=OptimizerOptions(iterations=3, adam_steps=0))
+            return model.fit(data, restarts=1, options=OptimizerOptions(iterations=3))
 
     def values(self, system, *states) -> torch.Tensor:
         """Mixing and features of one state as one vector."""

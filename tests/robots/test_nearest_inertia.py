@@ -9,11 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from forcegp.errors import DataWarning, InvalidInput, NonPhysicalInertia
+from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotFileWarning
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import lay_out
+from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import MARGIN, nearest_inertia, with_chosen_inertias
 
@@ -58,18 +59,32 @@ def test_the_nearest_is_possible_and_no_possible_one_is_nearer(seed):
 
 
 def test_a_broken_urdf_is_refused_and_the_error_names_the_option():
-    with pytest.raises(NonPhysicalInertia, match=r"link 'arm'.*`inertias='nearest'`"):
+    with pytest.raises(NonPhysicalInertia, match=r"link 'arm'.*\(path, inertias='nearest'\)"):
         Robot.from_urdf_text(BROKEN)
 
 
 def test_the_repaired_robot_says_so_and_can_be_stored():
-    with pytest.warns(DataWarning, match=r"link 'arm' .*triangle.* \d+(\.\d+)? %"):
+    with pytest.warns(RobotFileWarning, match=r"link 'arm'.*triangle.* \d+(\.\d+)? %"):
         robot = Robot.from_urdf_text(BROKEN, inertias="nearest")
     assert "<!-- rounded to death -->" in robot.to_urdf()
     again = MechanicalSystem.from_json(MechanicalSystem(robot).to_json()).robot
     q = torch.zeros(1).double()
     assert again.mass_matrix(q).equal(robot.mass_matrix(q))
     robot.inertial_parameters("arm")  # log-Cholesky parameters exist
+
+
+def test_a_frame_without_mass_loses_its_inertia():
+    frame = """<link name="tip"><inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+    </inertial></link><joint name="hold" type="fixed"><parent link="arm"/><child link="tip"/></joint></robot>"""
+    text = URDF.format(mass=1.0, ixx=0.02).replace("</robot>", frame)
+    with pytest.raises(NonPhysicalInertia, match="'tip'") as caught:
+        Robot.from_urdf_text(text)
+    assert caught.value.remedy == {"inertias": "nearest"}
+    with pytest.warns(RobotFileWarning, match=r"'tip'.* changed by 1e\+02 %"):
+        robot = Robot.from_urdf_text(text, **caught.value.remedy)
+    plain = Robot.from_urdf_text(URDF.format(mass=1.0, ixx=0.02))
+    q = torch.zeros(1).double()
+    assert robot.mass_matrix(q).equal(plain.mass_matrix(q))
 
 
 def test_what_is_possible_stays_as_it_is():
@@ -85,6 +100,7 @@ def test_a_negative_mass_is_not_mended():
 
 
 def test_another_choice_is_refused():
-    description = parse_urdf(BROKEN, source="here")
+    problems = Problems("here")
+    description = parse_urdf(BROKEN, problems)
     with pytest.raises(InvalidInput, match="strict, nearest"):
-        with_chosen_inertias("closest", BROKEN, description, lay_out(description, {}))
+        with_chosen_inertias("closest", BROKEN, description, lay_out(description, {}, problems), problems)

@@ -204,24 +204,6 @@ def test_a_comparison_that_cannot_be_made_is_refused(data, changes, message):
         comparison(data, **changes)
 
 
-def test_results_that_do_not_record_their_code_are_not_used(data, tmp_path):
-    folder = tmp_path / "out"
-    validate(comparison(data), folder, models=("analytical",), seeds=1)
-    configuration = {"forcegp": "0.1.0", **comparison(data).configuration()}
-    shutil.rmtree(folder / "jobs")
-    (folder / "jobs.json").unlink()
-    (folder / "cells").mkdir()
-    (folder / "cells" / "episodes-1-seed0-analytical.json").write_text("{}")
-    (folder / "configuration.json").write_text(json.dumps({"kind": KIND, "configuration": configuration}))
-    with pytest.raises(InvalidInput, match=r"another points \(15, not 16\)"):
-        validate(comparison(data, points=16), folder, models=("analytical",), seeds=1)
-    with pytest.warns(OutdatedWarning, match="computed anew, and the old results stay in .*cells"):
-        found = validate(comparison(data), folder, models=("analytical",), seeds=1)
-    assert found.document["models"]["analytical"]["runs"] == 1
-    assert (folder / "cells" / "episodes-1-seed0-analytical.json").read_text() == "{}"
-    validate(comparison(data), folder, models=("analytical",), seeds=1)  # without a word
-
-
 def test_only_what_depends_on_a_changed_model_of_somebody_else_is_computed_anew(data, tmp_path, monkeypatch):
     models = ("analytical", "broken")
     validate(comparison(data), tmp_path / "out", models=models, seeds=1)

@@ -24,7 +24,7 @@ from scipy.linalg import block_diag
 from typing_extensions import override
 
 from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
-from forcegp.errors import NonPhysicalInertia
+from forcegp.errors import InvalidInput, NonPhysicalInertia
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia, standard_basis
 from forcegp.robots.urdf_file import replace_dynamics, replace_inertial
@@ -163,11 +163,16 @@ THICKNESS = 0.05
 def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
     """The robot with bodies of some thickness, since only they have coordinates; and the links that were changed.
 
-    Points, rods and plates (ideal ones, as simple URDFs have them) get an isotropic second moment.
+    Points, rods and plates (ideal ones, as simple URDFs have them) get an isotropic second moment. Raises InvalidInput
+    for a body without mass.
     """
     text, changed = robot.urdf_text, []
-    for body, (pseudo, joint) in enumerate(zip(body_pseudo_inertias(robot).numpy(), robot.joints, strict=True)):
-        mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+    for body, (pseudo, joint) in enumerate(zip(body_pseudo_inertias(robot).numpy(), robot.layout.bodies, strict=True)):
+        mass, center = pseudo[3, 3], pseudo[:3, 3] / (pseudo[3, 3] or 1.0)
+        if mass == 0.0:
+            raise InvalidInput(
+                f"link {joint.child!r} moves with {joint.name!r} and has no mass to estimate; lock that joint."
+            )
         about_center = pseudo[:3, :3] - mass * np.outer(center, center)
         size = max(np.trace(pseudo[:3, :3]), 1e-8 * mass)
         if np.linalg.eigvalsh(about_center)[0] > THIN * size:
@@ -213,11 +218,15 @@ def with_bodies(robot: Robot, wanted: Float[np.ndarray, "nv 4 4"]) -> Robot:
 
 
 def with_joint_dynamics(robot: Robot, damping: np.ndarray | None, friction: np.ndarray | None) -> Robot:
-    """The robot whose URDF has <dynamics damping friction> (nv,) of every joint; None leaves what is there."""
+    """The robot whose URDF has <dynamics damping friction> (nv,) of every joint; None leaves what is there.
+
+    That of a joint that others mimic includes theirs, which become 0.
+    """
     text = robot.urdf_text
-    for index, joint in enumerate(robot.joints):
+    for joint, drive in zip(robot.layout.bodies, robot.layout.drives, strict=True):
+        own = float(joint.name == robot.joint_names[drive.joint])
         values = {"damping": damping, "friction": friction}
-        given = {name: float(value[index]) for name, value in values.items() if value is not None}
+        given = {name: own * float(value[drive.joint]) for name, value in values.items() if value is not None}
         text = replace_dynamics(text, joint.name, given, source=robot.source) if given else text
     return robot.with_text(text)
 

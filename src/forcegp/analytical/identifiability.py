@@ -37,7 +37,7 @@ UNITS = ("kg", *("kg m",) * 3, *("kg m^2",) * 6)
 def torque_regressor(
     robot: Robot, q: Float[Tensor, "*#rows nv"], v: Float[Tensor, "*#rows nv"], a: Float[Tensor, "*#rows nv"]
 ) -> Float[Tensor, "... nv columns"]:
-    """Y (..., nv, 10 nv) with ``Y @ standard_parameters(robot)`` the joint forces in Nm or N, without armature.
+    """Y (..., nv, 10 bodies) with ``Y @ standard_parameters(robot)`` the joint forces in Nm or N, without armature.
 
     Columns are named by `parameter_names`. Differentiable in all arguments. Raises InvalidInput for wrong shapes,
     dtypes or devices.
@@ -46,11 +46,11 @@ def torque_regressor(
 
 
 def standard_parameters(robot: Robot) -> Float[Tensor, "columns"]:
-    """The parameters pi (10 nv,) that the robot's URDF gives, links fixed to one another merged."""
+    """The parameters pi (10 bodies,) that the robot's URDF gives, links fixed to one another merged."""
     return standard_of_pseudo_inertia(body_pseudo_inertias(robot)).flatten()
 
 
-def body_pseudo_inertias(robot: Robot) -> Float[Tensor, "nv 4 4"]:
+def body_pseudo_inertias(robot: Robot) -> Float[Tensor, "bodies 4 4"]:
     """Pseudo-inertia of every body in the frame of its child link."""
     inverse = torch.linalg.inv(torch.as_tensor(robot.layout.child_frames, device=robot.device))
     return inverse @ robot.tree.inertias[..., 0] @ inverse.mT
@@ -58,7 +58,7 @@ def body_pseudo_inertias(robot: Robot) -> Float[Tensor, "nv 4 4"]:
 
 def body_names(robot: Robot) -> tuple[str, ...]:
     """What the bodies are called: by the child link of their joint."""
-    return tuple(joint.child for joint in robot.joints)
+    return tuple(joint.child for joint in robot.layout.bodies)
 
 
 def parameter_names(robot: Robot) -> tuple[str, ...]:

@@ -153,7 +153,9 @@ def identify_payload(
 
     links, usual = body_pseudo_inertias(robot).cpu().numpy(), _usual(offset)
     bodies = ConsistentBodies(usual[None] if baseline is None else np.concatenate([links, usual[None]]))
-    stated = (links.reshape(-1, 16) @ np.linalg.pinv(standard_basis().numpy()).T)[: robot.nv if baseline is None else 0]
+    stated = (links.reshape(-1, 16) @ np.linalg.pinv(standard_basis().numpy()).T)[
+        : len(links) if baseline is None else 0
+    ]
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)
@@ -229,7 +231,7 @@ class _Windows:
 
 def _last_link(robot: Robot) -> str:
     """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file."""
-    last = robot.nv - 1
+    last = len(robot.layout.bodies) - 1
     return [name for name, place in robot.layout.links.items() if place.body == last][-1]
 
 

@@ -77,7 +77,9 @@ class AnalyticalIdentification(Summary):
     @property
     def units(self) -> dict[str, str]:
         """By name."""
-        of_bodies = dict(zip(parameter_names(self.given.robot), UNITS * self.given.robot.nv, strict=True))
+        of_bodies = dict(
+            zip(parameter_names(self.given.robot), UNITS * len(self.given.robot.layout.bodies), strict=True)
+        )
         return of_bodies | {
             f"{field.name}.{joint.name}": _unit(field.unit, joint.type == "prismatic")
             for field in self.terms.fields
@@ -104,6 +106,16 @@ class AnalyticalIdentification(Summary):
         Without information in the data it is the prior's spread. Linearised (delta method).
         """
         return dict(zip(self.names, np.linalg.norm(self._spread, axis=1).tolist(), strict=True))
+
+    @cached_property
+    def centers_of_mass(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
+        """Of the bodies in the axes of their child links, and their standard errors (delta method), in m."""
+        masses, moments = self.parameters[:, :1], self.parameters[:, 1:4]
+        spread = self._spread[: self.parameters.size].reshape(*self.parameters.shape, -1)
+        centers = moments / masses
+        return centers, np.linalg.norm(
+            (spread[:, 1:4] - centers[..., None] * spread[:, :1]) / masses[..., None], axis=-1
+        )
 
     @cached_property
     def _spread(self) -> np.ndarray:

@@ -127,7 +127,8 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
 
 
 def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation]:
-    names, tree = robot.joint_names, robot.tree
+    names, tree, layout = robot.joint_names, robot.tree, robot.layout
+    bodies = [(names[drive.joint], joint.child) for joint, drive in zip(layout.bodies, layout.drives, strict=True)]
     linear = np.stack([1.0 - FACTORS, FACTORS], axis=1)  # of the torques at 0 and at 1
 
     def with_tree(**changes: torch.Tensor) -> np.ndarray:
@@ -148,8 +149,7 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
     if len(names) > 1:
         text = "all torques fit {:.3g} times the masses of the URDF (or the torque unit is another)"
         yield factor("masses", text.format, 0.0 * tau, cost=-0.1)
-    for body, name in enumerate(names):
-        link = robot.joints[body].child
+    for body, (name, link) in enumerate(bodies):
         J = tree.inertias[body, :, :, 0]
         if float(J[3, 3]) <= 0.0:
             continue
@@ -164,10 +164,10 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
     quadratic = np.stack([FACTORS**0, FACTORS, FACTORS**2], axis=1) @ np.linalg.inv(
         np.stack([powers**0, powers, powers**2], axis=1)
     )
-    for body, name in enumerate(names):
+    for body, (name, link) in enumerate(bodies):
         length = float(torch.linalg.vector_norm(tree.rest[body, :3, 3, 0]))
         for whole in (False, True):
-            if not whole and (length == 0.0 or robot.layout.parents[body] < 0):
+            if not whole and (length == 0.0 or layout.parents[body] < 0):
                 continue  # where the whole robot stands changes nothing
             taus = []
             for x in powers:
@@ -175,16 +175,16 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
                 if whole:  # the link of this joint with everything on it
                     stretch = torch.diag(torch.tensor([x, x, x, 1.0], dtype=rest.dtype, device=rest.device))
                     inertias[body, :, :, 0] = stretch @ inertias[body, :, :, 0] @ stretch
-                    for child, parent in enumerate(robot.layout.parents):
+                    for child, parent in enumerate(layout.parents):
                         if parent == body:
                             rest[child, :3, 3] *= x
                 else:
                     rest[body, :3, 3] *= x
                 taus.append(with_tree(rest=rest, inertias=inertias))
 
-            def seen(x: float, name: str = name, body: int = body, whole: bool = whole, length: float = length) -> str:
+            def seen(x: float, name: str = name, link: str = link, whole: bool = whole, length: float = length) -> str:
                 if whole:
-                    return f"the torques fit {x:.3g} times the length of {robot.joints[body].child}"
+                    return f"the torques fit {x:.3g} times the length of {link}"
                 what = f"the length from {name} to the joint before ({x * length:.3g} instead of {length:.3g} m)"
                 return f"the torques fit {x:.3g} times {what}"
 

@@ -35,7 +35,7 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
     moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
     heavy = [link for link in moving if link.mass > 0.0]
     reach = _reach(robot)
-    children = {joint.child for joint in robot.joints}
+    children = {joint.child for joint in robot.layout.bodies}
     alone = [link.name for link in moving if link.mass == 0.0 and link.name in children]
     if alone:
         yield look(
@@ -65,7 +65,7 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
 
 def _reach(robot: Robot) -> float:
     """Sum of the distances between joints, plus the largest distance of a centre of mass from its joint [m]."""
-    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.joints)
+    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
     centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
     return origins + max(centers, default=0.0) if origins > 0.0 else 0.0
 

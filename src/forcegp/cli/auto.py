@@ -54,17 +54,17 @@ class Auto(Resuming, Import):
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder of results; an unfinished one resumes."""
     correct: bool = False
-    """Correct the mistakes that are found in units, signs and the order of joints, and go on."""
+    """Correct mistakes in units, signs and the order of joints, and continue."""
     accept: bool = False
-    """Go on although something is wrong with the log that nobody corrected."""
+    """Continue although the log contains mistakes."""
     models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=MODEL_PARTS)] = ()
     """What is compared, as for forcegp validate."""
     link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
     """Where a payload may be."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Low-pass filter. auto: of which the parameters predict held-out torques best."""
+    """Low-pass filter. auto: the one that predicts held-out torques best."""
     delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
-    """How much later than it acts u was logged, in s."""
+    """Delay of u in the log, in s."""
     every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
 
@@ -92,7 +92,7 @@ class Auto(Resuming, Import):
                 terminal.show(_findings(terminal, wrong))
                 raise DatasetError(
                     f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
-                    "add --accept to go on."
+                    "add --accept to continue."
                 )
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
@@ -125,7 +125,7 @@ class Auto(Resuming, Import):
         content |= {"cpu_seconds": time.process_time() - begin}
         write_json(self.out / "payload.json", {} if payload is None else payload.to_dict())
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
-        write_text(self.out / "identified.urdf", identified.system.robot.to_urdf())
+        identified.system.robot.to_urdf(self.out / "identified.urdf")
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
         table = Table.grid(padding=(0, 2))
         table.add_column(style="bold", no_wrap=True)
@@ -249,7 +249,7 @@ class Auto(Resuming, Import):
                 findings=[forcegp.report.Finding(*line) for line in answer],
                 pictures=forcegp.report.validation_pictures(content),
                 tables=[forcegp.report.validation_table(content, NAMES)],
-                next_steps=[forcegp.report.Finding("Record the motion that teaches most:", command)],
+                next_steps=[forcegp.report.Finding("Record the most informative motion:", command)],
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
                 },

@@ -253,7 +253,7 @@ class BackendOptions(Command):
 class Resuming(Command):
     """A command that keeps every finished piece of work in its folder."""
 
-    interrupted: ClassVar[str] = "finished pieces are kept, and the same command goes on from there"
+    interrupted: ClassVar[str] = "finished pieces are kept, and the same command resumes"
     replaces: ClassVar[bool] = False
 
 

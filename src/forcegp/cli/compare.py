@@ -105,9 +105,9 @@ class Compare(LearningOptions):
     ) -> forcegp.PriorComparison:
         points = min(POINTS, len(dataset)) if self.points is None else self.points
         options = forcegp.models.default_options(points)
-        options = replace(options, iterations=self.iterations, adam_steps=self.adam_steps)
+        options = replace(options, iterations=self.iterations)
         restarts = forcegp.models.default_restarts(points) if self.restarts is None else self.restarts
-        names, steps = list(priors), options.iterations + options.adam_steps
+        names, steps = list(priors), options.iterations
         with terminal.progress(f"comparing: {points} points", may_end_early=True) as report:
 
             def progress(name: str, restart: int, iteration: int, value: float) -> None:

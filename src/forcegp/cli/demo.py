@@ -39,7 +39,7 @@ PUBLISHED_MAE = dict(zip(MODELS, (published.FIG2B_MAE["s-gp"], published.FIG2B_M
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Command):
-    """A robot arm slides its tool on a surface, and a model learns the friction that nobody modelled.
+    """A robot arm slides its tool on a surface, and a model learns the friction of the tool.
 
     Simulates a training and a test trajectory, and fits the model of the paper (Rath, Geist, Trimpe 2021) without and
     with its analytical mean. Scores both on the other trajectory, draws pictures, and keeps everything in one folder.
@@ -76,8 +76,6 @@ class Demo(Command):
                 models[name], fits[name] = self._fitted(terminal, folder / place, train, name, mean)
                 evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
             pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-            histories = {name: posterior.result.history for name, posterior in models.items()}
-            forcegp.evaluation.save_figure(forcegp.evaluation.likelihood_figure(histories), folder / "likelihood.png")
             terminal.note(f"drew {', '.join(pictures)}")
             wall_seconds = time.monotonic() - start
             results = {

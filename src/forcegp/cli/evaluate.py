@@ -50,13 +50,13 @@ class Evaluate(Command):
     system: SystemChoice = "model"
     """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
     contact: Annotated[tuple[str, ...], listed(CONTACTS, "those of --system", goes_on=NUMBERS)] = ()
-    """Predict under these contacts instead, for example a joint that stuck; written as for forcegp fit."""
+    """Predict under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
     report: Annotated[Path | None, unless_given("FILE.html", "no report")] = None
-    """Also write one page to send around: the robot in motion with its forces, pictures and errors."""
+    """Also write a report in one file: the robot in motion with its forces, figures and errors."""
     shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
-    """What the links look like in the report: a URDF with visual elements, its meshes beside it."""
+    """A URDF with visual elements for the links in the report, its meshes beside it."""
     overwrite: bool = False
     """Replace the folder of plots and the report if forcegp wrote them."""
 
@@ -142,17 +142,9 @@ def evaluate_with_progress(
 
 def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
-    figures = {
-        "prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset),
-        "likelihood.png": lambda: forcegp.evaluation.likelihood_figure(
-            {posterior.description: posterior.result.history}, objective=posterior.objective
-        ),
-    }
-    if posterior.system.contacts:
-        figures["tool_path.png"] = lambda: forcegp.evaluation.tool_path_figure(posterior, dataset)
-        figures["summary.png"] = lambda: forcegp.evaluation.summary_figure(posterior, dataset)
-        if posterior.predicts_forces:
-            figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
+    figures = {"prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset)}
+    if posterior.system.contacts and posterior.predicts_forces:
+        figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
     if forcegp.evaluation.curve_panels(posterior):
         figures["forces.png"] = lambda: forcegp.evaluation.friction_curves_figure(posterior, dataset)
     with terminal.progress("drawing") as report:

@@ -21,7 +21,7 @@ from forcegp.errors import InvalidInput
 
 @dataclass(frozen=True, kw_only=True)
 class Excite(RobotOptions):
-    """Choose a motion within limits, from rest to rest, after which learned forces are surest.
+    """Choose the motion within limits, from rest to rest, that reduces the uncertainty of learned forces most.
 
     With --robot instead of a model, one that identifies base parameters and friction.
 
@@ -45,11 +45,11 @@ class Excite(RobotOptions):
     posture: Annotated[tuple[float, ...], listed("Q,...", "mean of the log, or middle of the ranges", of=float)] = ()
     """Positions of the joints at both ends."""
     avoid: Annotated[tuple[str, ...], listed(CONTACTS, "its contacts", goes_on=NUMBERS)] = ()
-    """What points of the robot shall not touch, as in `forcegp fit --contact`; or none."""
+    """Surfaces that points of the robot must not touch, as in `forcegp fit --contact`; or none."""
     clearance: Annotated[float, arg(metavar="M")] = 0.05
     """How far the points of --avoid stay away, in m."""
     task: Annotated[Path | None, DATASET, unless_given("DATA", "all within the limits", Path)] = None
-    """A log with the states at which forces shall be sure (HDF5)."""
+    """A log with the states at which forces should be certain (HDF5)."""
     tries: Annotated[int, arg(metavar="N")] = 300
     """How many motions to look at."""
     seed: Annotated[int, arg(metavar="K")] = 0

@@ -49,7 +49,7 @@ class Export(Command):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Write and show."""
         if self.integrator is not None and self.steps is None:
-            raise InvalidInput("--integrator was given without --steps, which says how long a step lasts.")
+            raise InvalidInput("--integrator was given without --steps, which sets the length of a step.")
         self.require_free(self.out)
         posterior = forcegp.load_posterior(self.run_folder)
         names = ("to", "covariance", "jacobian", "steps", "integrator")

@@ -114,7 +114,7 @@ def fit_with_progress(
     """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
     # networks have no options, but steps of their own
     options: forcegp.inference.OptimizerOptions | None = how.get("options")
-    steps = model.steps if options is None else options.iterations + options.adam_steps
+    steps = model.steps if options is None else options.iterations
     wanted = how.get("restarts", 1)
     restarts = forcegp.models.default_restarts(how["points"]) if wanted is None else wanted
     with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
@@ -167,7 +167,7 @@ def motion_report(posterior: Any) -> list[Any]:
         f"{found['windows']} windows of {found['seconds']:g} s, whose initial states are estimated, too; rms of q by "
         f"joint: {error}."
     )
-    weak = f"Not told by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
+    weak = f"Not identified by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
     table = columns("refined on motions", ["", "value", "std. error"], rows)
     return [*([table] if rows else []), summary, *([weak] if weak else [])]
 

@@ -24,19 +24,19 @@ GROUPS: Mapping[str, str] = {
     "Columns": "time q v u a step joints unit sign scale offset episode unwrap",
     "Timing": "start end gap resample rate",
     "Preparation": "cutoff differentiate delay lag every trim",
-    "Robot": "robot shapes inertias identified lock armature gravity beyond_limits link system contact known_force",
+    "Robot": "robot shapes inertias base root identified "
+    "lock armature gravity beyond_limits link system contact known_force",
     "Scene": "surface contact_model tool_friction friction_coefficient joint_friction patch",
     "Motion": "seconds trajectories start_rows starts integrator baumgarte samples posture limits limit_share avoid "
     "clearance tries bandwidth false_alarms",
     "Noise": "noise force_noise measured_torque",
     "Model": "model models prior priors mean hyperprior learn friction rotors likelihood "
     "robust prior_strength identification",
-    "Fit": "points learning_points rows learn_from window motions engine restarts iterations adam_steps checks "
-    "correct accept",
+    "Fit": "points learning_points rows learn_from window motions engine restarts iterations checks correct accept",
     "Score": "split guard seeds seed_list horizon margin block_seconds strict",
     "Program": "to steps covariance jacobian unchecked",
     "Compute": "preset seed jobs backend device port",
-    "Output": "out plots report html rerun write_mapping docs overwrite json",
+    "Output": "out plots report html browser rerun write_mapping docs overwrite json",
     "Other": "debug",
 }
 """Options of all commands by purpose, in the order of the pages: a name means the same everywhere."""

@@ -16,12 +16,13 @@ import forcegp
 import forcegp.analytical
 import forcegp.inference
 import forcegp.models
+import forcegp.priors
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, listed, unless_given
+from forcegp.cli.command import DATASET, FIELDS, listed, unless_given
 from forcegp.cli.fit import fit_summary, fit_with_progress, motion_report, refined_with_progress
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import PARTS, friction_laws, parse_learn, with_learned_forces
-from forcegp.cli.model_choice import FitOptions, resolved_noise
+from forcegp.cli.model_choice import PRIORS, FitOptions, resolved_noise
 from forcegp.cli.terminal import NONE, Terminal, columns, with_option_names
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
@@ -33,14 +34,16 @@ class IdentifyOptions(FitOptions):
     learn: Annotated[tuple[str, ...], listed("LINK:PARTS|FORCE,...", goes_on=PARTS)] = ()
     """What to estimate. LINK:PARTS: out of mass, com (centre of mass) and inertia. FORCE or FORCE:JOINT,JOINT:
     viscous-joint-friction, coulomb-joint-friction or armature, of all joints or of these. They begin at the URDF's
-    coefficients, or at FORCE=START. The models least-squares and consistent estimate all of it instead."""
+    coefficients, or at FORCE=START. The models least-squares and consistent estimate all of these instead."""
     model: Literal["structured", "analytical", "least-squares", "consistent"] = "structured"
-    """structured: Gaussian processes model the unknown forces. analytical: there are none but noise.
-    least-squares: regression of joint forces on every inertia. consistent: the same with inertias that bodies can have.
-    """
+    """structured: Gaussian processes model the unknown forces. analytical: no unknown forces, noise alone.
+    least-squares: regression of joint forces on every inertia. consistent: the same, physically consistent."""
+    prior: Annotated[tuple[str, ...], listed(PRIORS, "joint", goes_on=FIELDS)] = ()
+    """With structured: what the unknown forces may be, as in forcegp fit, for instance joint-friction or
+    payload:frame=LINK."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """With the last two models: viscous, coulomb or stribeck or load (grows with |u|), offset, direction (viscous
-    friction that differs by it); none for no friction."""
+    friction that depends on the direction); none for no friction."""
     rotors: Literal["armature", "rotor", "none"] = "armature"
     """With the last two models: armature: one rotor inertia per joint. rotor: those of the system's coupled rotors."""
     likelihood: Literal["torque", "acceleration"] = "torque"
@@ -51,7 +54,7 @@ class IdentifyOptions(FitOptions):
     test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none", Path)] = None
     """With the last two models: score on this recording, too."""
     motions: Annotated[float | None, unless_given("S", "none", float)] = None
-    """With consistent: refine all of it in the end on the recorded positions, over windows so long. See
+    """With consistent: finally refine all parameters on the recorded positions, over windows of S seconds. See
     docs/how-to/motions.md."""
     prior_strength: Annotated[float | None, unless_given("W", "0; 1 for the last two models", float)] = None
     """Weight that holds inertias near the URDF's, w/2 times their squared distance in the geometric metric."""
@@ -117,7 +120,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
         write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
-            (folder / "identified.urdf").write_bytes(identified.robot.to_urdf().encode("utf-8"))
+            identified.robot.to_urdf(folder / "identified.urdf")
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*tables, *_report_of_regression(command, found, content, identified))
@@ -126,7 +129,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
 
 def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
     """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
-    given = {"learn": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
+    given = {"learn": (), "prior": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
     changed = [name for name, default in given.items() if getattr(command, name) != default]
     if changed:
         option = changed[0].replace("_", "-")
@@ -159,6 +162,22 @@ def _report_of_regression(
         header = ["joint", "force rms\nbefore [Nm]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
         tables.append(columns(f"{command.out}: residuals of the {name} data", header, rows))
     errors, values, units = found.standard_errors, found.values, found.units
+    centers, center_errors = found.centers_of_mass
+    weak_bodies = dict(found.weak_directions)
+    rows = []
+    for body, link in enumerate(forcegp.analytical.body_names(found.given.robot)):
+        mass, center, spread = f"{link}.m", 1e3 * centers[body], 1e3 * center_errors[body]
+        rows.append(
+            [
+                link,
+                f"{found.start[mass]:.4g}",
+                f"{values[mass]:.4g} ± {errors[mass]:.2g}",
+                ", ".join(f"{x:.1f} ± {e:.2g}" for x, e in zip(center, spread, strict=True)),
+                f"{10 - weak_bodies.get(link, 0):.0f} of 10",
+            ]
+        )
+    header = ["body", "mass [kg]\ngiven", "\nidentified", "centre of mass [mm]\nx, y, z", "directions\nin the data"]
+    tables.append(columns("bodies, ± standard errors; the URDF decides what the data do not hold", header, rows))
     rows = []
     for field in dict.fromkeys(name.partition(".")[0] for name in found.terms.names):
         rows.append([f"{field.replace('_', ' ')} [{units[f'{field}.{joints[0]}']}]"])
@@ -193,7 +212,7 @@ COEFFICIENT_NAMES = (
 class Identify(IdentifyOptions):
     """Estimate physical parameters of the robot along with the unknown forces, and report their standard errors.
 
-    The estimates start from the URDF and always belong to a body that can exist (but those of least-squares). The
+    The estimates start from the URDF. Except for least-squares, they are physically consistent. The
     folder holds identified.urdf, identification.json, and the model as `forcegp fit` writes it, or system.json for
     --identified.
 
@@ -201,7 +220,7 @@ class Identify(IdentifyOptions):
       forcegp identify log.h5 --robot arm.urdf --model consistent --friction viscous,coulomb,offset --out identified
       forcegp identify log.h5 --robot arm.urdf --model consistent --motions 1 --out identified
       forcegp identify train.h5 --learn lbr_iiwa_link_7:mass,com --points 100 --out identified
-      forcegp identify log.h5 --learn tool:mass,com,inertia,viscous-joint-friction=0.1 --out identified
+      forcegp identify log.h5 --learn tool:mass,com,armature=0.1 --prior joint-friction --out identified
     """
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
@@ -212,6 +231,10 @@ class Identify(IdentifyOptions):
             raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
         if self.model in INERTIAS:
             return identify_by_regression(self, terminal)
+        if self.model == "analytical" and self.prior:
+            raise InvalidInput(
+                "--model analytical has no unknown forces; leave --prior out, or use --model structured."
+            )
         if self.motions is not None:
             raise InvalidInput("--motions goes with --model consistent; for the processes use forcegp fit --motions.")
         self.require_free(self.out)
@@ -222,8 +245,13 @@ class Identify(IdentifyOptions):
         system, added = with_learned_forces(self._system(dataset), learn)
         self._check(terminal, dataset, system)
         dataset, rows_note = self._rows(dataset, system)
-        prior = forcegp.NoForces() if self.model == "analytical" else forcegp.JointForces()
-        model = forcegp.StructuredGP(system, prior, self.mean, resolved_noise(self.noise, dataset, self.force_noise))
+        prior = "none" if self.model == "analytical" else " + ".join(self.prior or ("joint",))
+        model = forcegp.StructuredGP(
+            system,
+            forcegp.priors.named_prior(prior, system),
+            self.mean,
+            resolved_noise(self.noise, dataset, self.force_noise),
+        )
         posterior = fit_with_progress(
             terminal,
             model,
@@ -234,7 +262,7 @@ class Identify(IdentifyOptions):
             seed=self.seed,
             backend=self._backend(),
             hyperprior=self.hyperprior,
-            options=forcegp.inference.OptimizerOptions(iterations=self.iterations, adam_steps=self.adam_steps),
+            options=forcegp.inference.OptimizerOptions(iterations=self.iterations),
             learn=learn,
             prior_strength=self.prior_strength or 0.0,
             learning_points=self.learning_points,
@@ -245,8 +273,7 @@ class Identify(IdentifyOptions):
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
         identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
-        urdf = posterior.system.robot.to_urdf()
-        self._write(posterior, {"identification.json": identification, "identified.urdf": urdf})
+        self._write(posterior, {"identification.json": identification}, posterior.system.robot)
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:

@@ -75,7 +75,7 @@ class Import(PreparationOptions, RobotOptions):
     scale: Text = None
     """A factor, for instance u=0.1 for all joints or u=0.1,0.2."""
     offset: Text = None
-    """What is added at last, in SI: q=0,1.5708."""
+    """Added last, in SI units: q=0,1.5708."""
     episode: Text = None
     """A column that numbers the episodes."""
     episodes: Text = None
@@ -87,7 +87,7 @@ class Import(PreparationOptions, RobotOptions):
     side_by_side: bool = False
     """The files are one recording, with a signal in each; columns are called FILE:column."""
     gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
-    """A longer pause begins another episode."""
+    """A longer pause starts a new episode."""
     resample: Literal["auto", "no"] = "auto"
     """auto: rows at uneven times are given even ones by a cubic spline. no: every stamp is kept."""
     rate: Annotated[float | None, unless_given("HZ", "the median", float)] = None

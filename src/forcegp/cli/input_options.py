@@ -19,26 +19,50 @@ from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, u
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
-ROBOT_OPTIONS = ("robot", "inertias", "lock", "armature", "gravity", "identified")
+ROBOT_OPTIONS = ("robot", "inertias", "base", "root", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotOptions(Command):
-    """What every command asks that needs a robot."""
+class RobotFileOptions(Command):
+    """What every command asks that reads a robot file."""
 
-    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
-    """Use this robot instead of the dataset's."""
     inertias: Literal["strict", "nearest"] = "strict"
-    """What to do about a link with an inertia that no body has. strict: refuse the URDF. nearest: use the nearest
-    inertia that a body can have, and warn how far it is."""
+    """What to do about a physically impossible inertia. strict: refuse the URDF. nearest: use the nearest possible
+    one, and warn how far it is."""
+    base: Annotated[Literal["fixed"] | None, unless_given("fixed", "asked where a file looks otherwise")] = None
+    """How the base is held. fixed: bolted to the world, also where the robot has legs, wheels or rotors."""
+    root: Annotated[str | None, unless_given("LINK", "that of the file", str)] = None
+    """A link that the URDF does not define, such as world, which the base hangs on."""
     lock: Annotated[tuple[str, ...], listed("JOINT=RAD,...", "as recorded")] = ()
     """Hold joints of the URDF at these positions (rad or m), for instance a finger that was not recorded."""
     armature: Annotated[tuple[str, ...], listed("JOINT=VALUE,...", "as recorded, or 0")] = ()
     """Rotor inertias seen at joints, in kg m² (kg for a prismatic one)."""
     gravity: Annotated[str | None, unless_given("X,Y,Z", "as recorded, or 0,0,-9.81", str)] = None
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
+
+    def _changes(self) -> dict[str, Any]:
+        """Arguments of `Robot.from_urdf` by name."""
+        changes: dict[str, Any] = {name: value for name in ("base", "root") if (value := getattr(self, name))}
+        if self.gravity is not None:
+            words = self.gravity.split(",")
+            if len(words) != 3:
+                raise InvalidInput(f"--gravity {self.gravity} holds {len(words)} numbers; write --gravity 0,0,-9.81.")
+            changes["gravity"] = [_finite(word, f"--gravity {self.gravity}") for word in words]
+        if self.lock:
+            changes["locked"] = _named(self.lock, "--lock", "JOINT=RAD")
+        if self.armature:
+            changes["armature"] = _named(self.armature, "--armature", "JOINT=VALUE")
+        return changes
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotOptions(RobotFileOptions):
+    """What every command asks that needs a robot."""
+
+    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
+    """Use this robot instead of the dataset's."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
     """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
 
@@ -83,7 +107,8 @@ class RobotOptions(Command):
     def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
         """A robot from a URDF file, or from the recorded one's text, with what the options change."""
         if recorded is not None:
-            changes = {"gravity": recorded.gravity.tolist(), "locked": recorded.locked} | changes
+            kept = {"gravity": recorded.gravity.tolist(), "locked": recorded.locked, "base": recorded.base}
+            changes = kept | changes
         if self.robot is not None:
             robot = forcegp.Robot.from_urdf(self.robot, inertias=self.inertias, **changes)
         else:
@@ -94,28 +119,16 @@ class RobotOptions(Command):
         # robots with other joints are refused by their names: clearer than an armature of the wrong length
         if recorded is None or robot.joint_names != recorded.joint_names:
             return robot
+        if self.robot is not None and not self.armature and bool(robot.armature.any()):
+            return robot  # a file beside the URDF says more than the recording
         kept = dict(zip(recorded.joint_names, recorded.armature.tolist(), strict=True))
         return robot.with_armature(kept | changes.get("armature", {}))
-
-    def _changes(self) -> dict[str, Any]:
-        """Arguments of `Robot.from_urdf` by name."""
-        changes: dict[str, Any] = {}
-        if self.gravity is not None:
-            words = self.gravity.split(",")
-            if len(words) != 3:
-                raise InvalidInput(f"--gravity {self.gravity} holds {len(words)} numbers; write --gravity 0,0,-9.81.")
-            changes["gravity"] = [_finite(word, f"--gravity {self.gravity}") for word in words]
-        if self.lock:
-            changes["locked"] = _named(self.lock, "--lock", "JOINT=RAD")
-        if self.armature:
-            changes["armature"] = _named(self.armature, "--armature", "JOINT=VALUE")
-        return changes
 
     def _identified_system(self) -> forcegp.MechanicalSystem | None:
         if self.identified is None:
             return None
-        given = {"robot": self.robot, "lock": self.lock, "armature": self.armature, "gravity": self.gravity}
-        contradicting = [f"--{name}" for name, value in given.items() if value]
+        given = ("robot", "base", "root", "lock", "armature", "gravity")
+        contradicting = [f"--{name}" for name in given if getattr(self, name)]
         if contradicting:
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
 
@@ -189,8 +202,8 @@ class CutoffOptions(Command):
     """What every command asks that filters a log."""
 
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
-    """Low-pass filter q and u without delay, and compute v and a anew. auto: near where the spectrum shows
-    the end of the motion, as held-out torques decide."""
+    """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
+    torques."""
     differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
 
@@ -209,14 +222,14 @@ class PreparationOptions(CutoffOptions):
     """What every command asks that makes rows to learn from out of a raw log."""
 
     delay: Annotated[str, arg(metavar="S|auto|each")] = "0"
-    """How much later than it acts u was logged, in s: one number, or one per joint with commas. auto: estimated for all
-    joints together, each: for each, which need the robot."""
+    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together.
+    each: estimated per joint. Both need the robot."""
     lag: Annotated[str, arg(metavar="S|auto|each")] = "0"
     """Time constant in s with which actuators of first order follow u: as for --delay."""
     every: Annotated[int | None, unless_given("N", "1", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0
-    """Drop so many seconds at both ends of each episode, after the filter."""
+    """Drop S seconds at both ends of each episode, after the filter."""
 
     @override
     def _preparation(self) -> forcegp.Preparation:

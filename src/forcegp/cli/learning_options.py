@@ -169,8 +169,6 @@ class LearningOptions(BackendOptions, RobotOptions):
     """Draws the starts of the search after the first."""
     jobs: Annotated[int | None, unless_given("J", "1, or all that --backend has", int)] = None
     """Restarts at once."""
-    adam_steps: Annotated[int, arg(metavar="N")] = 0
-    """Adam steps before the L-BFGS iterations."""
     hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
     """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
     contact: Annotated[tuple[str, ...], listed(CONTACTS, "the dataset's", goes_on=NUMBERS)] = ()

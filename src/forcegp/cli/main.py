@@ -25,7 +25,7 @@ from forcegp.cli.help_pages import command_page, flag_of, front_page, show
 from forcegp.cli.terminal import Terminal, with_option_names
 from forcegp.errors import ForceGPError, InvalidInput, NotEnoughMemory
 
-DESCRIPTION = """Learn the forces that nobody modelled, inside the rigid-body dynamics that are known.
+DESCRIPTION = """Learn the forces that a robot model lacks: friction, payload, cables.
 
 Begin with:
   forcegp demo
@@ -39,24 +39,25 @@ or step by step:
 Every command has --help, --json and --debug, and writes its lists with commas, as in --models a,b."""
 
 COMMANDS: Mapping[str, str] = {
-    "auto": "from logs and a URDF to a validated model, in one command",
-    "demo": "the whole story in a minute: simulate, learn, evaluate, draw",
+    "auto": "go from logs and a URDF to a validated model, in one command",
+    "demo": "simulate, learn, evaluate and draw, in a minute",
     "simulate": "make a dataset with ground truth",
-    "import": "make a dataset of logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot",
-    "check": "what would spoil a model of this log, and what to do about it",
-    "prepare": "filter and differentiate a raw log, and report what that costs",
+    "import": "make a dataset from logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot",
+    "robot": "show a robot file: tree, limits, masses, repairs, and a picture",
+    "check": "find mistakes in a log, with the correction of each",
+    "prepare": "filter and differentiate a raw log, and report the signal lost",
     "fit": "learn the unknown forces from a dataset",
-    "compare": "which kind of unknown force the data support",
+    "compare": "compare priors: which unknown force the data support",
     "identify": "estimate masses, inertias and friction coefficients, and their standard errors",
-    "payload": "mass, centre of mass and inertia of what the robot holds",
+    "payload": "estimate mass, centre of mass and inertia of a payload",
     "evaluate": "score a fitted model on another dataset",
-    "validate": "models side by side on rows of a log that none of them has seen",
-    "view": "a recording and its learned forces in 3D, in the browser",
+    "validate": "compare models on unseen time of a log",
+    "view": "show a recording and its learned forces in 3D, in the browser",
     "rollout": "predict whole motions and compare them with the recorded ones",
-    "monitor": "when a robot was touched, where and how hard, from a log without force sensor",
-    "excite": "the next motion to record: the one that teaches most",
+    "monitor": "find contacts in a log without a force sensor: time, link and force",
+    "excite": "the most informative motion to record next",
     "export": "write a fitted model as a C program",
-    "reproduce": "every figure and number of the paper, from one command",
+    "reproduce": "reproduce every figure and number of the paper",
 }
 """A new command is an entry here, and a module of that name with a subclass of Command of that name."""
 MODULES = {"import": "import_log"}

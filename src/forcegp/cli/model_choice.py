@@ -38,13 +38,20 @@ class FitOptions(LearningOptions):
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder to write."""
 
-    def _write(self, posterior: forcegp.models.Posterior, more: Mapping[str, str] | None = None) -> None:
-        """The model, `more` files by name with their text, and how it was made."""
+    def _write(
+        self,
+        posterior: forcegp.models.Posterior,
+        more: Mapping[str, str] | None = None,
+        identified: forcegp.Robot | None = None,
+    ) -> None:
+        """The model, `more` files by name with their text, the URDF of a robot, and how it was made."""
         content = {**self._given(), "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
             for name, text in (more or {}).items():
                 (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
+            if identified is not None:
+                identified.to_urdf(folder / "identified.urdf")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +85,7 @@ class ModelOptions(FitOptions):
     window: Annotated[float | None, unless_given("S", f"{WINDOW}", float)] = None
     """Length of the windows of weak-form."""
     motions: Annotated[float | None, unless_given("S", "none", float)] = None
-    """After the fit, refine friction, inertias and the unknown forces on the recorded positions, over windows so long.
+    """After the fit, refine friction, inertias and unknown forces on the recorded positions, over windows of S seconds.
     See docs/how-to/motions.md."""
     iterations: Annotated[int | None, unless_given("N", ITERATIONS_HINT, int)] = None
     """Most L-BFGS iterations of each start, or training steps of a network."""
@@ -104,7 +111,6 @@ MEANT_FOR: Mapping[str, tuple[str, ...]] = {
     "learn_from": ("structured", "unconstrained", "analytical"),
     "motions": ("structured", "analytical"),
     "backend": SEARCHED,
-    "adam_steps": (*SEARCHED, "analytical"),
     "hyperprior": (*SEARCHED, "analytical"),
 }
 """Options that mean nothing to some models -> those to which they do."""
@@ -189,7 +195,7 @@ def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
         "restarts": 1 if command.model == "analytical" else command.restarts,  # its starts are all the same
         "backend": command._backend(),
         "hyperprior": command.hyperprior,
-        "options": replace(options, iterations=command.iterations, adam_steps=command.adam_steps),
+        "options": replace(options, iterations=command.iterations),
     }
 
 

@@ -28,9 +28,9 @@ APART = 0.25  # alarms that are less apart in s belong to one contact
 
 @dataclass(frozen=True, kw_only=True)
 class Monitor(Command):
-    """Find contacts that nobody modelled in a log: when, on which link, and with what force. No sensor is needed.
+    """Find contacts in a log without a force sensor: time, link and force of each.
 
-    What moves the robot beyond the model is a contact where free motion of the same robot hardly ever shows as much.
+    A residual torque counts as a contact if it exceeds what free motion of the same robot shows.
     LOG is a dataset, or any log that forcegp import reads, with the signals of the joints of the model.
 
     For example:
@@ -41,19 +41,19 @@ class Monitor(Command):
     run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote, of a robot without contacts."""
     log: Annotated[Positional[Path], LOG, arg(metavar="LOG")]
-    """The log to look at, at the rate of its sensors."""
+    """The log to search, at the rate of its sensors."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: contacts.csv, contacts.json and contacts.png."""
     free: Annotated[Path | None, LOG, unless_given("LOG", "--free-seconds of LOG")] = None
-    """A log in which nothing touches the robot, of 40 s or more, which the model did not learn from."""
+    """A log of 40 s or more without contacts, not used for training."""
     free_seconds: Annotated[float | None, unless_given("S", "--free")] = None
-    """Nothing touches the robot in the first S seconds of LOG; they serve as --free, and are not looked at."""
+    """The first S seconds of LOG are without contacts; they replace --free and are not searched."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside the log, or by the names")] = None
     """What the columns of logs mean, as for forcegp import."""
     false_alarms: Annotated[float, arg(metavar="N")] = 0.1
-    """How many false alarms an hour are accepted."""
+    """Accepted false alarms per hour."""
     bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
-    """Cut-off of the low-pass filter on the torques: higher is sooner, lower sees smaller forces."""
+    """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
     overwrite: bool = False
     """Replace the folder if forcegp wrote it."""
 

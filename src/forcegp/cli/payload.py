@@ -24,10 +24,10 @@ LABELS |= {f"inertia.{x}": (f"inertia {x}", "kg m²", 1.0) for x in ("xx", "yy",
 
 @dataclass(frozen=True, kw_only=True)
 class Payload(PreparationOptions, RobotOptions):
-    """Find the mass, centre of mass and inertia of a payload, with friction and rotors estimated along.
+    """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
 
-    The log is a motion in the air that turns every joint in both directions, of 20 s or more. Without --baseline, what
-    the URDF's links lack counts as payload. With one, both logs share the links, which are estimated, too.
+    The log is a motion without contact of 20 s or more that turns every joint in both directions. Without --baseline,
+    errors of the URDF's links count as payload. With one, the links are estimated from both logs.
 
     For example:
       forcegp payload loaded.h5 --robot arm.urdf
@@ -39,13 +39,13 @@ class Payload(PreparationOptions, RobotOptions):
     baseline: Annotated[Path | None, DATASET, unless_given("DATA", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
     link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
-    """What carries the payload, and in whose frame it is reported."""
+    """The link that carries the payload; results are in its frame."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "stribeck", "offset")
-    """What is estimated of friction, as for forcegp identify."""
+    """Friction laws to estimate, as for forcegp identify."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Low-pass filter of a log that is not prepared yet. auto: of which parameters predict held-out torques best."""
+    """Low-pass filter of a raw log. auto: the one that predicts held-out torques best."""
     delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
-    """How much later than it acts u was logged, in s."""
+    """Delay of u in the log, in s."""
     out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
     """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
     overwrite: bool = False
@@ -65,7 +65,7 @@ class Payload(PreparationOptions, RobotOptions):
             given = {"command": self.words("baseline", "link", "friction", "cutoff", "delay")}
             with self.folder(self.out, {"data": str(self.data), **given}) as folder:
                 write_json(folder / "payload.json", content)
-                write_text(folder / "loaded.urdf", found.system.robot.to_urdf())
+                found.system.robot.to_urdf(folder / "loaded.urdf")
                 write_text(folder / SYSTEM_FILE, found.system.to_json() + "\n")
         for note in notes:
             terminal.note(note)

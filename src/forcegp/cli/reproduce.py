@@ -18,8 +18,8 @@ from forcegp.errors import InvalidInput
 class Reproduce(Resuming, BackendOptions):
     """Compute figures of Rath, Geist, Trimpe (2021) beside the published values.
 
-    FIGURE is fig2b, fig2c, fig3, fig4 or all. Every finished piece of work is kept in the folder; after an interruption
-    the same command goes on from there.
+    FIGURE is fig2b, fig2c, fig3, fig4 or all. Finished work is kept in the folder; after an interruption the same
+    command resumes.
 
     For example:
       forcegp reproduce all --preset smoke
@@ -32,7 +32,7 @@ class Reproduce(Resuming, BackendOptions):
     preset: Annotated[str, arg(metavar="smoke|paper")] = "smoke"
     """smoke: small, in a few minutes, to see that everything works. paper: the full experiments, CPU-hours."""
     out: Annotated[Path | None, unless_given("FOLDER", "reproduction-PRESET")] = None
-    """The folder of results; an unfinished one is gone on with."""
+    """The folder of results; an unfinished run resumes."""
     docs: Annotated[Path | None, unless_given("FOLDER", "only into --out")] = None
     """Write the page (reproduction.md), its figures, JSON and CSV into this folder, too."""
     points: Annotated[tuple[int, ...], listed("N,...", "the preset's", of=int)] = ()

@@ -26,7 +26,7 @@ MOMENTS = (0.1, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout(Command):
-    """Let a fitted model predict whole motions under recorded torques, and compare them with the recording.
+    """Predict whole motions under recorded torques with a fitted model, and compare them with the recording.
 
     The motions begin at rows of the dataset.
 
@@ -44,7 +44,7 @@ class Rollout(Command):
     start_rows: Annotated[tuple[int, ...], listed("ROW,...", "--starts", of=int)] = ()
     """Begin at these rows of the dataset."""
     starts: Annotated[int | None, unless_given("N", "10")] = None
-    """Begin at so many rows, spread evenly over the recording."""
+    """Begin at N rows, spread evenly over the recording."""
     seconds: Annotated[float, arg(metavar="S")] = 1.0
     """How long each motion lasts."""
     system: SystemChoice = "model"
@@ -54,7 +54,7 @@ class Rollout(Command):
     baumgarte: Annotated[str, arg(metavar="OMEGA[,ZETA]|none")] = "none"
     """Stabilisation of the contacts in the rollout, rad/s and damping ratio (1 if left out)."""
     samples: Annotated[int, arg(metavar="N")] = 0
-    """Also roll out so many functions drawn from the model, for intervals. Time grows with it."""
+    """Also roll out N functions drawn from the model, for intervals. Time grows with N."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the functions."""
     overwrite: bool = False

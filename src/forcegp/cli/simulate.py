@@ -31,7 +31,7 @@ JOINT_FRICTION = arg(help_behavior_hint="(default: none; stribeck for free arms)
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a surface with friction that nobody models, as in Rath, Geist,
+    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
     Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
     friction in every joint, without PyBullet. Equal seeds give equal motions; train and test need different ones.
 
@@ -55,15 +55,15 @@ class Simulate(Command):
     trajectories: Annotated[int, arg(metavar="N")] = 1
     """Number of independent trajectories, each from the start posture."""
     tool_friction: Annotated[ToolFriction | None, TOOL_FRICTION] = None
-    """Friction of the tool, the force that nobody models: viscous, or in proportion to the normal force
+    """Unmodelled friction of the tool: viscous, or in proportion to the normal force
     coulomb or stribeck. PyBullet's contact has no other than coulomb."""
     friction_coefficient: Annotated[float | None, unless_given("F", "1 if viscous, else 0.3", float)] = None
     """viscous: in N/(m/s). coulomb, stribeck: friction per normal force while sliding."""
     joint_friction: Annotated[JointFriction | None, JOINT_FRICTION] = None
-    """Friction of the joints that nobody models either: dry and viscous, with stribeck and exponential more near rest.
+    """Unmodelled friction of the joints: dry and viscous, with stribeck and exponential more near rest.
     asymmetric, load, lugre and drift have no kernel of their own."""
     patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
-    """Makes friction so many times as large on the strip 0 < x < 0.25 m of the surface; 1 for none."""
+    """Multiplies friction on the strip 0 < x < 0.25 m of the surface; 1 for none."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
     """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
     contact_model: Literal["ideal", "bullet"] = "ideal"

@@ -28,8 +28,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     """Fit models side by side, score them on rows that are held out, and write one page about them.
 
     Every model learns from the same rows; what is held out is whole episodes, or blocks of time with a guard around
-    them. A run that was interrupted goes on with the same command; one with more --models or --seeds computes only
-    these. The page is report.md in the folder, the numbers are in results.json, and the recommended model, learned from
+    them. After an interruption the same command resumes; with more --models or --seeds it computes only these. The
+    page is report.md in the folder, the numbers are in results.json, and the recommended model, learned from
     all rows, is in model; see docs/how-to/validation.md.
 
     For example:
@@ -65,7 +65,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     margin: Annotated[float, arg(metavar="RATIO")] = 0.02
     """Models whose errors differ by less count as equal."""
     seeds: Annotated[int, arg(metavar="N")] = 5
-    """So many choices of the rows that models learn from."""
+    """Number of random choices of the rows that models learn from."""
     horizon: Annotated[tuple[float, ...], listed("S,...", of=float)] = (0.1, 0.2, 0.5, 1.0)
     """Lengths of the motions that are predicted from held-out states, in s."""
     starts: Annotated[int, arg(metavar="N")] = 10
@@ -79,8 +79,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
     """Models with physics learn a noise of the joint forces as well, beginning at this standard deviation in Nm."""
     measured_torque: bool = False
-    """u was measured by noisy sensors, and models with physics take it so when they predict: those with --force-noise,
-    or a noise from an identification of all training rows."""
+    """u comes from noisy sensors; predictions account for this noise. It applies to models with physics and a force
+    noise."""
     jobs: Annotated[int | None, unless_given("J", "1", int)] = None
     """Pieces of work at once, each on one core."""
     overwrite: bool = False

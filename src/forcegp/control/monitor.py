@@ -243,7 +243,7 @@ def contact_points(robot: Robot) -> list[tuple[str, Float[Tensor, "3"]]]:
     Of these ends the farthest, in m in the frame of the link.
     """
     layout, points = robot.layout, []
-    for body, joint in enumerate(layout.joints):
+    for body, joint in enumerate(layout.bodies):
         ends = [origin[:3, 3] for origin, parent in zip(layout.origins, layout.parents, strict=True) if parent == body]
         ends += [placed.offset[:3, 3] for placed in layout.links.values() if placed.body == body]
         turn = layout.links[joint.child].offset[:3, :3]

@@ -158,10 +158,10 @@ def missing_contact(
     robot = system.robot
     parents = set(robot.layout.parents)
     best: tuple[float, forcegp.mechanics.Contact] | None = None
-    for body in range(rows.nv):
+    for body, joint in enumerate(robot.layout.bodies):
         if body in parents:
             continue
-        for contact in _surfaces(rows, robot, robot.joints[body].child):
+        for contact in _surfaces(rows, robot, joint.child):
             others, _ = moved_points(rows, system.with_contacts([contact]))
             with_it = Residual(rows, system.with_contacts([contact]), more=others)
             _, left, weights = with_it.fitted(extra=True)  # the motion may show the surface, and not the point

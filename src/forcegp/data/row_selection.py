@@ -4,8 +4,6 @@ Neighbouring rows of one motion are nearly equal: a random split of rows tests m
 therefore by episode, and `require_disjoint` refuses a pair that overlaps.
 """
 
-from collections.abc import Iterable
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -36,39 +34,6 @@ def time_blocks(
         stretch = int((time[row] - first[number]) / seconds)
         blocks.setdefault((number, stretch), []).append(int(row))
     return tuple(tuple(rows) for rows in blocks.values())
-
-
-def train_test_split(
-    dataset: Dataset,
-    *,
-    test_episodes: Iterable[int] | None = None,
-    test_fraction: float | None = None,
-    seed: int | None = None,
-) -> tuple[Dataset, Dataset]:
-    """`(train, test)` of whole episodes: the ones named, or a fraction of them drawn by `seed`.
-
-    A fraction is of the number of episodes, rounded, at least one on either side. Raises InvalidInput if not exactly
-    one of `test_episodes` and `test_fraction` is given, if the fraction comes without a seed, or with fewer than two
-    episodes.
-    """
-    if (test_episodes is None) == (test_fraction is None):
-        raise InvalidInput("give either test_episodes or test_fraction.")
-    if len(dataset.episodes) < 2:
-        raise InvalidInput(
-            "this Dataset has one episode; splitting inside it would test on the training trajectory. "
-            "Record or simulate another one (another seed)."
-        )
-    if test_episodes is not None:
-        return dataset.split_by_episode(test_episodes)
-    if seed is None:
-        raise InvalidInput("test_fraction draws episodes at random; give a seed.")
-    assert test_fraction is not None
-    if not 0 < test_fraction < 1:
-        raise InvalidInput(f"test_fraction is {test_fraction}; it must be between 0 and 1, both excluded.")
-    total = len(dataset.episodes)
-    count = min(max(round(test_fraction * total), 1), total - 1)
-    chosen = np.random.default_rng(seed).choice(dataset.episodes, size=count, replace=False)
-    return dataset.split_by_episode(chosen.tolist())
 
 
 def require_disjoint(train: Dataset, test: Dataset) -> None:

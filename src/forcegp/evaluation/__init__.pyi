@@ -11,14 +11,13 @@ from .plots.excitation import excitation_figure as excitation_figure
 from .plots.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
 from .plots.log import check_figure as check_figure, preparation_figure as preparation_figure
 from .plots.prediction import (
-    likelihood_figure as likelihood_figure, normal_force_figure as normal_force_figure, prediction_figure as
+    normal_force_figure as normal_force_figure, prediction_figure as
     prediction_figure,
 )
 from .plots.motion_bands import motion_bands_figure as motion_bands_figure
 from .plots.contacts import contacts_figure as contacts_figure
 from .plots.rollout import rollout_figure as rollout_figure
 from .plots.style import save_figure as save_figure
-from .plots.tool_path import summary_figure as summary_figure, tool_path_figure as tool_path_figure
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows
 from .prior_comparison import (
     PriorComparison as PriorComparison, PriorScore as PriorScore, compare_priors as compare_priors,

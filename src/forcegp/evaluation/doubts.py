@@ -76,7 +76,7 @@ def poor_scores(scores: Mapping[str, Any]) -> Iterator[str]:
         if mine > WORSE * alone:
             yield (
                 f"the model is worse here than its known forces alone ({what} {mine:.3g} against {alone:.3g}): "
-                "what it has learned does not hold here; do not use it for motions like these"
+                "do not use it for motions like these"
             )
         break  # against the truth where it is known, for noise hides the difference
     for name, what in (
@@ -86,8 +86,8 @@ def poor_scores(scores: Mapping[str, Any]) -> Iterator[str]:
         inside = scores.get(name)
         if inside is not None and float(np.mean(inside)) < FEWEST_INSIDE:
             yield (
-                f"the 95 % intervals hold {float(np.mean(inside)):.0%} of the {what}: the model is surer than it is "
-                "right; a force is missing, the noise is larger than stated, or these motions differ from the training"
+                f"the 95 % intervals hold {float(np.mean(inside)):.0%} of the {what}: the model is "
+                "overconfident; a force is missing, the noise is larger than stated, or these motions are new to it"
             )
 
 

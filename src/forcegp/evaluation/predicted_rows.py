@@ -27,8 +27,7 @@ class PredictedRows:
 
     `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the model, or of
     the Dataset where it states a larger one or that of every row; `negative_log_density` of the measured rows under
-    that noise; `known_physics` the acceleration of the known forces alone; `moving_force` M (mean - known_physics), the
-    part of the unknown force that moves the robot (the other part presses on the surface); `unknown_force` Q_U and
+    that noise; `known_physics` the acceleration of the known forces alone; `unknown_force` Q_U and
     `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all
     three None for a model without forces; `A`, `b` and the mass matrix `mass`.
     """
@@ -42,8 +41,6 @@ class PredictedRows:
     multiplier: Float[np.ndarray, "rows m"] | None
     multiplier_variance: Float[np.ndarray, "rows m"] | None
     known_physics: Float[np.ndarray, "rows nv"]
-    moving_force: Float[np.ndarray, "rows nv"]
-    moving_force_variance: Float[np.ndarray, "rows nv"]
     carried_known_force: Float[np.ndarray, "rows nv"] | None
     A: Float[np.ndarray, "rows c nv"]
     b: Float[np.ndarray, "rows c"]
@@ -114,8 +111,6 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
         multiplier=None if multiplier is None else _array(multiplier.mean),
         multiplier_variance=None if multiplier is None else _array(multiplier.variance),
         known_physics=known,
-        moving_force=(mass @ (mean - known)[..., None])[..., 0],
-        moving_force_variance=np.einsum("nij,njk,nik->ni", mass, covariance, mass),
         carried_known_force=None if force is None else _array(carried),
         A=_array(own.A),
         b=_array(own.b),

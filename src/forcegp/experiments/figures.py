@@ -6,17 +6,18 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import NullLocator
 
 from forcegp.evaluation.plots.style import (
     LARGE,
-    MEASUREMENT,
+    QUANTILE,
     QUIET,
     SERIES,
     TRUTH,
     draw_band,
     legend_below,
     new_figure,
+    plain_ticks,
     quiet,
 )
 from forcegp.experiments import published
@@ -52,11 +53,9 @@ def learning_curves_figure(summary: Mapping[str, Any]) -> Figure:
                 axes.plot(list(values), list(values.values()), **line)
         axes.set(xscale="log", yscale="log")
         axes.set_xticks(counts, [str(count) for count in counts])
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.xaxis.set_minor_locator(NullLocator())
         if score != "constraint_error":
-            axes.yaxis.set_major_formatter(ScalarFormatter())
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            plain_ticks(axes.yaxis)
         quiet(axes, title=heading, x="training points N", y="")
     panels[0].axhline(summary["noise_floor"], color=QUIET, linewidth=0.8)
     panels[0].annotate(
@@ -92,7 +91,7 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
                 style = {"color": COLORS[model], "linestyle": LINES[mean], "linewidth": 1.4}
                 axes.plot(np.abs(trace[name]), label=f"{ESTIMATING_MODELS[model]} {MEANS[mean]}", **style)
         if bound is not None:
-            axes.axhline(bound, color=QUIET, linewidth=0.8)
+            axes.axhline(bound, color=QUIET, linewidth=0.8, label="counts as found")
         for model, values in published.FIG2C.items():
             points = values.get(name, {})
             axes.plot(list(points), np.abs(list(points.values())), "x", color=COLORS[model], markersize=6)
@@ -102,35 +101,30 @@ def estimation_figure(summary: Mapping[str, Any]) -> Figure:
         axes.set_xticks([0, 5, 10, 40, 100, 400], ["0", "5", "10", "40", "100", "400"])
         quiet(axes, title=title, x="iteration")
     panels[0].plot([], [], "x", color=QUIET, label="published (2021)")
-    legend_below(figure, panels[0], columns=5)
+    legend_below(figure, panels[0])
     return figure
 
 
 SHOWN_JOINTS = (0, 3, 6)
-INTERVAL = 1.96
 
 
 def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Models side by side, joints 1, 4 and 7 below each other, all of one joint on the same scale."""
-    figure = new_figure(11.0, 6.0)
+    """Errors of models side by side, joints 1, 4 and 7 below each other; accelerations themselves would coincide."""
+    figure = new_figure(11.0, 5.4)
     panels = figure.subplots(len(SHOWN_JOINTS), len(arrays), sharex=True, sharey="row", squeeze=False)
     for column, (model, stored) in enumerate(arrays.items()):
         for row, joint in enumerate(SHOWN_JOINTS):
-            axes = panels[row, column]
-            time, mean, std = stored["time"], stored["mean"][:, joint], stored["std"][:, joint]
-            measured, color = stored["measured"][:, joint], COLORS[model]
-            axes.plot(time, measured, ".", color=MEASUREMENT, markersize=1.5, label="measured", rasterized=True)
-            draw_band(axes, time, mean, INTERVAL * std, color=color, alpha=0.3, label="95 % interval")
-            axes.plot(time, mean, color=color, linewidth=1.2, label="prediction")
-            axes.plot(time, stored["truth"][:, joint], color=TRUTH, linewidth=0.8, linestyle=":", label="truth")
-            margin = 0.25 * (measured.max() - measured.min())
-            axes.set_ylim(measured.min() - margin, measured.max() + margin)
-            quiet(
-                axes,
-                title=MODELS[model].label if row == 0 else "",
-                x="time [s]" if row == len(SHOWN_JOINTS) - 1 else "",
-                y=f"joint {joint + 1} [rad/s²]" if column == 0 else "",
-            )
+            axes, time, half = panels[row, column], stored["time"], QUANTILE * stored["std"][:, joint]
+            draw_band(axes, time, np.zeros_like(half), half, color=COLORS[model], alpha=0.35, label="95 % interval")
+            error = stored["mean"][:, joint] - stored["truth"][:, joint]
+            axes.plot(time, error, color=TRUTH, linewidth=0.9, label="prediction − truth")
+            title, label = MODELS[model].label if row == 0 else "", f"joint {joint + 1} [rad/s²]" if column == 0 else ""
+            quiet(axes, title=title, x="time [s]" if row == len(SHOWN_JOINTS) - 1 else "", y=label)
+    for row, joint in enumerate(SHOWN_JOINTS):  # a few rows at the jumps of the reference would hide all others
+        errors = [np.abs(each["mean"] - each["truth"])[:, joint] for each in arrays.values()]
+        halves = [QUANTILE * each["std"][:, joint] for each in arrays.values()]
+        limit = 1.2 * float(np.quantile([errors, halves], 0.98))
+        panels[row, 0].set_ylim(-limit, limit)
     legend_below(figure, panels[0, -1])
     return figure
 

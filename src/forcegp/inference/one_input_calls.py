@@ -14,7 +14,7 @@ from forcegp.inference.kernel_sums import PADDING, KernelSum
 from forcegp.inference.one_input_functions import OneInputFunctions, drawn_form, markov_functions, one_input_form
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance, kernel_sums
 
 FEW_CENTERS = 128
 """Kernels without an exact form in pieces are summed over so few centres as fast as a table is looked up."""
@@ -85,13 +85,12 @@ class OneInputCall:
 LatentCall = KernelSum | OneInputCall
 
 
-def latent_calls(
-    latent: LatentPosterior, prepared: PreparedKernels, compressed: CompressedCovariance | None
-) -> tuple[LatentCall, ...]:
+def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | None) -> tuple[LatentCall, ...]:
     """The processes as C functions, in the form that suits each. Raises InvalidInput for an untraceable kernel."""
     found: list[LatentCall] = []
-    factors = [None] * len(prepared.groups) if compressed is None else compressed.factors
-    for part, F in zip(prepared.sums(), factors, strict=True):
+    sums = kernel_sums(latent)
+    factors = [None] * len(sums) if compressed is None else compressed.factors
+    for part, F in zip(sums, factors, strict=True):
         rank = 0 if F is None else F.shape[-1]
         roots = None if F is None else torch.nn.functional.pad(F, (0, -rank % PADDING))
         index, functions = part.latents[0], None

@@ -232,23 +232,21 @@ def one_input_form(
     index: int,
     coefficients: Float[Tensor, "N R"] | None = None,
     *,
-    smooth: bool = False,
     tolerance: float = TOLERANCE,
 ) -> OneInputFunctions | None:
     """sum_j k(z, z_j) c_jr of one latent in the form that suits its kernel; without coefficients, its posterior mean.
 
-    A table is at most `tolerance` of the largest value from the sum and reaches `MARGIN` beyond the centres; `smooth`
-    asks for one where the exact form has kinks. None for several inputs and where `MOST_INTERVALS` do not suffice.
+    A table is at most `tolerance` of the largest value from the sum and reaches `MARGIN` beyond the centres. None for
+    several inputs and where `MOST_INTERVALS` do not suffice.
     """
     centers, kernel = latent.features[index].detach(), latent.kernels.dense[index]
     if centers.shape[-1] != 1:
         return None
     weights = latent.weights[index].detach()[:, None] if coefficients is None else coefficients.detach()
     exact = markov_functions(latent.kernels[index], centers[:, 0], weights)
-    if exact is not None and not smooth:
+    if exact is not None:
         return exact
-    function = exact.values if exact else lambda s: kernel.cross(s[:, None], centers) @ weights
-    return cubic_table(function, centers[:, 0], MARGIN, tolerance)
+    return cubic_table(lambda s: kernel.cross(s[:, None], centers) @ weights, centers[:, 0], MARGIN, tolerance)
 
 
 def drawn_form(

@@ -1,4 +1,4 @@
-"""Minimise an objective over named tensors: L-BFGS, an optional Adam warm-up, rollback and a named cause."""
+"""Minimise an objective over named tensors: L-BFGS, rollback and a named cause."""
 
 import operator
 import time
@@ -37,27 +37,24 @@ class OptimizerOptions:
     fraction of it; `slow`: stop when `SLOW_ITERATIONS` of them together lower it by less than this (nats), 0 for never;
     `patience`: stop when so many iterations at the present pace would not reach the best of earlier starts, 0 for
     never; `gradient_tolerance`: stop when the largest gradient entry is below this; `memory`: iterations that make up
-    the curvature; `adam_steps`, `adam_rate`: optional warm-up; `keep_iterates`: keep the parameters after every one.
+    the curvature; `keep_iterates`: keep the parameters after every one.
     """
 
     iterations: int = 200
     tolerance: float = 1e-8
     gradient_tolerance: float = 1e-4
     memory: int = 200
-    adam_steps: int = 0
-    adam_rate: float = 0.1
     keep_iterates: bool = False
     slow: float = 0.0
     patience: int = 0
 
     @usable_arguments("OptimizerOptions")
     def __post_init__(self) -> None:
-        if min(map(operator.index, (self.iterations, self.adam_steps, self.patience))) < 0:
-            counts = f"iterations={self.iterations}, adam_steps={self.adam_steps} and patience={self.patience}"
-            raise InvalidInput(f"{counts} must be >= 0")
+        if min(map(operator.index, (self.iterations, self.patience))) < 0:
+            raise InvalidInput(f"iterations={self.iterations} and patience={self.patience} must be >= 0")
         tolerances = (self.tolerance, self.slow, self.gradient_tolerance)
-        if not (all(x >= 0 for x in tolerances) and self.adam_rate > 0 and self.memory > 0):
-            raise InvalidInput("tolerances must be >= 0, adam_rate and memory > 0")
+        if not (all(x >= 0 for x in tolerances) and self.memory > 0):
+            raise InvalidInput("tolerances must be >= 0, memory > 0")
 
 
 @dataclass(frozen=True)
@@ -173,15 +170,12 @@ def minimize_objective(
     history = [search.best_value]
     points = [search.best_point.copy()]
 
-    def record(value: float, point: np.ndarray) -> None:
-        history.append(value)
-        if options.keep_iterates:
-            points.append(point.copy())
-        if progress is not None:
-            progress(len(history) - 1, value)
-
     def after_iteration(intermediate_result: OptimizeResult) -> None:
-        record(float(intermediate_result.fun), intermediate_result.x)
+        history.append(float(intermediate_result.fun))
+        if options.keep_iterates:
+            points.append(intermediate_result.x.copy())
+        if progress is not None:
+            progress(len(history) - 1, history[-1])
         hopeless = options.patience and SLOW_ITERATIONS * (history[-1] - rival) > options.patience * pace()
         if len(history) > SLOW_ITERATIONS and (pace() < options.slow or hopeless):
             raise StopIteration  # ends the search at this point
@@ -189,8 +183,6 @@ def minimize_objective(
     def pace() -> float:
         return history[-1 - SLOW_ITERATIONS :][0] - history[-1]
 
-    if options.adam_steps:
-        _adam(search, options, record)
     if search.best_point.size:
         status, converged = "no iterations asked for", False
     else:
@@ -254,22 +246,6 @@ def _sentence(status: int, message: str, options: OptimizerOptions) -> str:
     if status == LINE_SEARCH_FAILED:
         return "stopped where no step lowers the objective, as far as rounding lets it be seen"
     return f"stopped at the limit of {options.iterations} iterations; raise `iterations` to search on"
-
-
-def _adam(search: _Search, options: OptimizerOptions, record: Callable[[float, np.ndarray], None]) -> None:
-    """Kingma & Ba (2015), algorithm 1; ends early at the first point that cannot be evaluated."""
-    point = torch.as_tensor(search.best_point.copy()).requires_grad_()
-    optimizer = torch.optim.Adam([point], lr=options.adam_rate)
-    slope = search.best_slope
-    for _ in range(options.adam_steps):
-        point.grad = torch.as_tensor(slope.copy())
-        optimizer.step()
-        at = point.detach().numpy()
-        evaluated = search.evaluate(at)
-        if evaluated is None:
-            return
-        value, slope = evaluated
-        record(value, at)
 
 
 def best_of(results: list[OptimizationResult]) -> OptimizationResult:

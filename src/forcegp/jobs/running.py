@@ -5,7 +5,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -19,12 +19,11 @@ from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, req
 from forcegp.errors import BackendError, FileFormatError, FitError, ForceGPError, InvalidInput, OutdatedWarning
 from forcegp.jobs.job import Job, digests, machine
 from forcegp.parallel import Backend, Joblib
+from forcegp.parallel.backend import outcome_of
 
 FORMAT_VERSION = 2
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
 RESULT_FILE = "job.json"
-BEFORE = ("reproduction.json", "configuration.json")
-"""Descriptions of format 1, whose digests did not cover the code: its results, in `cells`, are not used."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,8 @@ class JobStore:
     ) -> "JobStore":
         """The folder, made if it does not exist, for jobs of this kind under one configuration of JSON values.
 
-        With `overwrite` everything is computed anew; None for commands that do not offer it. Warns where the folder
-        holds results that are not used because they do not record their code. Raises InvalidInput for a folder of
-        something else or of another configuration, naming what differs.
+        With `overwrite` everything is computed anew; None for commands that do not offer it. Raises InvalidInput for a
+        folder of something else or of another configuration, naming what differs.
         """
         store = cls(folder, kind)
         description = store._description()
@@ -54,14 +52,7 @@ class JobStore:
                 raise InvalidInput(f"{folder} exists and was not written by `{kind}`; choose another `folder`.")
         elif not overwrite:
             store._require_same(description["configuration"], configuration, can_overwrite=overwrite is not None)
-            if description["format_version"] == FORMAT_VERSION:
-                return store
-            warnings.warn(
-                f"{folder} holds results of an earlier forcegp, which do not record the code that computed them; "
-                f"everything is computed anew, and the old results stay in {folder / 'cells'}.",
-                OutdatedWarning,
-                stacklevel=2,
-            )
+            return store
         folder.mkdir(parents=True, exist_ok=True)
         with store.locked():
             shutil.rmtree(folder / JOBS, ignore_errors=True)
@@ -71,19 +62,13 @@ class JobStore:
         return store
 
     def _description(self) -> dict[str, Any] | None:
-        """What the folder holds, also that of format 1; None without a description."""
-        file = next((self.folder / name for name in (DESCRIPTION, *BEFORE) if (self.folder / name).exists()), None)
-        if file is None:
+        """What the folder holds; None without a description."""
+        if not (self.folder / DESCRIPTION).exists():
             return None
-        stored = read_json(file, f"choose another `folder`, or delete {self.folder}")
-        if file.name == BEFORE[0]:
-            stored["configuration"] = {"preset": stored.get("preset")}
+        stored = read_json(self.folder / DESCRIPTION, f"choose another `folder`, or delete {self.folder}")
         if stored.get("kind") != self.kind or not isinstance(stored.get("configuration"), dict):
             raise InvalidInput(f"{self.folder} was not written by `{self.kind}`; choose another `folder`.")
-        if file.name != DESCRIPTION:
-            stored["format_version"] = 1
-            stored["configuration"].pop("forcegp", None)
-        elif stored.get("format_version") != FORMAT_VERSION:
+        if stored.get("format_version") != FORMAT_VERSION:
             raise FileFormatError(
                 f"{self.folder} holds results of forcegp {stored.get('forcegp_version')} (format "
                 f"{stored.get('format_version')}); this is {__version__} (format {FORMAT_VERSION}). Choose another "
@@ -164,8 +149,7 @@ def run_jobs(
 
     Every finished job is kept at once, so a run that is killed at any moment goes on where it was. A job that fails
     stops only what depends on it. Results of other code or settings are computed anew, with a warning. Raises FitError
-    at the end if any job has failed, naming the first, and BackendError if workers cannot be had, or if those of one
-    job died again and again.
+    at the end if any job has failed, naming the first, and BackendError if a worker died.
     """
     wanted = digests(jobs)
     if all(store.has(name, digest) for name, digest in wanted.items()):
@@ -215,20 +199,22 @@ class _Run:
 
     def on(self, backend: Backend) -> None:
         """Compute all."""
+        at_work: dict[Future[None], Job] = {}
         try:
-            with backend.pool() as pool:
-                while self.waiting or len(pool):
-                    for job in self._ready(pool.free):
-                        bare = replace(job, arguments=())  # arguments go by themselves
-                        known = {"digest": self.digests[job.name], "code": job.code_digest}
-                        pool.submit(job.name, compute, self.store, bare, known, *job.arguments)
-                    if not len(pool):
-                        break  # what still waits depends on jobs that failed
-                    for name, future in pool.finished():
-                        self._record(self.jobs[name], future)
+            while True:
+                for job in self._ready(backend.jobs - len(at_work)):
+                    bare = replace(job, arguments=())  # arguments go by themselves
+                    known = {"digest": self.digests[job.name], "code": job.code_digest}
+                    at_work[backend.submit(compute, self.store, bare, known, *job.arguments)] = job
+                if not at_work:
+                    break  # what still waits depends on jobs that failed
+                for future in wait(at_work, return_when=FIRST_COMPLETED).done:
+                    self._record(at_work.pop(future), future)
         except BackendError as error:
             raise BackendError(f"{error}. {self._kept()}") from None
         finally:
+            if at_work:
+                backend.stop()
             self.store.remove_leftovers()
         if self.failed:
             name, cause = next(iter(self.failed.items()))
@@ -239,11 +225,11 @@ class _Run:
     def _kept(self) -> str:
         return f"{len(self.done)} of {self.count} jobs are kept, so the same command goes on from here"
 
-    def _ready(self, free: int | float) -> list[Job]:
+    def _ready(self, free: int) -> list[Job]:
         """The next jobs whose inputs are finished: those that others wait for longest come first."""
         ready = [job for job in self.waiting.values() if not self.stopped and self.finished.issuperset(job.inputs)]
         ready.sort(key=lambda job: -self._work_behind(job.name))
-        chosen = ready[: int(min(max(free, 0), len(ready)))]
+        chosen = ready[:free]
         for job in chosen:
             del self.waiting[job.name]
         return chosen
@@ -257,9 +243,11 @@ class _Run:
 
     def _record(self, job: Job, future: Future[None]) -> None:
         try:
-            future.result()
+            outcome_of(future)
             self.done.append(job.name)
             self.finished.add(job.name)
+        except BackendError:
+            raise
         except ForceGPError as error:
             self.failed[job.name] = str(error)
         except OSError as error:  # a full disk, say: what others would compute could not be kept either

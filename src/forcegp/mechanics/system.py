@@ -217,11 +217,7 @@ class MechanicalSystem(Summary):
         """
         return {
             "format": FORMAT_VERSION,
-            "urdf": self.robot.urdf_text,
-            "gravity": self.robot.gravity.tolist(),
-            "armature": self.robot.armature.tolist(),
-            **({} if self.robot.base == "fixed" else {"base": self.robot.base}),
-            "locked": dict(self.robot.locked),
+            **self.robot.to_stored(),
             "contacts": [
                 {
                     **{"frame": contact.frame, "point": list(contact.point)},
@@ -252,14 +248,7 @@ class MechanicalSystem(Summary):
             for key, kind in STORED_PARTS.items():
                 if not isinstance(stored[key], kind):
                     raise FileFormatError(f"stored system is damaged: {key} is {stored[key]!r}")
-            robot = Robot.from_urdf_text(
-                stored["urdf"],
-                source="stored URDF",
-                gravity=stored["gravity"],
-                armature=stored["armature"],
-                locked=stored["locked"],
-                base=stored.get("base", "fixed"),
-            )
+            robot = Robot.from_stored(stored)
             if contacts is None:
                 contacts = [
                     Contact(

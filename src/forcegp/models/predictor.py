@@ -17,7 +17,7 @@ from typing_extensions import override
 from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, Motions, fused
@@ -60,7 +60,6 @@ class Predictor(Summary):
     nv: int
     device: torch.device
     latent: LatentPosterior
-    prepared: PreparedKernels
     terms: TermsFunction
     code: KeptCode | None
     kind: str
@@ -98,8 +97,8 @@ class Predictor(Summary):
         functions = {k: f and RowFunction(f.library, f.inputs, f.outputs, tables) for k, f in self._functions.items()}
         of_mean = {how: loops for how, loops in self._loops.items() if not how[1]}
         loops = {how: x and [FusedLoop(loop.library, tables) for loop in x] for how, x in of_mean.items()}
-        prepared, made = PreparedKernels.of(latent), {"_functions": functions, "_loops": loops}
-        return replace(self, latent=latent, prepared=prepared, code=code, posterior=posterior, **made)
+        made = {"_functions": functions, "_loops": loops}
+        return replace(self, latent=latent, code=code, posterior=posterior, **made)
 
     @property
     def rank(self) -> int | None:
@@ -140,9 +139,9 @@ class Predictor(Summary):
             return _single(a, single), _single(covariance.view(-1, nv, nv), single)
         means, covariances = [], []
         for part in self._blocks(states):
-            mean, W, inputs, features, cross = self._mean(*part)
+            mean, W, features = self._mean(*part)
             means.append(mean)
-            covariances.append(W @ self._covariance(W, inputs, features, cross) @ W.mT)
+            covariances.append(W @ self._covariance(W, features) @ W.mT)
         return _finished(means, single), _finished(covariances, single)
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
@@ -296,8 +295,8 @@ class Predictor(Summary):
             elif kind == "forces":
                 parts.append(forces_around(self.posterior, *part))
             else:
-                mean, W, *latents = self._mean(*part)
-                parts.append((mean, W @ self._covariance(W, *latents) @ W.mT) if kind == "covariance" else (mean,))
+                mean, W, features = self._mean(*part)
+                parts.append((mean, W @ self._covariance(W, features) @ W.mT) if kind == "covariance" else (mean,))
         return [_finished(list(rows), False).flatten(1) for rows in zip(*parts, strict=True)]
 
     def _at_one(self, kind: str, program: RowFunction, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
@@ -328,33 +327,30 @@ class Predictor(Summary):
             warnings.warn(f"{BY_TORCH}: {error}", NumericalWarning, stacklevel=4)
             return None
 
-    def _mean(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], list[Tensor]]:
-        """By torch: the mean, W, what the kernels need, the features, and the kernel functions."""
+    def _mean(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """By torch: the mean, W and the features of all latents."""
         offset, W, *features = self.terms(q, v, u)
         if not W.shape[-1]:
-            return offset, W, [], features, []
-        inputs = self.prepared.inputs(features)
-        f, cross = self.prepared.mean(inputs)
-        return offset + (W @ f[..., None])[..., 0], W, inputs, features, cross
+            return offset, W, features
+        return offset + (W @ self.latent.mean(features)[..., None])[..., 0], W, features
 
     def rounding(self, q: Tensor, v: Tensor, u: Tensor) -> float:
         """What rounding of the sums over all points may change in the mean, relative to its largest value there."""
-        mean, W, _, _, cross = self._mean(q, v, u)
-        if not cross:
+        mean, W, features = self._mean(q, v, u)
+        if not W.shape[-1]:
             return 0.0
-        terms = self.prepared.ordered(
-            [(k * w).abs().sum(-1) for k, w in zip(cross, self.prepared.weights, strict=True)]
-        )
+        latent = self.latent
+        parts = zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
+        terms = torch.stack([kernel.cross(z, centers).abs() @ w.abs() for kernel, z, centers, w in parts], dim=-1)
         return torch.finfo(mean.dtype).eps * float((W.abs() @ terms[..., None]).max() / mean.abs().max())
 
-    def _covariance(self, W: Tensor, inputs: list[Tensor], features: list[Tensor], cross: list[Tensor]) -> Tensor:
+    def _covariance(self, W: Tensor, features: list[Tensor]) -> Tensor:
         """Of the latents, (n, C, C)."""
         if not W.shape[-1]:
             return W.new_zeros(len(W), 0, 0)
-        if self.compressed is None:
-            return self.widening**2 * self.latent.covariance(features)
-        P = self.prepared.ordered(self.compressed.roots(cross))
-        return self.widening**2 * (torch.diag_embed(self.prepared.diagonal(inputs)) - P @ P.mT)
+        compressed = self.compressed
+        found = self.latent.covariance(features) if compressed is None else compressed.at(self.latent, features)
+        return self.widening**2 * found
 
     def _linearize(self, states: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         with torch.enable_grad():

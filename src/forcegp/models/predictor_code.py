@@ -24,7 +24,7 @@ from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_sums import PADDING
 from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.models.fused_rollouts import STEPS, FusedLoop, loop_source
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
@@ -57,7 +57,6 @@ class PredictorCode:
         traced: Callable[..., list[Tensor]],
         example: Sequence[Tensor],
         latent: LatentPosterior,
-        prepared: PreparedKernels,
         compressed: CompressedCovariance | None,
         widening: float,
     ) -> "PredictorCode":
@@ -67,7 +66,7 @@ class PredictorCode:
                 f"a compiled predictor runs on the CPU, and the model is on {example[0].device}; give compile=False, "
                 "or a model on the CPU."
             )
-        sums = latent_calls(latent, prepared, compressed)
+        sums = latent_calls(latent, compressed)
         latents = sum(len(part.latents) for part in sums)
         graph, found = trace(traced, [*example, torch.ones(1, latents, dtype=torch.float64)])
         (a, W, Q, passive, *around), features = ([x[0].tolist() for x in part] for part in (found[:7], found[7:]))

@@ -55,8 +55,8 @@ class Rollout:
     Fields
     ------
     time: (T+1,) in s, from 0.
-    q, v: (..., T+1, nv) in rad and rad/s (m and m/s), q of a base that moves (..., T+1, nq); row 0 is the initial state,
-        which `integrator="projected"` moves onto the constraint first. Angles are not wrapped.
+    q, v: (..., T+1, nv) in rad and rad/s (m and m/s), q of a base that moves (..., T+1, nq); row 0 is the initial
+        state, which `integrator="projected"` moves onto the constraint first. Angles are not wrapped.
     a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
     constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
         signed distances).

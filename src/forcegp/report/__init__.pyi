@@ -8,5 +8,6 @@ from .results import (
     evaluation_sentence as evaluation_sentence, evaluation_table as evaluation_table, model_page as model_page,
     validation_pictures as validation_pictures, validation_table as validation_table,
 )
+from .robot_picture import robot_figure as robot_figure, still_scene as still_scene
 from .scene import recording as recording
 from .viewer import serve as serve

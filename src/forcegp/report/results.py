@@ -104,11 +104,11 @@ def scene_notes(recorded: RecordedScene) -> list[str]:
 def evaluation_sentence(evaluation: Evaluation, unit: str) -> str:
     """The result of an evaluation in one sentence."""
     error, known = evaluation.mae, evaluation.known_physics_mae
-    better = f", {known / error:.3g} times less than known physics alone" if known > error > 0.0 else ""
+    better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
     held = 100.0 * evaluation.coverage_95
     return (
-        f"On rows that it has not seen, the model predicts accelerations to {error:.3g} {unit} on average{better}; "
-        f"its 95 % intervals hold {held:.0f} % of them."
+        f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit}{better}; "
+        f"95 % intervals contain {held:.0f} %."
     )
 
 

@@ -7,12 +7,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import torch
-from defusedxml import ElementTree
 
-from forcegp.errors import InvalidInput, MissingExtra
+from forcegp.errors import InvalidInput, MissingExtra, RobotModelError
 from forcegp.robots import Robot
 from forcegp.robots.inertia import rotation_from_rpy, transform
-from forcegp.robots.urdf_file import read_text
+from forcegp.robots.robot_file import read_robot_file
+from forcegp.robots.xml_text import parse_xml
 
 FORMATS = (".stl", ".obj", ".ply", ".off")
 """Meshes that are read; none of them can name another file that would be read with it."""
@@ -54,10 +54,10 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
     Raises MissingExtra without trimesh, and InvalidInput for a file that is no URDF.
     """
     trimesh_module()
-    text = robot.urdf_text if urdf is None else read_text(urdf)
+    text = robot.urdf_text if urdf is None else read_robot_file(urdf)
     try:
-        root = ElementTree.fromstring(text, forbid_dtd=True)
-    except Exception as error:
+        root = parse_xml(text, str(urdf))
+    except RobotModelError as error:
         raise InvalidInput(f"{urdf} is not a URDF ({error}); give the file that describes the robot.") from None
     drawn, doubts = {}, []
     for link in root.findall("link"):
@@ -77,25 +77,12 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
 def reach(robot: Robot) -> float:
     """The length of the robot in m: the farthest that a chain of joints stretches."""
     lengths: dict[str, float] = {}
-    for joint in _joints_from_base(robot):
+    for joint in robot.all_joints:
         step = float(np.linalg.norm(joint.origin[:3, 3]))
         lengths[joint.child] = lengths.get(joint.parent, 0.0) + step
     longest = max(lengths.values(), default=0.0)
     centers = [np.linalg.norm(robot.link(name).center_of_mass) for name in robot.link_names]
     return max(longest, float(max(centers, default=0.0)), 0.1)
-
-
-def _joints_from_base(robot: Robot) -> list[Any]:
-    """The joints of the file, parents before children."""
-    left, known, ordered = list(robot.description.joints), set(), []
-    children = {joint.child for joint in left}
-    known |= {name for name in robot.link_names if name not in children}
-    while left:
-        ready = [joint for joint in left if joint.parent in known]
-        ordered += ready
-        known |= {joint.child for joint in ready}
-        left = [joint for joint in left if joint not in ready]
-    return ordered
 
 
 def _visual(element: Element, urdf: Path | None, doubts: list[str]) -> Any:

@@ -23,7 +23,7 @@ from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import Expression, Graph, node_of
 from forcegp.codegen.library import Purpose, RowFunction, VectorUnit, load_library
 from forcegp.codegen.tracing import trace
-from forcegp.robots.layout import merged_inertias
+from forcegp.robots.tree import merged_inertias
 from forcegp.robots.unrolled import (
     Scalars,
     UnrolledKinematics,
@@ -113,7 +113,7 @@ class Request(NamedTuple):
     def sizes(self, unrolled: UnrolledRobot) -> dict[str, int]:
         """Length of every input, result and derivative by name."""
         nv = unrolled.nv
-        merged = len(INERTIA_ENTRIES) * nv
+        merged = len(INERTIA_ENTRIES) * len(unrolled.joints)
         results = [merged] if self.function == MERGED else [nv**d for d in DIMENSIONS.get(self.function, (1,))]
         given = {"inertias": merged, "parameters": 10 * len(self.links)}
         kept = dict.fromkeys(KEPT, len(unrolled.pairs) + 2 * nv)
@@ -138,7 +138,7 @@ def trace_dynamics(unrolled: UnrolledRobot, request: Request) -> Program:
     else:
         inertias = None
         if request.free_inertias:
-            inertias = [scalars([[0.0] * 4 for _ in range(4)]) for _ in range(n)]
+            inertias = [scalars([[0.0] * 4 for _ in range(4)]) for _ in unrolled.joints]
             for body, P in enumerate(inertias):
                 P[COLUMNS, ROWS] = P[ROWS, COLUMNS] = given["inertias"][10 * body : 10 * body + 10]
         at = UnrolledKinematics(unrolled, given["q"], given.get("v"))
@@ -211,7 +211,7 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
     def write(unit: VectorUnit) -> str:
         return write_program(trace_dynamics(unrolled, request), unit.lanes)
 
-    constants: list[object] = [(joint.parent, joint.revolute) for joint in unrolled.joints]
+    constants: list[object] = [(joint.parent, joint.revolute, *joint.drive) for joint in unrolled.joints]
     constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
     constants += [unrolled.gravity.tolist(), unrolled.armature.tolist()]
     if request.links:

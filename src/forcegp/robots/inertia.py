@@ -72,6 +72,8 @@ def inverse(pose: Array) -> Array:
 
 # relative to the trace of the inertia: what turning an ideal rod or plate in float64 costs, with a wide margin
 ROUNDING = 1e-10
+# m^2; the square of a hundred millionth of a metre: a point, whatever the digits of a file say
+SMALLEST = 1e-16
 # relative thickness squared below which log-Cholesky parameters (logarithms) lose all digits
 SINGULAR = 1e-12
 
@@ -185,7 +187,7 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
         return "its mass is zero but its inertia is not" if inertia.any() else None
     moments = np.linalg.eigvalsh(inertia)
     listed = ", ".join(f"{moment:.10g}" for moment in moments)
-    slack = ROUNDING * abs(moments).sum()
+    slack = ROUNDING * abs(moments).sum() + SMALLEST * mass
     if moments[0] < -slack:
         return f"its inertia is not positive definite (principal moments {listed} kg m^2)"
     if moments[0] + moments[1] < moments[2] - slack:

@@ -27,9 +27,10 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.arguments import Inertials, JointValues, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
-from forcegp.robots.layout import WORLD, Tree
+from forcegp.robots.layout import WORLD
 from forcegp.robots.manifold import Group, pose
 from forcegp.robots.structure import RobotStructure
+from forcegp.robots.tree import Tree
 
 Bodies = Float[Tensor, "n 4 4 batch"]
 """A 4x4 matrix of every body: its pose or its pseudo-inertia."""
@@ -56,15 +57,26 @@ def over_tree(matrix: Float[Tensor, "n n"], values: Float[Tensor, "n rows column
     return (matrix @ values.flatten(1)).view_as(values)
 
 
-def body_poses(tree: Tree, q: Float[Tensor, "n batch"]) -> Bodies:
+def of_bodies(tree: Tree, values: Float[Tensor, "nv batch"]) -> Float[Tensor, "n batch"]:
+    """Velocities or accelerations of the joints of all bodies: ``G values``."""
+    return tree.coupling @ values if tree.coupled else values
+
+
+def of_joints(tree: Tree, values: Float[Tensor, "batch n *rest"]) -> Float[Tensor, "batch nv *rest"]:
+    """Forces at the joints of all bodies as forces at those with a coordinate: ``G^T values``."""
+    return (values.movedim(1, -1) @ tree.coupling).movedim(-1, 1) if tree.coupled else values
+
+
+def body_poses(tree: Tree, q: Float[Tensor, "nq batch"]) -> Bodies:
     """Pose T of every body frame in the world."""
-    single = q if tree.positions is None else q[tree.positions]
+    single = of_bodies(tree, q if tree.positions is None else q[tree.positions])
+    single = single + tree.shift if tree.coupled else single
     local = torch.addcmul(tree.rest, tree.sine, single.sin()[:, None, None])
     local = torch.addcmul(local, tree.cosine, single.cos()[:, None, None])
     if not tree.all_revolute:
         local = torch.addcmul(local, tree.slide, single[:, None, None])
     if tree.groups:
-        local = torch.cat(_replaced(tree, local, lambda group: product(tree.rest[group.rows], _group_pose(group, q))))
+        local = torch.cat(_replaced(tree, local, lambda group: product(tree.rest[group.bodies], _group_pose(group, q))))
     pose = local[tree.levels[0].joints]
     laid = [pose]
     for level in tree.levels[1:]:
@@ -84,17 +96,17 @@ def joint_twists(tree: Tree, poses: Bodies) -> tuple[Vectors, Twists]:
         axis = tree.revolute * axis
     vectors = torch.cat([axis, moment], dim=1)
     if tree.groups:
-        vectors = torch.cat(_replaced(tree, vectors, lambda group: _group_vectors(group, poses[group.rows.stop - 1])))
+        vectors = torch.cat(_replaced(tree, vectors, lambda group: _group_vectors(group, poses[group.bodies.stop - 1])))
     return vectors, (tree.twist_basis @ vectors).unflatten(1, (3, 4))
 
 
 def _replaced(tree: Tree, values: Tensor, of_group: Callable[[Group], Tensor]) -> list[Tensor]:
-    """Values of the joints in order, where those of groups are `of_group`."""
+    """Values of the bodies in order, where those of groups are `of_group`."""
     parts, last = [], 0
     for group in tree.groups:
         own = of_group(group)
-        parts += [values[last : group.rows.start].expand(-1, *own.shape[1:]), own]
-        last = group.rows.stop
+        parts += [values[last : group.bodies.start].expand(-1, *own.shape[1:]), own]
+        last = group.bodies.stop
     return [*parts, values[last:]]
 
 
@@ -134,7 +146,7 @@ def world_inertias(poses: Bodies, inertias: Float[Tensor, "n 4 4 #batch"]) -> Bo
     return product(product(poses, inertias), poses.transpose(1, 2))
 
 
-def mass_matrix(tree: Tree, vectors: Vectors, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch n n"]:
+def mass_matrix(tree: Tree, vectors: Vectors, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch nv nv"]:
     """Joint-space inertia matrix, armature included on the diagonal."""
     momenta = product(twists, over_tree(tree.descendants, inertias))
     # <[[w]x, v], F> is the product of the vector [w; v] with these six combinations of the entries of F
@@ -144,21 +156,23 @@ def mass_matrix(tree: Tree, vectors: Vectors, twists: Twists, inertias: Bodies) 
     out = torch.where(tree.is_above, above, above.transpose(0, 1))
     if not tree.is_chain:
         out = out * tree.related
+    if tree.coupled:
+        out = torch.einsum("ki,klb,lj->ijb", tree.coupling, out, tree.coupling)
     if tree.has_armature:
         out = out + torch.diag(tree.armature)[..., None]
     return out.movedim(-1, 0).contiguous()
 
 
-def joint_forces(tree: Tree, twists: Twists, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch n"]:
+def joint_forces(tree: Tree, twists: Twists, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch nv"]:
     """Joint forces under which the bodies accelerate so against gravity (without armature)."""
     wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
-    return (twists * wrenches).sum((1, 2)).mT
+    return of_joints(tree, (twists * wrenches).sum((1, 2)).mT)
 
 
 def torque_regressor(
     tree: Tree, twists: Twists, accelerations: Twists, frames: Bodies, basis: Float[Tensor, "16 parameters"]
-) -> Float[Tensor, "batch n n parameters"]:
-    """Joint force (first n) per unit of each parameter of each body (second n), without armature.
+) -> Float[Tensor, "batch nv n parameters"]:
+    """Joint force (nv) per unit of each parameter of each body (n), without armature.
 
     The pseudo-inertia of body k is ``frames[k] P frames[k]^T`` with P, row by row, equal to ``basis`` times the body's
     parameters; so ``tau_i = tr((S_i T)^T (A_k - g) T P)``.
@@ -169,13 +183,13 @@ def torque_regressor(
         left, right = product(twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
         gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
         columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
-    return torch.stack(columns, dim=2)
+    return of_joints(tree, torch.stack(columns, dim=2))
 
 
-def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch n"]:
+def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch nv"]:
     """Joint forces that hold the robot still."""
     first_moments = over_tree(tree.descendants, inertias[..., 3:, :])
-    return -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
+    return of_joints(tree, -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,11 +205,11 @@ class Kinematics:
 
     robot: RobotStructure
     batch_shape: torch.Size
-    poses: Tensor  # (nv, 4, 4, batch)
-    vectors: Tensor  # (nv, 6, batch)
-    twists: Tensor  # (nv, 3, 4, batch)
-    v: Tensor | None  # (nv, batch)
-    accelerations: Tensor | None  # (nv, 3, 4, batch), at zero joint acceleration and without gravity
+    poses: Tensor  # (n, 4, 4, batch), with n bodies
+    vectors: Tensor  # (n, 6, batch)
+    twists: Tensor  # (n, 3, 4, batch)
+    v: Tensor | None  # (n, batch), of the joints of the bodies
+    accelerations: Tensor | None  # (n, 3, 4, batch), at zero joint acceleration and without gravity
 
     @classmethod
     def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> "Kinematics":
@@ -205,7 +219,7 @@ class Kinematics:
         vectors, twists = joint_twists(robot.tree, poses)
         if v is None:
             return cls(robot, batch, poses, vectors, twists, None, None)
-        v = _columns(v, batch)
+        v = of_bodies(robot.tree, _columns(v, batch))
         return cls(robot, batch, poses, vectors, twists, v, body_accelerations(robot.tree, twists, v))
 
     def mass_matrix(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
@@ -236,7 +250,7 @@ class Kinematics:
         at, inertias = self._expanded("a", a.shape[:-1])._with_inertias(inertials)
         _, v = at._moving("inverse_dynamics")
         tree, a = self.robot.tree, _columns(a, at.batch_shape)
-        accelerations = body_accelerations(tree, at.twists, v, a)
+        accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, a))
         forces = joint_forces(tree, at.twists, accelerations, inertias)
         return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
@@ -252,16 +266,17 @@ class Kinematics:
         return at._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
 
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
-        """Joint forces per unit of the standard parameters of each body (..., nv, nv, 10), armature left out.
+        """Joint forces per unit of the standard parameters of each body (..., nv, bodies, 10), armature left out.
 
-        Body i is what joint i moves as one: its child link and all that is fixed to it. Parameters are about the
-        origin and in the axes of the child link, in the order of :func:`forcegp.robots.inertia.standard_basis`.
+        A body is what a joint moves as one, also a joint that mimics another: its child link and all that is fixed to
+        it. Parameters are about the origin and in the axes of the child link, in the order of
+        :func:`forcegp.robots.inertia.standard_basis`.
         """
         a = self.robot.checked_input("a", a)
         at = self._expanded("a", a.shape[:-1])
         _, v = at._moving("torque_regressor")
         tree = self.robot.tree
-        accelerations = body_accelerations(tree, at.twists, v, _columns(a, at.batch_shape))
+        accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, _columns(a, at.batch_shape)))
         frames = product(at.poses, self._child_frames()[..., None])
         basis = standard_basis(self.robot.device)
         return at._rows(torque_regressor(tree, at.twists, accelerations, frames, basis))
@@ -292,8 +307,9 @@ class Kinematics:
             return self.twists.new_zeros(*at.batch_shape, 6, self.robot.nv)
         linear = product(at.twists, position)[:, :, 0]
         jacobian = torch.cat([linear, at.vectors[:, :3]], dim=1)
-        reached = self.robot.tree.descendants[:, body, None, None]
-        return at._rows((jacobian * reached).permute(2, 1, 0).contiguous())
+        tree = self.robot.tree
+        jacobian = (jacobian * tree.descendants[:, body, None, None]).permute(2, 1, 0)
+        return at._rows(jacobian @ tree.coupling if tree.coupled else jacobian.contiguous())
 
     def frame_bias_acceleration(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6"]:
         """Classical acceleration (..., 6) of a ``point`` fixed in ``frame`` at zero joint acceleration.
@@ -333,7 +349,7 @@ class Kinematics:
         """These states broadcast against the batch of ``inertials``, and the bodies' pseudo-inertias in the world."""
         if not inertials:
             return self, world_inertias(self.poses, self.robot.tree.inertias)
-        inertias = self.robot.body_inertias(inertials)  # (nv, 4, 4, *batch)
+        inertias = self.robot.body_inertias(inertials)  # (n, 4, 4, *batch)
         batch = inertias.shape[3:]
         if not batch:
             return self, world_inertias(self.poses, inertias[..., None])

@@ -55,12 +55,16 @@ MOTIONS = {
 
 @dataclass(frozen=True)
 class Group:
-    """One such joint in a robot: its kind, and its first entries of v and of q."""
+    """One such joint in a robot: its kind, its first entries of v and of q, and the first of its bodies.
+
+    It has as many bodies as entries of v, which all move together; the last of them carries the links.
+    """
 
     name: str
     kind: str
     row: int
     place: int
+    body: int
 
     @property
     def motion(self) -> Motion:
@@ -76,6 +80,11 @@ class Group:
     def places(self) -> slice:
         """Its entries of q."""
         return slice(self.place, self.place + len(self.motion.positions))
+
+    @property
+    def bodies(self) -> slice:
+        """Its bodies."""
+        return slice(self.body, self.body + len(self.motion.free))
 
     @property
     def extra(self) -> int:

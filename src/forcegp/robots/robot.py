@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,20 +20,27 @@ from forcegp.robots.arguments import (
     finite_vector,
     locked_positions,
 )
+from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.inertia import physical_from_parameters
+from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import Base, check_inertias, compile_tree, lay_out
+from forcegp.robots.layout import free_base, lay_out
+from forcegp.robots.problems import Problems
+from forcegp.robots.robot_file import read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
+from forcegp.robots.tree import bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import InertiaChoice, read_text, replace_inertial, with_chosen_inertias, write_text
+from forcegp.robots.urdf_file import InertiaChoice, replace_inertial, with_chosen_inertias, with_root
 
 GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot(RobotStructure):
-    """A tree of joints on a fixed, floating or planar base. Make one with :meth:`from_urdf`.
+    """A tree of joints on a base that is fixed, floating or planar. Make one with :meth:`from_urdf`.
+
+    A joint that mimics another has no coordinate: it moves with that one, whose damping and friction include its own.
+    Limits of position, velocity and effort are those of the joints with a coordinate.
 
     Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any
     leading batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth
@@ -55,25 +63,34 @@ class Robot(RobotStructure):
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
-        base: Base = "fixed",
+        base: BaseChoice | None = None,
+        root: str | None = None,
+        strict: bool = False,
     ) -> "Robot":
-        """Read a URDF file.
+        """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
         Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
-        joint or by joint name; ``locked`` maps joint names to positions at which movable joints become fixed;
-        ``inertias`` of "nearest" replaces one that no body has by the nearest possible, with a DataWarning.
+        joint or by joint name, by default what :meth:`to_urdf` wrote beside the file, or 0; ``locked`` maps joint names
+        to positions at which movable joints become fixed; ``inertias`` of "nearest" replaces one that no body has by
+        the nearest possible; ``base`` says how the root is held, "fixed", "floating", "planar" or "spherical", which
+        files of robots that do not look bolted to the world are asked; ``root`` names a link that the file does not
+        define, "world" for example, to be the root. A RobotFileWarning names what was ignored or repaired; with
+        ``strict`` what could be ignored is an error.
 
-        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, the link or joint, and the
-        remedy.
+        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, all links and joints
+        that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``). Raises
+        :class:`~forcegp.errors.MissingExtra` for a .xacro file without the package xacro.
         """
         return cls.from_urdf_text(
-            read_text(path),
+            read_robot_file(path),
             source=str(path),
             gravity=gravity,
-            armature=armature,
+            armature=read_armature(path) if armature is None else armature,
             locked=locked,
             inertias=inertias,
             base=base,
+            root=root,
+            strict=strict,
         )
 
     @classmethod
@@ -87,19 +104,60 @@ class Robot(RobotStructure):
         armature: Vector | Mapping[str, float | int] | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
-        base: Base = "fixed",
+        base: BaseChoice | None = None,
+        root: str | None = None,
+        strict: bool | None = False,
     ) -> "Robot":
-        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it."""
-        description = parse_urdf(text, source=source)
+        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it.
+
+        ``strict`` of None warns of nothing: for text that was warned of before.
+        """
+        check_choice(base)
         locked = locked_positions(locked or {})
-        layout = lay_out(description, locked, base)
-        text, description = with_chosen_inertias(inertias, text, description, layout)
-        names = tuple(joint.name for joint in layout.joints)
-        rotor_inertias = armature_values(armature, names, description.name)
-        tree = compile_tree(description, layout, finite_vector("gravity", gravity, 3), rotor_inertias)
-        check_inertias(description, layout, tree)
-        frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
-        return cls(description, layout, tree, text, tuple(locked.items()), frames)
+        given = {"locked": locked, "inertias": inertias if inertias != "strict" else None, "base": base, "root": root}
+        problems = Problems(source, {name: value for name, value in given.items() if value}, strict=bool(strict))
+        text = text.lstrip() if root is None else with_root(text.lstrip(), root)
+        description = parse_urdf(text, problems)
+        if not description.complete:  # nothing can be said of a tree that lacks joints
+            problems.raise_all()
+        with problems.collected():
+            layout = lay_out(description, locked, base, problems)
+            text, description = with_chosen_inertias(inertias, text, description, layout, problems)
+            names = tuple(joint.name for joint in layout.joints)
+            rotor_inertias = armature_values(armature, names, description.name)
+            tree = compile_tree(description, layout, finite_vector("gravity", gravity, 3), rotor_inertias)
+            frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
+            robot = cls(description, layout, tree, text, tuple(locked.items()), frames, base or free_base(layout))
+            without = bodies_without_inertia(description, layout, tree, problems.broken)
+            limp = robot._limp() if without and not problems.broken else range(robot.nv)
+            problems.errors += [error for coordinate, error in without if coordinate in limp]
+            problems.offer_no_lock_of(names)
+            check_base(description, layout.standing, problems)
+        problems.raise_all()
+        if strict is not None:
+            problems.warn(stacklevel=4)
+        return robot
+
+    @classmethod
+    def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
+        """The robot that :meth:`to_stored` gave."""
+        given = {name: stored[name] for name in ("gravity", "armature", "locked")} | {
+            "base": stored.get("base", "fixed")
+        }
+        return cls.from_urdf_text(stored["urdf"], source="stored URDF", strict=None, **given)
+
+    def to_stored(self) -> dict[str, Any]:
+        """The robot as plain JSON values."""
+        numbers = {"gravity": self.gravity.tolist(), "armature": self.armature.tolist(), "locked": self.locked}
+        return {"urdf": self.urdf_text, **numbers, "base": self.base}
+
+    def _limp(self) -> set[int]:
+        """Coordinates that nothing resists at a position without symmetry."""
+        step = torch.linspace(0.3, 1.1, self.nv, dtype=torch.float64).sin()
+        M = self.mass_matrix(self.space.integrate(self.space.neutral(), step))
+        scale = M.diagonal().clamp(min=1e-300).rsqrt()
+        values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
+        return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
     def with_inertials(self, inertials: Inertials) -> "Robot":
         """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
@@ -133,17 +191,22 @@ class Robot(RobotStructure):
 
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
-        armature = self.armature if armature is None else armature
-        robot = Robot.from_urdf_text(
-            text, source=self.source, gravity=self.gravity, armature=armature, locked=self.locked, base=self.base
-        )
+        given: dict[str, Any] = {"gravity": self.gravity, "locked": self.locked, "base": self.base}
+        given["armature"] = self.armature if armature is None else armature
+        robot = Robot.from_urdf_text(text, source=self.source, strict=None, **given)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def to_urdf(self, path: str | Path | None = None) -> str:
-        """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given."""
+        """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given.
+
+        Rotor inertias stand in a comment and, beside ``path``, in a file that :meth:`from_urdf` reads back; a
+        RobotFileWarning says so.
+        """
+        armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True))
+        text = with_comment(self.urdf_text, armature, source=str(path or self.source), stacklevel=3)
         if path is not None:
-            write_text(self.urdf_text, Path(path))
-        return self.urdf_text
+            write_robot_file(Path(path), text, armature)
+        return text
 
     def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:
         """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""

@@ -11,10 +11,12 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.arguments import Inertials, checked_tensor
+from forcegp.robots.base import BaseChoice
 from forcegp.robots.inertia import log_cholesky_of_link
-from forcegp.robots.layout import BASE, WORLD, Base, Layout, Tree, merged_inertias
+from forcegp.robots.layout import WORLD, Layout
 from forcegp.robots.manifold import ConfigurationSpace, pose
-from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
+from forcegp.robots.tree import Tree, merged_inertias
+from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
 from forcegp.summary import Summary, listed
 
 INERTIAL_PARTS = ("mass", "com", "inertia")
@@ -75,6 +77,8 @@ class RobotStructure(Summary):
     urdf_text: str
     _locked: tuple[tuple[str, float], ...]
     _frames: dict[str, tuple[int, Tensor]]
+    base: BaseChoice = "fixed"
+    """How the root link is held."""
 
     @property
     def name(self) -> str:
@@ -88,7 +92,7 @@ class RobotStructure(Summary):
 
     @property
     def nv(self) -> int:
-        """Number of degrees of freedom: the size of v, a and u."""
+        """Number of degrees of freedom, the size of v and a: of the movable joints that mimic none."""
         return len(self.layout.joints)
 
     @property
@@ -102,21 +106,21 @@ class RobotStructure(Summary):
         return ConfigurationSpace(self.nv, self.layout.groups)
 
     @property
-    def base(self) -> Base:
-        """Whether the root link is "fixed" in the world, "floating", or moves in a plane."""
-        first = next(iter(self.layout.groups), None)
-        return "fixed" if first is None or first.name != BASE else first.kind  # type: ignore[return-value]  # a kind of base
-
-    @property
     def position_names(self) -> tuple[str, ...]:
         """Names of the entries of q; `joint_names` where all joints have one degree of freedom."""
         return self.layout.position_names
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """Movable joints in the order of v; a joint of several degrees of freedom as one for each."""
+        """Movable joints in the order of v, without those that mimic one; one for each degree of freedom."""
         names = [field.name for field in fields(Joint)]
         return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
+
+    @property
+    def all_joints(self) -> tuple[JointDescription, ...]:
+        """Every joint of the file, fixed ones included, parents before children."""
+        places = {name: place for place, name in enumerate(self.layout.links)}
+        return tuple(sorted(self.description.joints, key=lambda joint: places[joint.child]))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -189,7 +193,7 @@ class RobotStructure(Summary):
         """One link by name."""
         require_known("link", name, self.name, self.layout.links, UnknownLink)
         body = self.layout.links[name].body
-        joint = None if body == WORLD else self.joint_names[body]
+        joint = None if body == WORLD else self.layout.bodies[body].name
         inertial = self.description.links[name] or MASSLESS
         rows = tuple(tuple(row) for row in inertial.inertia.tolist())
         return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
@@ -241,7 +245,7 @@ class RobotStructure(Summary):
         self.space.check(q)
         return q
 
-    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "nv 4 4 *batch"]:
+    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "bodies 4 4 *batch"]:
         """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
         return merged_inertias(self.tree, self.layout, self.checked_inertials(inertials))
 

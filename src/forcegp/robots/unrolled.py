@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from forcegp.robots.layout import WORLD
+from forcegp.robots.mimic import Drive
 from forcegp.robots.structure import RobotStructure
 
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
@@ -36,12 +37,13 @@ ROUNDING = 1e-15
 
 @dataclass(frozen=True)
 class UnrolledJoint:
-    """Constants of a joint: body i at q = 0 in the axes of its parent body."""
+    """Constants of a body and the joint that moves it: where it is at q = 0, in the axes of its parent body."""
 
     parent: int
     revolute: bool
     rotation: Scalars
     origin: Scalars
+    drive: Drive
 
 
 class UnrolledRobot:
@@ -61,9 +63,13 @@ class UnrolledRobot:
                 joint.type != "prismatic",
                 self._scalars(torch.as_tensor(origin[:3, :3])),
                 self._scalars(torch.as_tensor(origin[:3, 3])),
+                drive,
             )
-            for parent, joint, origin in zip(layout.parents, layout.joints, layout.origins, strict=True)
+            for parent, joint, origin, drive in zip(
+                layout.parents, layout.bodies, layout.origins, layout.drives, strict=True
+            )
         )
+        self.coupled = layout.coupled
         merged = tree.inertias[..., 0]
         self.inertias = [self._scalars(body, float(body.abs().max())) for body in merged]
         self.gravity = self._scalars(tree.gravity, 0.0)
@@ -71,12 +77,17 @@ class UnrolledRobot:
 
     @property
     def nv(self) -> int:
-        """Number of movable joints."""
-        return len(self.joints)
+        """Number of coordinates."""
+        return self.robot.nv
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
-        """Each joint with each of those above it, where the mass matrix has entries below its diagonal."""
+        """Each joint with each of those above it, where the mass matrix has entries below its diagonal.
+
+        All pairs where joints mimic others: what they couple fills in.
+        """
+        if self.coupled:
+            return [(k, i) for k in range(self.nv) for i in range(k)]
         above: list[list[int]] = []
         for joint in self.joints:
             above.append([] if joint.parent == WORLD else [*above[joint.parent], joint.parent])
@@ -102,7 +113,10 @@ class UnrolledKinematics:
     """
 
     def __init__(self, unrolled: UnrolledRobot, q: Sequence[Any], v: Sequence[Any] | None = None) -> None:
-        self.unrolled, self.v = unrolled, v
+        self.unrolled = unrolled
+        self.v = None if v is None else self._of_bodies(v)
+        if unrolled.coupled:
+            q = [q[k] * multiplier + offset for k, multiplier, offset in (joint.drive for joint in unrolled.joints)]
         self.rotations: list[Scalars] = []  # body axes -> parent's axes
         self.origins: list[Scalars] = []  # body's origin in the parent's frame
         for joint, position in zip(unrolled.joints, q, strict=True):
@@ -117,7 +131,7 @@ class UnrolledKinematics:
 
     def mass_matrix(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
         """Mass matrix (nv, nv), armature on the diagonal; 0.0 between joints of different branches."""
-        joints, n = self.unrolled.joints, self.unrolled.nv
+        joints, n = self.unrolled.joints, len(self.unrolled.joints)
         composite = list(self.unrolled.inertias if inertias is None else inertias)
         for i in reversed(range(n)):
             if joints[i].parent != WORLD:
@@ -137,7 +151,8 @@ class UnrolledKinematics:
                     break
                 force, moment = self._wrench_in_parent(i, force, moment)
                 i = joints[i].parent
-            M[j, j] = M[j, j] + self.unrolled.armature[j]
+        M = self._of_joints(self._of_joints(M).T).T
+        M[np.diag_indices(len(M))] = M.diagonal() + self.unrolled.armature
         return M
 
     def bias_forces(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
@@ -146,13 +161,28 @@ class UnrolledKinematics:
 
     def inverse_dynamics(self, a: Scalars, inertias: Sequence[Scalars] | None = None) -> Scalars:
         """Joint forces (nv,) that give the accelerations ``a``: ``M a + bias``."""
-        return self._joint_forces(self.v, a, inertias) + self.unrolled.armature * a
+        return self._joint_forces(self.v, self._of_bodies(a), inertias) + self.unrolled.armature * a
 
     def gravity_forces(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
         """Joint forces (nv,) that hold the robot still."""
-        return self._joint_forces([0.0] * self.unrolled.nv, None, inertias)
+        return self._joint_forces([0.0] * len(self.unrolled.joints), None, inertias)
 
-    def _accelerations(self, v: Sequence[Any], a: Scalars | None) -> list[Scalars]:
+    def _of_bodies(self, values: Sequence[Any] | Scalars) -> Any:
+        """Velocities or accelerations of the joints of all bodies."""
+        if not self.unrolled.coupled:
+            return values
+        return scalars([values[joint.drive.joint] * joint.drive.multiplier for joint in self.unrolled.joints])
+
+    def _of_joints(self, values: Scalars) -> Scalars:
+        """Rows at the joints of all bodies, added up at those with a coordinate."""
+        if not self.unrolled.coupled:
+            return values
+        out = np.full((self.unrolled.nv, *values.shape[1:]), 0.0, dtype=object)
+        for row, joint in zip(values, self.unrolled.joints, strict=True):
+            out[joint.drive.joint] = out[joint.drive.joint] + row * joint.drive.multiplier
+        return out
+
+    def _accelerations(self, v: Sequence[Any], a: Sequence[Any] | None) -> list[Scalars]:
         """Accelerations A (3, 4) of all bodies at joint accelerations ``a`` (0 if None), less that of free fall."""
         base = scalars([[0.0, 0.0, 0.0, -g] for g in self.unrolled.gravity])
         w: list[Scalars] = []
@@ -178,9 +208,11 @@ class UnrolledKinematics:
             A.append(np.column_stack([_turning(wi, dwi), acceleration]))
         return A
 
-    def _joint_forces(self, v: Sequence[Any] | None, a: Scalars | None, inertias: Sequence[Scalars] | None) -> Scalars:
+    def _joint_forces(
+        self, v: Sequence[Any] | None, a: Sequence[Any] | None, inertias: Sequence[Scalars] | None
+    ) -> Scalars:
         assert v is not None, "forces that depend on velocities need some"
-        joints, n = self.unrolled.joints, self.unrolled.nv
+        joints, n = self.unrolled.joints, len(self.unrolled.joints)
         forces, moments = ([scalars([0.0] * 3) for _ in range(n)] for _ in range(2))
         out = [0.0] * n
         accelerations = self._accelerations(v, a)
@@ -193,7 +225,7 @@ class UnrolledKinematics:
             if parent != WORLD:
                 force, moment = self._wrench_in_parent(i, force, moment)
                 forces[parent], moments[parent] = forces[parent] + force, moments[parent] + moment
-        return scalars(out)
+        return self._of_joints(scalars(out))
 
     def _wrench_in_parent(self, i: int, force: Scalars, moment: Scalars) -> tuple[Scalars, Scalars]:
         """Force and moment of body i about its origin, in the axes and about the origin of its parent body."""

@@ -2,17 +2,15 @@
 
 Format: http://wiki.ros.org/urdf/XML. Defaults are those of the format (origin: identity, axis: x); a missing
 ``<limit>`` means no limit. Visual, collision, transmission, sensor and simulator elements are ignored (and kept when
-written back).
+written back). Problems are collected (:mod:`forcegp.robots.problems`), so that one report names all of them.
 """
 
 import difflib
 import math
 from dataclasses import dataclass
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
 import numpy as np
-from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
-from defusedxml import ElementTree as SafeElementTree
 
 from forcegp.errors import (
     DanglingJoint,
@@ -20,14 +18,18 @@ from forcegp.errors import (
     InvalidNumber,
     MalformedUrdf,
     MissingElement,
-    UnexpandedXacro,
-    UnsafeXml,
     UnsupportedJoint,
 )
 from forcegp.robots.inertia import rotation_from_rpy, transform
+from forcegp.robots.problems import Problems
+from forcegp.robots.xml_text import parse_xml, refuse_xacro
 
 FARTHEST = 1e9  # m; squares of larger numbers overflow
-MOVABLE = ("revolute", "continuous", "prismatic", "floating", "planar")
+LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
+MOVABLE = ("revolute", "continuous", "prismatic")
+FREE = ("floating", "planar")
+"""Joints of several degrees of freedom."""
+ENDS = ("parent", "child")
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Joint:
     """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
 
     name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic'; 'floating' | 'planar' | 'spherical' before they are laid out
+    type: str  # 'revolute' | 'continuous' | 'prismatic'
     parent: str
     child: str
     axis: tuple[float, float, float]  # unit vector in the joint frame
@@ -56,12 +58,21 @@ class Joint:
     friction: float  # Nm or N
 
 
+@dataclass(frozen=True)
+class Mimic:
+    """A joint moves with another: ``q = multiplier q_other + offset``, in rad or m."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
 @dataclass(frozen=True, eq=False)
 class JointDescription(Joint):
-    """One ``<joint>``, which may also be fixed; ``origin`` (4, 4) places it in its parent link."""
+    """One ``<joint>``, which may also be fixed or free; ``origin`` (4, 4) places it in its parent link."""
 
     origin: np.ndarray
-    mimics: str | None
+    mimics: Mimic | None
 
 
 def free_joint(name: str, kind: str, parent: str, child: str) -> JointDescription:
@@ -78,34 +89,56 @@ class RobotDescription:
     source: str
     links: dict[str, InertialDescription | None]
     joints: tuple[JointDescription, ...]
+    complete: bool = True
+    """Whether every joint of the file could be read."""
 
 
-def parse_urdf(text: str, *, source: str) -> RobotDescription:
-    """Parse URDF text. ``source``, for example a path, is what the error messages call the file."""
-    root = _parse_xml(text, source)
-    if root.tag != "robot":
-        raise MalformedUrdf(f"{source}: the root element is <{root.tag}>, not <robot>; give a URDF file.")
-    _refuse_xacro(root, source)
-    links: dict[str, InertialDescription | None] = {}
-    for name, element in _named(root, "link", source).items():
-        links[name] = _inertial(element, _Place(f"link {name!r}", source))
+def parse_urdf(text: str, problems: Problems) -> RobotDescription:
+    """Parse URDF text. ``problems`` collects what is wrong with links and joints, which are then left out."""
+    source, element = problems.source, parse_xml(text, problems.source)
+    if element.tag != "robot":
+        raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; give a URDF file.")
+    refuse_xacro(element, source)
+    name = (element.get("name") or "").strip() or "robot"
+    if "name" not in element.attrib:
+        problems.ignore("a <robot> without a name is called 'robot'", "<robot>", "no name")
+    named, parts = (_named(element, kind, problems) for kind in ("link", "joint"))
+    problems.raise_all()  # nothing can be said of what has no name
+    links: dict[str, InertialDescription | None] = dict.fromkeys(named)
+    for link, part in named.items():
+        with problems.collected(link):
+            links[link] = _inertial(part, _Place(f"link {link!r}", source, problems))
     if not links:
         raise MalformedUrdf(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
-    joints = tuple(
-        _joint(element, name, links, _Place(f"joint {name!r}", source))
-        for name, element in _named(root, "joint", source).items()
-    )
-    return RobotDescription(_name(root, "robot", source), source, links, joints)
+    root = _undefined_root(element, set(links))
+    if root is not None:
+        links = {root: None} | links
+        seen = f"{source}: the link {root!r} is a parent, and the file does not define it"
+        problems.errors.append(DanglingJoint(seen, ". It can be the root, fixed in the world.", {"root": root}))
+    joints = []
+    for joint, part in parts.items():
+        with problems.collected():
+            joints.append(_joint(part, joint, links, _Place(f"joint {joint!r}", source, problems)))
+    return RobotDescription(name, source, links, tuple(joints), len(joints) == len(parts))
 
 
-def _named(root: Element, kind: str, source: str) -> dict[str, Element]:
+def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
     found: dict[str, Element] = {}
     for element in root.findall(kind):
-        name = _name(element, kind, source)
-        if name in found:
-            raise DuplicateName(f"{source}: two {kind}s are called {name!r}; {kind} names must be unique, rename one.")
-        found[name] = element
+        with problems.collected():
+            name = _name(element, kind, problems.source)
+            if name in found:
+                seen = f"{problems.source}: two {kind}s are called {name!r}"
+                raise DuplicateName(seen, f"; {kind} names must be unique, rename one.")
+            found[name] = element
     return found
+
+
+def _undefined_root(element: Element, links: set[str]) -> str | None:
+    """The one parent that the file does not define, if everything hangs on it."""
+    parents, children = ({part.get("link", "") for part in element.iterfind(f"joint/{end}")} for end in ENDS)
+    undefined = (parents | children) - links
+    return None if len(undefined) != 1 or undefined & children or links - children else undefined.pop()
 
 
 @dataclass(frozen=True)
@@ -114,37 +147,10 @@ class _Place:
 
     owner: str
     source: str
+    problems: Problems
 
     def __str__(self) -> str:
         return f"{self.source}: {self.owner}"
-
-
-def _parse_xml(text: str, source: str) -> Element:
-    if not text.strip():
-        raise MalformedUrdf(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
-    try:
-        return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
-    except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
-        raise UnsafeXml(
-            f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
-            "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
-        ) from None
-    except (ParseError, UnicodeError) as error:
-        hint = ""
-        if "unbound prefix" in str(error):
-            hint = " If this is a xacro file, expand it first: xacro robot.urdf.xacro > robot.urdf."
-        raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.{hint}") from None
-
-
-def _refuse_xacro(root: Element, source: str) -> None:
-    mechanics = [element for part in root if part.tag in ("link", "joint") for element in part.iter()]
-    expressions = [element for element in mechanics if any("${" in v or "$(" in v for v in element.attrib.values())]
-    macros = [element for element in root.iter() if "xacro}" in element.tag]
-    for element in (*macros, *expressions):
-        raise UnexpandedXacro(
-            f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
-            "run xacro first: xacro robot.urdf.xacro > robot.urdf."
-        )
 
 
 def _name(element: Element, kind: str, source: str) -> str:
@@ -177,7 +183,7 @@ def _optional_child(element: Element, tag: str, place: _Place) -> Element | None
 
 def _number(text: str, what: str, place: _Place) -> float:
     try:
-        if "_" in text:  # Python reads 1_000, the format does not
+        if "_" in text or not text.isascii():  # Python reads 1_000 and digits of every script, the format does not
             raise ValueError
         return float(text)
     except ValueError:
@@ -195,13 +201,23 @@ def _scalar(element: Element | None, attribute: str, default: float, place: _Pla
     return value
 
 
+def _limit(element: Element | None, attribute: str, place: _Place) -> float:
+    """A limit >= 0 that may be absent; a negative one is none."""
+    value = _scalar(element, attribute, math.inf, place)
+    if value < 0.0:
+        what = f"a negative <limit> {attribute} is taken as no limit"
+        place.problems.ignore(what, place.owner, f"<limit> {attribute}={value:g}")
+        return math.inf
+    return value
+
+
 def _non_negative(element: Element | None, attribute: str, default: float, place: _Place) -> float:
-    """A number >= 0 that may be absent; only what may be absent as infinite may be infinite."""
+    """A finite number >= 0 that may be absent."""
     value = _scalar(element, attribute, default, place)
-    if value < 0.0 or (math.isinf(value) and not math.isinf(default)):
-        allowed = "a number >= 0" if math.isinf(default) else "a finite number >= 0"
-        what = "" if element is None else f"<{element.tag}> "
-        raise InvalidNumber(f"{place}: {what}{attribute} is {value:g}; give {allowed}, or leave it out.")
+    if element is not None and not 0.0 <= value < math.inf:
+        raise InvalidNumber(
+            f"{place}: <{element.tag}> {attribute} is {value:g}", "; give a finite number >= 0, or leave it out."
+        )
     return value
 
 
@@ -228,6 +244,8 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     if element is None:
         return None
     mass = _number(_attribute(_child(element, "mass", place), "value", place), "<mass> value", place)
+    if 0.0 < mass < LIGHTEST:
+        raise InvalidNumber(f"{place}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
     entries = _child(element, "inertia", place)
     ixx, ixy, ixz, iyy, iyz, izz = (
         _number(_attribute(entries, key, place), f"<inertia> {key}", place)
@@ -245,24 +263,27 @@ def _joint(
     element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place
 ) -> JointDescription:
     kind = _attribute(element, "type", place)
-    if kind not in (*MOVABLE, "fixed"):
+    if kind not in (*MOVABLE, "fixed", *FREE):
         close = difflib.get_close_matches(kind, (*MOVABLE, "fixed"), n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise UnsupportedJoint(f"{place} has the unknown type {kind!r}; allowed: {', '.join(MOVABLE)}, fixed.{hint}")
     ends = {}
-    for end in ("parent", "child"):
+    for end in ENDS:
         ends[end] = _attribute(_child(element, end, place), "link", place)
         if ends[end] not in links:
             close = difflib.get_close_matches(ends[end], links, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
             raise DanglingJoint(
-                f"{place} names the {end} link {ends[end]!r}, which the file does not define{hint}; "
-                f"correct the name or add the link. Links: {', '.join(sorted(links))}"
+                f"{place} names the {end} link {ends[end]!r}, which the file does not define{hint}",
+                f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
     origin = _origin(_optional_child(element, "origin", place), place)
     if not (np.abs(origin) < FARTHEST).all():
         raise InvalidNumber(f"{place}: <origin> xyz {origin[:3, 3].tolist()} is not finite or far; give metres.")
-    axis = _vector(_optional_child(element, "axis", place), "xyz", (1.0, 0.0, 0.0), place)
+    axes = element.findall("axis")
+    if len(axes) > 1:
+        place.problems.ignore("the first of several <axis> counts", place.owner, f"{len(axes)} <axis>")
+    axis = _vector(axes[0] if axes else None, "xyz", (1.0, 0.0, 0.0), place)
     length = float(np.linalg.norm(axis))
     if kind in MOVABLE and not (math.isfinite(length) and length > 0.0):
         raise InvalidNumber(f"{place}: <axis> {axis.tolist()} has no direction; give a non-zero, finite vector.")
@@ -273,9 +294,13 @@ def _joint(
         # the format's default for the one that is left out is 0
         lower, upper = (_scalar(limit, side, 0.0, place) for side in ("lower", "upper"))
         if lower > upper:
-            raise InvalidNumber(f"{place}: lower limit {lower:g} is above upper limit {upper:g}; swap them.")
+            what = "a lower limit above the upper one is taken as no limit"
+            place.problems.ignore(what, place.owner, f"the lower limit {lower:g} above the upper limit {upper:g}")
+            lower, upper = -math.inf, math.inf
     dynamics = _optional_child(element, "dynamics", place)
     mimic = _optional_child(element, "mimic", place)
+    if mimic is not None and kind == "fixed":
+        place.problems.note("the <mimic> of a fixed joint is ignored", place.owner)
     return JointDescription(
         name=name,
         type=kind,
@@ -285,9 +310,16 @@ def _joint(
         axis=unit,
         lower=lower,
         upper=upper,
-        velocity_limit=_non_negative(limit, "velocity", math.inf, place),
-        effort_limit=_non_negative(limit, "effort", math.inf, place),
+        velocity_limit=_limit(limit, "velocity", place),
+        effort_limit=_limit(limit, "effort", place),
         damping=_non_negative(dynamics, "damping", 0.0, place),
         friction=_non_negative(dynamics, "friction", 0.0, place),
-        mimics=None if mimic is None else mimic.get("joint", "another joint"),
+        mimics=None if mimic is None or kind == "fixed" else _mimic(mimic, place),
     )
+
+
+def _mimic(element: Element, place: _Place) -> Mimic:
+    numbers = [_scalar(element, name, default, place) for name, default in (("multiplier", 1.0), ("offset", 0.0))]
+    if not np.isfinite(numbers).all():
+        raise InvalidNumber(f"{place}: <mimic> holds numbers that are not finite; correct multiplier and offset.")
+    return Mimic(_attribute(element, "joint", place), *numbers)

@@ -8,20 +8,25 @@ three variables.
 """
 
 import re
-import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float
 
 from forcegp.atomic_files import write_bytes
-from forcegp.errors import DataWarning, InvalidInput, UnknownJoint, UnknownLink, UnreadableRobotFile
+from forcegp.errors import InvalidInput, NonPhysicalInertia, UnknownJoint, UnknownLink, UnreadableRobotFile
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
+from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import RobotDescription, parse_urdf
+
+LARGEST_FILE = 16 << 20
+"""Bytes; robot files have some hundred thousand."""
 
 
 def read_text(path: str | Path) -> str:
@@ -30,6 +35,11 @@ def read_text(path: str | Path) -> str:
     if path.is_fifo():  # to open it would wait for a writer for ever
         raise UnreadableRobotFile(f"{path}: is not a regular file; give the path of a URDF file.")
     try:
+        if path.is_file() and path.stat().st_size > LARGEST_FILE:
+            raise UnreadableRobotFile(
+                f"{path}: holds {path.stat().st_size >> 20} MiB, more than the {LARGEST_FILE >> 20} MiB that a robot "
+                "file may have; give the URDF file of one robot."
+            )
         data = path.read_bytes()
     except FileNotFoundError:
         raise UnreadableRobotFile(f"{path}: no such file; give the path of a URDF file.") from None
@@ -204,31 +214,56 @@ def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 
 
 def with_chosen_inertias(
-    choice: str, text: str, description: RobotDescription, layout: Layout
+    choice: str, text: str, description: RobotDescription, layout: Layout, problems: Problems
 ) -> tuple[str, RobotDescription]:
-    """URDF text and its description, unless "strict" with possible inertias for impossible ones of moving links.
+    """URDF text and its description with possible inertias for impossible ones of moving links; every other byte stays.
 
-    Every other byte stays. Warns DataWarning with the link and the relative change. What the inertia alone cannot mend
-    (a negative mass) stays, and is refused by :func:`~forcegp.robots.layout.check_inertias`. Raises InvalidInput for
-    another choice.
+    With "strict" `problems` collects these links, and the text stays. With "nearest" it notes them, with the relative
+    change; a link without mass loses its inertia. What the inertia alone cannot mend (a negative mass) is collected in
+    both cases. Raises InvalidInput for another choice.
     """
     if choice not in get_args(InertiaChoice):
         raise InvalidInput(f"inertias is {choice!r}; give one of {', '.join(get_args(InertiaChoice))}.")
-    if choice == "strict":
-        return text, description
+    links, source = dict(description.links), description.source
+    changed = False
     for name in layout.moving:
-        inertial = description.links[name]
+        inertial = links[name]
         objection = inertial and physical_objection(inertial.mass, inertial.center_of_mass, inertial.inertia)
-        if inertial is None or objection is None or inertial.mass <= 0.0 or not np.isfinite(inertial.inertia).all():
+        if inertial is None or objection is None or name in problems.broken:
             continue
-        nearest = nearest_inertia(inertial.inertia)
-        relative = np.linalg.norm(nearest - inertial.inertia) / np.linalg.norm(inertial.inertia)
-        source = description.source
+        seen = f"{source}: no physical body has the inertia of link {name!r}: {objection}"
+        mendable = inertial.mass >= 0.0 and np.isfinite([inertial.inertia, inertial.center_of_mass * np.eye(3)]).all()
+        if not mendable:
+            problems.broken.add(name)
+            problems.errors.append(NonPhysicalInertia(seen, f"{IN_THE_FILE}."))
+            continue
+        nearest = nearest_inertia(inertial.inertia) if inertial.mass > 0.0 else np.zeros((3, 3))
+        links[name] = replace(inertial, inertia=nearest)
+        if choice == "strict":
+            problems.errors.append(
+                NonPhysicalInertia(
+                    seen, f"{IN_THE_FILE}, or take the nearest inertia that a body has.", {"inertias": "nearest"}
+                )
+            )
+            continue
+        changed = True
+        relative = 100.0 * np.linalg.norm(nearest - inertial.inertia) / np.linalg.norm(inertial.inertia)
         text = replace_inertial(text, name, inertial.mass, inertial.center_of_mass, nearest, source=source)
-        warnings.warn(
-            f"{source}: no body has the inertia of link {name!r} ({objection}); the nearest one that a body has "
-            f"differs by {100.0 * relative:.2g} % and is used instead.",
-            DataWarning,
-            stacklevel=4,
+        problems.note(
+            "an inertia that no body has is replaced by the nearest one that a body has",
+            f"link {name!r}: {objection}; changed by {relative:.2g} %",
         )
-    return text, parse_urdf(text, source=description.source)
+    if changed:
+        return text, parse_urdf(text, Problems(source))
+    return text, replace(description, links=links)
+
+
+IN_THE_FILE = (
+    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
+)
+
+
+def with_root(text: str, root: str) -> str:
+    """URDF text that defines the link ``root``, which it does not name as one."""
+    end = text.rfind("</robot")
+    return f"{text[:end]}<link name={quoteattr(root)}/>\n{text[end:]}"

@@ -1,16 +1,21 @@
 """Figures of a comparison: errors per joint, calibration, and errors of predicted motions against their length."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.evaluation.plots import style
+from forcegp.validation.candidates import MOTIONS
 
-LINE_STYLES, MARKERS = ("-", "--", ":"), "os^"
-"""For models beyond the number of colours."""
+COLORS = {
+    "given": (style.KNOWN_PHYSICS,),
+    "identified": (style.IDENTIFIED, "#00563F"),
+    "black box": (style.BLACK_BOX, "#7B3F67"),
+    "residual": (style.SERIES[4],),
+    "force prior": (style.PREDICTION, style.SERIES[5], "#17375E"),
+}
+"""By the kind of a model, as in all other figures; what is refined on motions is its model with dashes."""
 
 
 def figures_of(document: Mapping[str, Any]) -> dict[str, Figure]:
@@ -26,89 +31,89 @@ def figures_of(document: Mapping[str, Any]) -> dict[str, Figure]:
 
 
 def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Figure:
-    """Normalised errors of accelerations above, force errors below: the median and the range over runs, by joint."""
-    joints = style.short_joint_names(document["joint_names"])
-    figure = style.new_figure(max(7.0, 1.3 * len(joints) + 2.0), 6.4)
-    above, below = figure.subplots(2, 1, sharex=True)
-    for axes, score, title, label in (
-        (above, "nrmse", "Acceleration: RMSE over the standard deviation of the target", "nRMSE"),
-        (below, "force_rms", "Force space: RMS of M (predicted − measured acceleration)", _unit(document, "u")),
-    ):
-        _points(axes, models, f"{score}_per_joint", len(joints))
-        style.quiet(axes, title=title, y=label)
-        axes.set_yscale("log")
-    below.set_xticks(range(len(joints)), joints, fontsize=style.SMALL)
-    _legend(figure, above, len(models))
+    """One row per model, one column per joint: normalised errors of accelerations above, force errors below.
+
+    A dot is the median over runs, the line behind it the range.
+    """
+    joints, looks = style.short_joint_names(document["joint_names"]), _looks(models)
+    scores = {
+        "nrmse": "Acceleration: RMSE / standard deviation of the measurement",
+        "force_rms": f"Force: RMS of M (predicted − measured acceleration) [{_unit(document, 'u')}]",
+    }
+    figure = style.new_figure(2.4 + max(4.2, 1.35 * len(joints)), 1.4 + 0.44 * len(models))
+    halves: Any = figure.subfigures(2, 1)
+    for part, (score, title) in zip(halves, scores.items(), strict=True):
+        panels = part.subplots(1, len(joints), sharey=True, squeeze=False)[0]
+        style.heading(part, title, size=style.NORMAL)
+        for joint, axes in enumerate(panels):
+            for row, (name, model) in enumerate(models.items()):
+                value = model[f"{score}_per_joint"][joint]
+                if value is not None:
+                    color, inside = (looks[name][part] for part in ("color", "markerfacecolor"))
+                    axes.plot([value["min"], value["max"]], [row, row], color=color, linewidth=4.0, alpha=0.35)
+                    axes.plot(value["median"], row, "o", markersize=5.5, color=color, markerfacecolor=inside)
+            style.quiet(axes, title=joints[joint])
+            axes.set_xscale("log")
+            axes.margins(x=0.12)
+            style.plain_ticks(axes.xaxis)
+        panels[0].set_yticks(range(len(models)), list(models))
+        panels[0].set_ylim(len(models) - 0.5, -0.5)
     return figure
-
-
-def _points(axes: Axes, models: Mapping[str, Any], score: str, joints: int) -> None:
-    width = 0.8 / len(models)
-    for place, (name, model) in enumerate(models.items()):
-        known = [(joint, value) for joint, value in enumerate(model[score]) if value is not None]
-        at = np.array([joint + (place + 0.5) * width - 0.4 for joint, _ in known])
-        middle, low, high = (np.array([value[key] for _, value in known]) for key in ("median", "min", "max"))
-        looks = {"fmt": MARKERS[place // len(style.SERIES) % 3], "markersize": 4.5, "elinewidth": 1.2}
-        around = np.vstack([middle - low, high - middle])
-        axes.errorbar(at, middle, yerr=around, label=name, color=_color(place), **looks)
-    for joint in range(joints - 1):
-        axes.axvline(joint + 0.5, color="#DDE0E4", linewidth=0.7)
 
 
 def calibration_figure(models: Mapping[str, Any]) -> Figure:
     """The share of held-out accelerations inside the central intervals, against the share that should be."""
-    figure = style.new_figure(5.6, 5.0)
+    figure = style.new_figure(7.6, 4.4)
     axes = figure.subplots()
-    axes.plot([0, 1], [0, 1], color=style.TRUTH, linewidth=1.0)
-    for place, (name, model) in enumerate(models.items()):
-        middle = [covered["median"] for covered in model["calibration"]["covered"]]
-        _draw_curve(axes, place, name, model["calibration"]["levels"], middle)
+    axes.plot([0, 1], [0, 1], color=style.TRUTH, linewidth=1.0, label="exact")
+    for name, looks in _looks(models).items():
+        calibration = models[name]["calibration"]
+        axes.plot(calibration["levels"], [covered["median"] for covered in calibration["covered"]], label=name, **looks)
     title = "Calibration, mean over joints, median over runs"
     style.quiet(axes, title=title, x="nominal interval", y="held-out rows inside")
     axes.set_aspect("equal")
-    axes.annotate("too narrow", (0.72, 0.2), fontsize=style.NORMAL, color=style.QUIET)
-    axes.annotate("too wide", (0.1, 0.72), fontsize=style.NORMAL, color=style.QUIET)
-    _legend(figure, axes, len(models))
+    corner = {"fontsize": style.NORMAL, "color": style.QUIET}
+    axes.text(0.98, 0.02, "intervals too narrow", ha="right", **corner)
+    axes.text(0.0, 0.97, "too wide", **corner)
+    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
     return figure
 
 
 def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Figure:
     """RMS error of q over motions and joints against the length of the prediction: median and range over runs."""
-    figure = style.new_figure(6.4, 4.6)
+    figure = style.new_figure(8.2, 3.8)
     axes = figure.subplots()
-    for place, (name, model) in enumerate(models.items()):
-        motions = model["motions"]
+    for name, looks in _looks(models).items():
+        motions = models[name]["motions"]
         known = [(h, rms) for h, rms in zip(motions["horizons"], motions["rms"], strict=True) if rms is not None]
         if not known:
             continue
         time = [h for h, _ in known]
         low, middle, high = ([rms[key] for _, rms in known] for key in ("min", "median", "max"))
-        _draw_curve(axes, place, name, time, middle)
-        axes.fill_between(time, low, high, color=_color(place), alpha=0.10, linewidth=0)
+        axes.plot(time, middle, label=name, **looks)
+        axes.fill_between(time, low, high, color=looks["color"], alpha=0.12, linewidth=0)
     title, label = "Motions predicted from recorded states under recorded forces", _unit(document, "q")
     style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{label}]")
     axes.set_yscale("log")
-    _legend(figure, axes, len(models))
+    style.plain_ticks(axes.yaxis)
+    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
     return figure
 
 
-LINE, LETTER = 0.6, 0.075
-"""Inches that the line and a letter of a legend's entry take."""
-
-
-def _legend(figure: Figure, axes: Axes, count: int) -> None:
-    longest = max(map(len, axes.get_legend_handles_labels()[1]), default=0)
-    fitting = max(1, int(figure.get_figwidth() / (LINE + LETTER * longest)))
-    style.legend_below(figure, axes, columns=min(count, 4, fitting), labelcolor=style.QUIET)
-
-
-def _color(place: int) -> str:
-    return style.SERIES[place % len(style.SERIES)]
-
-
-def _draw_curve(axes: Axes, place: int, name: str, x: Sequence[float], y: Sequence[float]) -> None:
-    looks = {"linestyle": LINE_STYLES[place // len(style.SERIES) % len(LINE_STYLES)], "marker": "o", "markersize": 3.0}
-    style.draw_line(axes, x, y, _color(place), 1.4, name, **looks)
+def _looks(models: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """How every model is drawn: colours of its kind; earlier ones wider, so that curves which coincide are seen."""
+    kinds = {name.removesuffix(MOTIONS): model["kind"] for name, model in models.items()}
+    named = sorted(kinds, key=lambda base: not base.startswith("joint-friction"))  # which has one colour everywhere
+    looks = {}
+    for below, name in enumerate(models, start=1 - len(models)):
+        base = name.removesuffix(MOTIONS)
+        alike = [other for other in named if kinds[other] == kinds[base]]
+        turn, place = divmod(alike.index(base), len(COLORS[kinds[base]]))
+        color, refined = COLORS[kinds[base]][place], name != base
+        looks[name] = {"color": color, "linestyle": "--" if refined else ("-", "-.", ":")[turn % 3]}
+        looks[name] |= {"linewidth": 1.2 - 0.35 * below, "marker": "o", "markersize": 3.0 - 0.5 * below}
+        looks[name] |= {"markerfacecolor": "white" if refined else color}
+    return looks
 
 
 def _unit(document: Mapping[str, Any], quantity: str) -> str:

@@ -22,18 +22,18 @@ def contacts_figure(
     figure = style.new_figure(9.0, 5.4)
     above, below = figure.subplots(2, 1, sharex=True)
     for axes in (above, below):
+        axes.margins(x=0)
         for start, end in contacts:
             axes.axvspan(start, end, color=style.KNOWN_PHYSICS, alpha=0.18, linewidth=0, label="contact")
     style.draw_line(above, time, np.maximum(distance, 1e-3), style.PREDICTION, 0.8, "distance from free motion")
     style.draw_line(above, time, np.full_like(time, threshold), style.TRUTH, 1.0, "threshold", linestyle=style.DASHED)
     above.set_yscale("log")
     above.set_ylim(bottom=max(0.1, float(np.quantile(distance, 0.01))))
-    style.quiet(above, y="squared, in standard deviations")
+    style.quiet(above, y="squared distance [σ²]")
     names = style.short_joint_names(joints)
     for joint, name in enumerate(names):
         style.draw_line(below, time, torque[:, joint], style.SERIES[joint % len(style.SERIES)], 0.9, name)
-    style.quiet(below, x="time in s", y="torque beyond the model, Nm (N)")
-    below.margins(x=0)
+    style.quiet(below, x="time [s]", y="unexplained torque [Nm (N)]")
     style.legend_above(figure, title, above)
     style.legend_below(figure, below)
     return figure

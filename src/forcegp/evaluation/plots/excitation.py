@@ -16,23 +16,21 @@ def excitation_figure(chosen: Excitation) -> Figure:
     figure = style.new_figure(max(2.2 * robot.nv, 6.0), 1.2 + 2.2 * rows)
     grid = figure.subplots(rows, robot.nv, squeeze=False)
     for j, name in enumerate(style.short_joint_names(robot.joint_names)):
-        axes = grid[0, j]
+        axes, (length, force) = grid[0, j], ("m", "N") if robot.joints[j].type == "prismatic" else ("rad", "Nm")
         if model is not None:
             log = model.training.q[:, j], model.training.v[:, j]
-            axes.plot(*log, ".", markersize=3, color=style.KNOWN_PHYSICS, label="log so far", zorder=3)
+            axes.plot(*log, ".", markersize=3, color=style.QUIET, label="log so far", zorder=3)
         style.draw_line(axes, chosen.motion.q[:, j], chosen.motion.v[:, j], style.PREDICTION, 1.0, "chosen motion")
-        style.quiet(axes, title=name, x="position in rad (m)", y="" if j else "velocity in rad/s (m/s)")
+        axes.locator_params(nbins=4)
+        style.quiet(axes, title=name, x=f"position [{length}]", y="" if j else f"velocity [{length}/s]")
         if model is None or chosen.expected is None or rows == 1:
             continue
         axes, v = grid[1, j], np.linspace(-fastest[j], fastest[j], 301)
-        for posterior, color, when in (
-            (model, style.KNOWN_PHYSICS, "so far"),
-            (chosen.expected, style.PREDICTION, "after"),
-        ):
+        for posterior, color, when in ((model, style.QUIET, "so far"), (chosen.expected, style.PREDICTION, "after")):
             std = posterior.curve(panels[j].latent, v).std
             style.draw_line(axes, v, std, color, 1.2, f"standard deviation {when}")
         axes.set_yscale("log")
-        style.quiet(axes, x="velocity in rad/s (m/s)", y="" if j else "standard deviation in Nm (N)")
+        style.quiet(axes, x=f"velocity [{length}/s]", y="" if j else f"standard deviation\nof friction [{force}]")
     style.legend_below(figure, *grid[:, 0])
     style.heading(figure, f"The next {chosen.seconds:g} s")
     return figure

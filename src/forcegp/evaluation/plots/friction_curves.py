@@ -78,7 +78,11 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
         for index, place in enumerate(range(which.start, which.stop)):
             along = _velocity_along(term, term.latent_names(robot)[index], index) if widths[place] > 1 else None
             if widths[place] == 1:
-                joint = robot.joint_names.index(term.latent_names(robot)[index]) if _of_joints(term) else None
+                joint = (
+                    robot.joint_names.index(term.latent_names(robot)[index])
+                    if isinstance(term, JointFriction)
+                    else None
+                )
                 panels.append(CurvePanel(names[place], component, term, index, 0, 1.0, joint))
             elif along is not None:
                 panels.append(CurvePanel(names[place], component, term, index, along, -1.0))
@@ -86,11 +90,6 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
         return panels
     with_law = [joint for joint in range(robot.nv) if law_forces(posterior.system, joint, np.ones(1)).any()]
     return [CurvePanel(robot.joint_names[joint], LAWS, NoForces(), joint, 0, 1.0, joint) for joint in with_law]
-
-
-def _of_joints(term: ForcePrior) -> bool:
-    """Whether the processes of a term are friction of single joints over their velocity."""
-    return isinstance(term, JointFriction)
 
 
 def law_forces(system: MechanicalSystem, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -133,7 +132,7 @@ def friction_curves_figure(
     truth = {} if dataset is None else _truth(posterior, dataset, chosen)
     for number, (axes, panel) in enumerate(zip(grid, chosen, strict=False)):
         feature, unit = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
-        what = {"Nm": "torque in Nm", "": "force / normal force"}.get(unit, f"force in {unit}")
+        what = {"Nm": "torque [Nm]", "": "force / normal force"}.get(unit, f"force [{unit}]")
         what = f"resisting {what}" if panel.resisting < 0 else what
         style.quiet(axes, title=titles[number], x=_label(feature), y=what)
     for axes in grid[len(chosen) :]:
@@ -167,10 +166,9 @@ def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> lis
 
 
 def _label(feature: str) -> str:
-    """`velocity of lbr_iiwa_joint_1 [rad/s]` -> `velocity in rad/s`: the title names the joint."""
+    """`velocity of lbr_iiwa_joint_1 [rad/s]` -> `velocity [rad/s]`: the title names the joint."""
     what, _, unit = feature.partition(" [")
-    what = what.split(" of ")[0]
-    return f"{what} in {unit.removesuffix(']')}" if unit else what
+    return " [".join(filter(None, (what.split(" of ")[0], unit)))
 
 
 def _draw_curve(

@@ -47,7 +47,7 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
         style.quiet(panel, y=f"({units['u'][joint]})² / Hz")
     for column, title in enumerate(("Acceleration (positions differentiated)", "Torque")):
         axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
-        axes[-1, column].set_xlabel("frequency in Hz", fontsize=style.NORMAL)
+        axes[-1, column].set_xlabel("frequency [Hz]", fontsize=style.NORMAL)
     figure.align_ylabels(axes[:, 0])
     title = "Power spectra"
     if preparation.cutoff is not None:
@@ -62,12 +62,8 @@ def _draw_filtered(axes: Axes, frequency: np.ndarray, power: np.ndarray, step: f
     if preparation.cutoff is not None:
         gain = low_pass_gain(frequency, 1.0 / step, float(preparation.cutoff), preparation.order)
         _draw(axes, frequency, power * gain**2, style.PREDICTION, "after the filter")
-        _draw_cutoff(axes, float(preparation.cutoff), style.PREDICTION)
+        axes.axvline(float(preparation.cutoff), color=style.PREDICTION, linestyle="--", linewidth=1.0, label="cut-off")
     _limits(axes, frequency, power)
-
-
-def _draw_cutoff(axes: Axes, cutoff: float, color: str) -> None:
-    axes.axvline(cutoff, color=color, linewidth=1.0, linestyle=style.DASHED, label="cut-off")
 
 
 def _draw(axes: Axes, frequency: np.ndarray, power: np.ndarray, color: str, label: str) -> None:
@@ -124,12 +120,12 @@ def check_figure(report: CheckReport) -> Figure:
     shown = shown.rows(slice(None, None, max(1, len(shown) // MOST_ROWS)))
     for joint, (panel, lowest) in enumerate(panels):
         unit = _draw_joint(panel, report, shown, joint)
-        style.quiet(panel, title=_title(names[joint], report, joint), y=unit, x="time in s" if lowest else "")
+        style.quiet(panel, title=_title(names[joint], report, joint), y=unit, x="time [s]" if lowest else "")
     style.legend_above(halves[0], _heading(report), *(panel for panel, _ in panels), markerscale=4)
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]
     _draw_spectra(left, report, names)
     _draw_time_steps(right, inputs.log)
-    style.quiet(right, title="Time steps as logged", x="recorded time in s", y="ms")
+    style.quiet(right, title="Time steps as logged", x="recorded time [s]", y="ms")
     return figure
 
 
@@ -182,7 +178,7 @@ def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
     title = "Acceleration as logged: no filter"
     if preparation.cutoff is not None:
-        _draw_cutoff(axes, float(preparation.cutoff), style.TRUTH)
+        axes.axvline(float(preparation.cutoff), color=style.TRUTH, linestyle="--", linewidth=1.0, label="cut-off")
         title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
     axes.legend(fontsize=style.SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
-    style.quiet(axes, title=title, x="frequency in Hz", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")
+    style.quiet(axes, title=title, x="frequency [Hz]", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

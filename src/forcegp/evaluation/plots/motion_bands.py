@@ -53,6 +53,6 @@ def motion_bands_figure(
             label = "predicted − recorded" if first else None
             style.draw_line(axes, time, signed[motion, :, joint], style.TRUTH, 1.1, label)
         axes.margins(x=0)
-        style.quiet(axes, title=names[joint], y=units[joint], x="time in s" if lowest else "")
+        style.quiet(axes, title=names[joint], y=units[joint], x="time [s]" if lowest else "")
     style.legend_above(figure, f"Errors of positions predicted {horizon:g} s ahead", panels[0][0])
     return figure

@@ -1,6 +1,5 @@
 """Plots: predicted accelerations and normal forces against the truth, and the course of the search."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.plots.style import NORMAL, QUANTILE, SERIES, SMALL, new_figure, quiet
+from forcegp.evaluation.plots.style import QUANTILE
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.models.protocol import Posterior
 
@@ -35,7 +34,7 @@ def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 
         style.quiet(axes[joint, 1], y=units[joint])
     for column, title in enumerate(("Acceleration", "Error: prediction minus measurement (dots) or truth (line)")):
         axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
-        axes[-1, column].set_xlabel("time in s", fontsize=style.NORMAL)
+        axes[-1, column].set_xlabel("time [s]", fontsize=style.NORMAL)
     figure.align_ylabels(axes[:, 0])
     figure.align_ylabels(axes[:, 1])
     title = f"Prediction after {len(posterior.training)} training points"
@@ -70,32 +69,6 @@ def draw_error(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) 
         axes.set_ylim(-limit, limit)
 
 
-def likelihood_figure(
-    histories: Mapping[str, Sequence[float]], *, objective: str = "negative log likelihood with hyperpriors [nats]"
-) -> Figure:
-    """One curve per model, `{name: posterior.result.history}`; the last value of each is written beside it.
-
-    `objective` names the values, with their unit in brackets: `posterior.objective`.
-    Raises InvalidInput without any history.
-    """
-    if not histories or not all(len(history) for history in histories.values()):
-        raise InvalidInput("no history to plot; give {name: posterior.result.history}.")
-    figure = new_figure(7.0, 3.6)
-    axes = figure.subplots()
-    for color, (name, history) in zip(SERIES, histories.items(), strict=False):
-        last = len(history) - 1
-        axes.plot(history, color=color, linewidth=1.6, label=name)
-        axes.plot(last, history[-1], "o", color=color, markersize=4)
-        text = f"{history[-1]:.1f}" if abs(history[-1]) >= 10.0 else f"{history[-1]:.3g}"
-        beside = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
-        axes.annotate(text, (last, history[-1]), color=color, fontsize=SMALL, **beside)
-    axes.margins(x=0.08)
-    what, _, unit = objective.partition(" [")
-    quiet(axes, title=f"What the search lowers: {what}", x="iteration", y=unit.removesuffix("]"))
-    axes.legend(fontsize=NORMAL, frameon=False)
-    return figure
-
-
 LARGEST_ERROR = 5.0
 """Standard deviations at which the histogram of errors ends; what lies beyond is counted at the ends."""
 ERROR_ROWS = 2000
@@ -128,7 +101,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         name = f"{type(contact.surface).__name__.lower()} at {contact.frame}"
         title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
         _draw_force(grid[index, 0], rows, forces, index, known)
-        style.quiet(grid[index, 0], title=title, x="time in s", y="normal force in N")
+        style.quiet(grid[index, 0], title=title, x="time [s]", y="normal force [N]")
         if every is not None:
             title = _draw_errors(grid[index, 1], every, index)
             style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")

@@ -43,7 +43,7 @@ def rollout_figure(
         dashed = {"label": "rollout of the mean", "linestyle": style.DASHED}
         style.draw_line(panel, errors.time, mean[:, joint], style.PREDICTION, 1.4, **dashed)
         panel.margins(x=0)
-        style.quiet(panel, title=names[joint], y=units[joint], x="time in s" if lowest else "")
+        style.quiet(panel, title=names[joint], y=units[joint], x="time [s]" if lowest else "")
     style.legend_above(above, f"{title}; from row {recorded.rows[0]}", axes[0][0])
     panels = [(_draw_joint_error, True), (_draw_tool, errors.tool is not None)]
     panels.append((_draw_constraint, errors.constraint is not None))
@@ -111,5 +111,5 @@ def _median(values: Float[np.ndarray, "motions rows"]) -> Float[np.ndarray, " ro
 def _finish(axes: Axes, title: str, unit: str) -> None:
     axes.set_yscale("log")
     axes.margins(x=0)
-    style.quiet(axes, title=title, x="time in s", y=unit)
+    style.quiet(axes, title=title, x="time [s]", y=unit)
     axes.legend(fontsize=style.SMALL, frameon=False, loc="lower right")

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from PIL import Image
 
 from forcegp.atomic_files import atomic_file
@@ -20,10 +20,12 @@ from forcegp.errors import InvalidInput
 # Okabe & Ito (2008): distinguishable with every kind of colour vision.
 PREDICTION = "#0072B2"
 KNOWN_PHYSICS = "#D55E00"
+IDENTIFIED = "#009E73"
+BLACK_BOX = "#CC79A7"
 TRUTH = "#111111"
 MEASUREMENT = "#9A9A9A"
 QUIET = "#5F6670"
-SERIES = (PREDICTION, KNOWN_PHYSICS, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", TRUTH)
+SERIES = (PREDICTION, KNOWN_PHYSICS, IDENTIFIED, BLACK_BOX, "#E69F00", "#56B4E9", TRUTH)
 
 DASHED = (0, (4, 1.5))
 SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
@@ -36,11 +38,6 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), dpi=RESOLUTION, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def speed_colors() -> ListedColormap:
-    """Viridis (even for every kind of colour vision) without its yellow end, which vanishes on white."""
-    return ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)), name="speed")
 
 
 def quiet(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
@@ -77,33 +74,40 @@ def joint_panels(figure: FigureBase, count: int, columns: int) -> list[tuple[Axe
     return [(axes, place + columns >= count) for place, axes in enumerate(grid[:count])]
 
 
-def heading(figure: Figure, text: str, *, size: float = LARGE) -> None:
+def heading(figure: FigureBase, text: str, *, size: float = LARGE) -> None:
     """A bold title above all panels, at the left."""
     figure.suptitle(text, fontsize=size, fontweight="bold", x=0.01, ha="left")
 
 
-def legend_entries(*axes: Axes) -> tuple[list[Artist], list[str]]:
-    """Handles and labels of several axes, each label once."""
+def legend_entries(*axes: Axes) -> list[Artist]:
+    """What several axes show, each label once."""
     entries: dict[str, Artist] = {}
     for source in axes:
         for handle, label in zip(*source.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    return list(entries.values()), list(entries)
+    return list(entries.values())
 
 
 def legend_above(figure: FigureBase, title: str, *axes: Axes, **more: Any) -> None:
     """The entries of these axes in one row above all panels, under a bold title."""
-    handles, labels = legend_entries(*axes)
-    more |= {"title": title, "title_fontproperties": {"size": LARGE, "weight": "bold"}, "alignment": "left"}
-    columns = max(1, len(labels))
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns, fontsize=NORMAL, frameon=False, **more)
+    handles = legend_entries(*axes)
+    more |= {"handles": handles, "ncols": max(1, len(handles)), "title": title, "alignment": "left"}
+    more |= {"title_fontproperties": {"size": LARGE, "weight": "bold"}}
+    figure.legend(loc="outside upper left", fontsize=NORMAL, frameon=False, **more)
 
 
 def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, size: float = SMALL, **more: Any) -> None:
     """The entries of these axes below all panels, by default in one row."""
-    handles, labels = legend_entries(*axes)
-    columns = columns or max(1, len(labels))
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=size, frameon=False, **more)
+    more |= {"handles": (handles := legend_entries(*axes)), "ncols": columns or max(1, len(handles))}
+    figure.legend(loc="outside lower center", fontsize=size, frameon=False, **more)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:

@@ -219,7 +219,7 @@ class _JointSearches:
     def __call__(self, index: int, before: Sequence[Outcomes], progress: FitProgress | None) -> Outcomes:
         first = perturbed(self.moments, self.seed, index) if index else self.first
         outcomes: Outcomes = []
-        steps = self.options.iterations + self.options.adam_steps
+        steps = self.options.iterations
         for joint, objective in enumerate(self.objectives):
 
             def note(iteration: int, value: float, joint: int = joint) -> None:

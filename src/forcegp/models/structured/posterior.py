@@ -25,7 +25,7 @@ from forcegp.inference import (
 )
 from forcegp.inference.cholesky_update import rows_to_keep
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
-from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels
+from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
@@ -359,8 +359,7 @@ class StructuredPosterior(Posterior):
         system = self.system if system is None else system
         self._require_commanded_torques()
         example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
-        traced, prepared = self._physics(system).traced, PreparedKernels.of(self.latent)
-        return PredictorCode.of(traced, example, self.latent, prepared, compressed, self.widening)
+        return PredictorCode.of(self._physics(system).traced, example, self.latent, compressed, self.widening)
 
     def _require_commanded_torques(self) -> None:
         noise = self.model.noise

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, PreparedKernels, Sample, compress
+from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress, kernel_groups
 from forcegp.mechanics import Actuation, ConstrainedDynamics, MechanicalSystem, RigidBodyBias
 from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor
@@ -92,20 +92,17 @@ def prepared_predictor(
     nv, device = training.q.shape[-1], training.q.device
     if covariance == "auto":
         covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
-    prepared = PreparedKernels.of(latent)
     options = [covariance, tolerance, largest_rank, widening]
     key = record_key(lambda: [physics.description(), options], _numbers(latent, training, physics))
     compressed = None
-    if covariance == "compressed" and prepared.groups:
+    if covariance == "compressed" and len(latent.kernels.dense):
         if not isinstance(latent, ExactPosterior):
             raise InvalidInput(
                 "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        compressed = kept_covariance(
-            key, lambda: _compressed(latent, training, prepared, physics.terms, tolerance, largest_rank)
-        )
+        compressed = kept_covariance(key, lambda: _compressed(latent, training, physics.terms, tolerance, largest_rank))
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > tolerance:
             warnings.warn(
@@ -117,9 +114,9 @@ def prepared_predictor(
     code = None
     if compile:
         example = [x[:1] for x in (training.q, training.v, training.u)]
-        given = (physics.traced, example, latent, prepared, compressed, widening)
+        given = (physics.traced, example, latent, compressed, widening)
         code = KeptCode(nv, len(physics.system.contacts), partial(PredictorCode.of, *given), key)
-    made = Predictor(nv, device, latent, prepared, physics.terms, code, covariance, compressed, widening, 0.0)
+    made = Predictor(nv, device, latent, physics.terms, code, covariance, compressed, widening, 0.0)
     first = "mean" if compressed is None else "covariance"
     if made.compiled(first) and code is not None and not code.is_traced:
         some = [x[:: 1 + len(x) // 3] for x in (training.q, training.v, training.u)]
@@ -141,7 +138,6 @@ def _numbers(latent: LatentPosterior, training: TrainingData, physics: Predictor
 def _compressed(
     latent: ExactPosterior,
     training: TrainingData,
-    prepared: PreparedKernels,
     terms: TermsFunction,
     tolerance: float,
     largest_rank: int,
@@ -155,7 +151,7 @@ def _compressed(
         usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
         return Sample([z[usable] for z in features], W[usable])
 
-    latents = [group.latents for group in prepared.groups]
+    latents = [group.latents for group in kernel_groups(latent)]
     chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
     return compress(latent, latents, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
 

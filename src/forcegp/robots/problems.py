@@ -1,0 +1,107 @@
+"""All problems of one robot file in one report, with the arguments that mend them together."""
+
+import contextlib
+import shlex
+import warnings
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from forcegp.errors import InvalidNumber, RobotFileWarning, RobotModelError
+
+LISTED = 12
+"""Problems of one kind that a message lists; the error has all of them."""
+
+
+class Problems:
+    """What is wrong with a file, and what was repaired.
+
+    Parameters: ``source``, which every message begins with; ``given``, arguments of ``Robot.from_urdf`` that the
+    remedy keeps; ``strict``, whether what could be ignored is an error.
+    """
+
+    def __init__(self, source: str, given: Mapping[str, Any] | None = None, *, strict: bool = False) -> None:
+        self.source, self.given, self.strict = source, dict(given or {}), strict
+        self.errors: list[RobotModelError] = []
+        self.broken: set[str] = set()
+        """Links of which something is reported, so that nothing else need be."""
+        self.notes: dict[str, list[str]] = {}
+
+    @contextlib.contextmanager
+    def collected(self, link: str | None = None) -> Iterator[None]:
+        """Keep an error of the file, of a ``link`` for example, for the report, and go on."""
+        try:
+            yield
+        except RobotModelError as error:
+            self.errors.append(error)
+            if link is not None:
+                self.broken.add(link)
+
+    def ignore(self, what: str, where: str, seen: str) -> None:
+        """Note ``what`` is ignored of the element ``where``. With `strict` this is an error: what was ``seen``."""
+        if self.strict:
+            advice = f"; correct it, or leave strict out: {what}."
+            self.errors.append(InvalidNumber(f"{self.source}: {where} has {seen}", advice))
+        else:
+            self.note(what, where)
+
+    def note(self, what: str, where: str) -> None:
+        """Note what was ignored or repaired, and of which element."""
+        self.notes.setdefault(what, []).append(where)
+
+    def offer_no_lock_of(self, joints: Collection[str]) -> None:
+        """Take locks out of the remedies where they would hold all of these joints."""
+        held = {name for error in self.errors for name in error.remedy.get("locked", ())}
+        if held.issuperset(joints):
+            for error in self.errors:
+                error.remedy.pop("locked", None)
+
+    def warn(self, stacklevel: int) -> None:
+        """One RobotFileWarning about all that was noted."""
+        if self.notes:
+            text = "; ".join(f"{what} ({', '.join(where)})" for what, where in self.notes.items())
+            warnings.warn(f"{self.source}: {text}.", RobotFileWarning, stacklevel=stacklevel)
+
+    def raise_all(self) -> None:
+        """Raise what was collected as one error: of their class where they are alike, else a RobotModelError."""
+        if not self.errors:
+            return
+        kinds, many = {type(error) for error in self.errors}, len(self.errors) > 1
+        by_hand, remedy = not all(error.remedy for error in self.errors), self._remedy()
+        text = f"{self.source}: {f'{len(self.errors)} problems: ' if many else ''}{' '.join(self._texts())}"
+        if remedy:
+            which = "the others, when the file is corrected" if by_hand else "all" if many else "it"
+            text += f" The remedy for {which}: {remedy_text(remedy)}"
+        found = (kinds.pop() if len(kinds) == 1 else RobotModelError)(text, "", {} if by_hand else remedy)
+        found.problems = tuple(str(error) for error in self.errors)
+        raise found from None
+
+    def _remedy(self) -> dict[str, Any]:
+        """The arguments that mend what has a remedy, with those that were given."""
+        remedy: dict[str, Any] = {}
+        for arguments in (error.remedy for error in self.errors):
+            for name, value in arguments.items():
+                remedy[name] = {**remedy.get(name, {}), **value} if isinstance(value, Mapping) else value
+        for name, value in self.given.items() if remedy else ():
+            remedy[name] = {**value, **remedy.get(name, {})} if isinstance(value, Mapping) else remedy.get(name, value)
+        return remedy
+
+    def _texts(self) -> list[str]:
+        """What was seen, with what to do once for all that are alike."""
+        groups: dict[str, list[str]] = {}
+        for error in self.errors:
+            groups.setdefault(error.advice, []).append(error.seen.removeprefix(f"{self.source}: "))
+        more = "; and {} more like these".format
+        return [
+            "; ".join(seen[:LISTED]) + (more(len(seen) - LISTED) if len(seen) > LISTED else "") + advice
+            for advice, seen in groups.items()
+        ]
+
+
+def remedy_text(remedy: Mapping[str, Any]) -> str:
+    """The arguments in Python, and the options of the command line that they are."""
+    words = []
+    for name, value in remedy.items():
+        listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
+        words.append(f"--{'lock' if name == 'locked' else name} {shlex.quote(listed)}")
+    python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
+    return f"Robot.from_urdf(path, {python}), or {' '.join(words)}."

@@ -1,0 +1,99 @@
+"""`forcegp robot`, and the options that take a file as it is."""
+
+import json
+
+import pytest
+from PIL import Image
+from tests.robots.robot_models import CHAIN
+from tests.robots.test_base import LOOSE
+from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
+from tests.robots.test_remedies import MANY
+
+from forcegp import Robot
+from forcegp.cli.main import parse_arguments
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(with_mimics(CHAIN, CHAIN_MIMICS))
+    return path
+
+
+def test_the_tree_and_the_numbers_are_printed(forcegp, file):
+    shown = forcegp("robot", file, "--armature", "spin=0.25")
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "cart 4 kg  slide (prismatic = 0.4 tilt +0.1)" in shown.stdout
+    assert "chain: 3 joints, 7.9 kg that move" in shown.stdout
+    row = next(line for line in shown.stdout.splitlines() if line.strip().startswith("spin"))
+    assert row.split() == ["spin", "–", "–", "–", "–", "0", "0", "0.25"]
+
+
+def test_json_holds_the_same(forcegp, file):
+    content = json.loads(forcegp("robot", file, "--lock", "skew=0.5", "--json").stdout)
+    assert content["mimics"] == {"slide": {"joint": "tilt", "multiplier": 0.4, "offset": 0.1}}
+    assert [joint["name"] for joint in content["joints"]] == ["spin", "tilt"]
+    assert content["locked"] == {"skew": 0.5}
+    assert (content["base"], content["repaired"]) == ("fixed", [])
+
+
+def test_one_error_and_its_options_take_the_file(forcegp, file):
+    file.write_text(MANY)
+    refused = forcegp("robot", file)
+    assert refused.returncode == 2
+    assert len(refused.stderr.splitlines()) == 1
+    options = refused.stderr.strip().rpartition(", or ")[2].removesuffix(".").split()
+    assert options == ["--inertias", "nearest", "--lock", "slip=0", "--base", "fixed"]
+    taken = forcegp("robot", file, *options, "--json")
+    assert taken.returncode == 0
+    assert "FL_foot" in taken.stderr
+    assert "is replaced by the nearest one" in taken.stderr
+    (repaired,) = json.loads(taken.stdout)["repaired"]
+    assert repaired in taken.stderr.replace("\n", " ")
+
+
+def test_strict_refuses_what_is_ignored_otherwise(forcegp, file):
+    file.write_text(CHAIN.replace('velocity="4"', 'velocity="-4"'))
+    assert "warning: " in forcegp("robot", file).stderr
+    refused = forcegp("robot", file, "--strict")
+    assert refused.returncode == 2
+    assert "joint 'skew' has <limit> velocity=-4" in refused.stderr
+
+
+def test_the_picture_is_a_png_that_is_not_overwritten(forcegp, file):
+    pytest.importorskip("trimesh")
+    out = file.with_suffix(".png")
+    assert forcegp("robot", file, "--out", out).returncode == 0
+    with Image.open(out) as image:
+        assert image.format == "PNG"
+        assert len(image.convert("RGB").getcolors(2**16)) > 20  # something is drawn
+    assert "add --overwrite" in forcegp("robot", file, "--out", out).stderr
+    assert forcegp("robot", file, "--out", out, "--overwrite").returncode == 0
+    assert "over" in forcegp("robot", file, "--out", file, "--overwrite").stderr  # never the robot itself
+
+
+def test_every_command_with_a_robot_takes_its_base(tmp_path):
+    path = tmp_path / "dog.urdf"
+    path.write_text(LOOSE["legs"])
+    command = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path), "--base", "fixed"])
+    robot = command.chosen_robot()
+    assert robot.base == "fixed"
+    again = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path)]).chosen_robot(robot)
+    assert again.base == "fixed"  # as recorded
+    assert isinstance(again, Robot)
+
+
+@pytest.mark.filterwarnings("ignore::forcegp.errors.RobotFileWarning")
+def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
+    recorded = Robot.from_urdf_text(CHAIN)
+    recorded.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
+    words = ["fit", "log.h5", "--out", "run", "--robot", str(tmp_path / "identified.urdf")]
+    assert parse_arguments(words).chosen_robot(recorded).armature.tolist() == [0.0, 0.3, 0.0, 0.0]
+    assert parse_arguments([*words, "--armature", "tilt=1"]).chosen_robot(recorded).armature.tolist() == [0, 0, 0, 1]
+
+
+def test_an_undefined_root_is_named(tmp_path, forcegp):
+    path = tmp_path / "arm.urdf"
+    path.write_text(CHAIN.replace('<link name="rail"/>', ""))
+    assert "--root rail" in forcegp("robot", path).stderr
+    assert forcegp("robot", path, "--root", "rail").returncode == 0

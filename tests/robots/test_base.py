@@ -1,0 +1,83 @@
+"""Who is asked whether the robot is bolted to the world, and who is not."""
+
+import pytest
+import torch
+from tests.robots.robot_models import CHAIN, MODELS, TREE
+
+from forcegp.errors import InvalidInput, UnstatedBase
+from forcegp.mechanics import MechanicalSystem
+from forcegp.robots import Robot
+
+BODY = '<inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+
+
+def limbs(*names: str, root: str = "trunk", mass: float = 5.0, robot: str = "r", joint: str = "joint_{}") -> str:
+    """A body with a limb for every name."""
+    parts = [f'<robot name="{robot}"><link name="{root}">{BODY.format(mass)}</link>']
+    for name in names:
+        ends = f'<parent link="{root}"/><child link="{name}"/>'
+        parts.append(f'<joint name="{joint.format(name)}" type="continuous">{ends}<origin xyz="0.1 0 0"/></joint>')
+        parts.append(f'<link name="{name}">{BODY.format(1.0)}</link>')
+    return "".join([*parts, "</robot>"])
+
+
+LOOSE = {
+    "legs": limbs("FL_foot", "FR_foot"),
+    "upper and lower leg": limbs("leftUpperLeg", "left_lowerLEG"),
+    "wheels": limbs("wheel_1", "rear_wheels"),
+    "propellers": limbs("a", "b", "c", joint="rotor_{}"),
+    "a humanoid without legs": limbs("arm", root="Pelvis"),
+    "a flying arm": limbs("arm", robot="flying_arm"),
+}
+BOLTED = {
+    **{name: text() for name, text in MODELS.items()},
+    "a hand": limbs("index", "middle", "ring", "thumb", root="palm"),
+    "a gripper": limbs("left_finger", "right_finger"),
+    "a base footprint": limbs("arm", root="base_footprint"),
+    "one wheel": limbs("reaction_wheel", "arm"),
+    "rotors of two motors": limbs("arm", "rotor_1", "rotor_2"),
+    "a console": limbs("console", "chip", "pushing_hippo"),
+    "a massless base": limbs("l_foot", "r_foot", mass=0.0).replace(BODY.format(0.0), ""),
+}
+
+
+@pytest.mark.parametrize("name", LOOSE)
+def test_robots_that_walk_drive_or_fly_are_asked(name):
+    with pytest.raises(UnstatedBase, match=r"not bolted to the world.*base='fixed' takes it as bolted") as caught:
+        Robot.from_urdf_text(LOOSE[name])
+    assert caught.value.remedy == {"base": "fixed"}
+    assert "--base fixed" in str(caught.value)
+    robot = Robot.from_urdf_text(LOOSE[name], **caught.value.remedy)
+    assert robot.base == "fixed"
+    robot = robot.with_armature([0.1] * robot.nv)  # and nobody asks again
+    assert MechanicalSystem.from_json(MechanicalSystem(robot).to_json()).robot.base == "fixed"
+
+
+@pytest.mark.parametrize("name", BOLTED)
+def test_arms_hands_and_grippers_never_are(name):
+    assert Robot.from_urdf_text(BOLTED[name]).base == "fixed"
+
+
+def test_a_file_that_says_so_itself_is_not_asked():
+    world = '<link name="world"/><joint name="weld" type="fixed"><parent link="world"/><child link="trunk"/></joint>'
+    text = LOOSE["legs"].replace("</robot>", f"{world}</robot>")
+    assert Robot.from_urdf_text(text).nv == 2
+    with pytest.raises(UnstatedBase, match="joint 'weld' is of type 'floating'"):
+        Robot.from_urdf_text(text.replace('"fixed"', '"floating"'))
+    welded = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'), base="fixed")
+    q = torch.zeros(2).double()
+    assert torch.equal(welded.mass_matrix(q), Robot.from_urdf_text(text).mass_matrix(q))
+
+
+def test_free_joints_elsewhere_can_be_locked_at_zero():
+    text = CHAIN.replace('name="tilt" type="revolute"', 'name="tilt" type="planar"')
+    robot = Robot.from_urdf_text(text, locked={"tilt": 0.0})
+    assert robot.joint_names == ("slide", "spin", "skew")
+    with pytest.raises(InvalidInput, match="joint 'tilt' is planar, so it can be locked at 0 alone"):
+        Robot.from_urdf_text(text, locked={"tilt": 0.1})
+
+
+@pytest.mark.parametrize("base", ["floating", "planar", "Fixed", 1])
+def test_other_bases_are_refused(base):
+    with pytest.raises(InvalidInput, match=r"give 'fixed'\. Floating and planar bases are not supported yet"):
+        Robot.from_urdf_text(TREE, base=base)

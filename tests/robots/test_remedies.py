@@ -1,0 +1,106 @@
+"""One report names all problems of a file, and its remedy takes the file."""
+
+import pytest
+import torch
+from tests.robots.test_base import LOOSE
+from tests.robots.test_urdf_errors import SMALL, changed
+
+from forcegp.errors import InvalidNumber, NonPhysicalInertia, RobotFileWarning, RobotModelError
+from forcegp.robots import Robot
+from forcegp.robots.problems import LISTED, Problems
+
+FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'
+FRAME = '<link name="frame"/><joint name="slip" type="prismatic"><parent link="FL_foot"/><child link="frame"/></joint>'
+MANY = LOOSE["legs"].replace('<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>', FLAT)
+MANY = MANY.replace("</robot>", f"{FRAME}</robot>")
+
+
+def test_all_problems_are_in_one_report_with_one_remedy():
+    with pytest.raises(RobotModelError) as caught:
+        Robot.from_urdf_text(MANY, source="dog.urdf")
+    message, error = str(caught.value), caught.value
+    assert message.startswith("dog.urdf: 4 problems: ")
+    assert all(part in message for part in ("'FL_foot'", "'FR_foot'", "'slip'", "not bolted"))
+    assert message.count("Correct its <inertial>") == 1  # what to do is said once
+    assert message.count("dog.urdf") == 1
+    assert len(error.problems) == 4
+    assert error.remedy == {"inertias": "nearest", "locked": {"slip": 0.0}, "base": "fixed"}
+    assert "Robot.from_urdf(path, inertias='nearest', locked={'slip': 0.0}, base='fixed')" in message
+    assert message.endswith("or --inertias nearest --lock slip=0 --base fixed.")
+    with pytest.warns(RobotFileWarning, match=r"FL_foot.*FR_foot") as warned:
+        robot = Robot.from_urdf_text(MANY, **error.remedy)
+    assert len(warned) == 1
+    assert robot.joint_names == ("joint_FL_foot", "joint_FR_foot")
+
+
+def test_the_remedy_keeps_what_was_given():
+    with pytest.raises(RobotModelError) as caught:
+        Robot.from_urdf_text(MANY, locked={"joint_FR_foot": 0.5}, inertias="nearest")
+    assert caught.value.remedy == {
+        "locked": {"joint_FR_foot": 0.5, "slip": 0.0},
+        "base": "fixed",
+        "inertias": "nearest",
+    }
+
+
+def test_what_must_be_corrected_in_the_file_leaves_no_remedy():
+    with pytest.raises(RobotModelError, match=r"4 problems: .*two.*The remedy for the others, when the file") as caught:
+        Robot.from_urdf_text(MANY.replace('mass value="1.0"', 'mass value="two"', 1))
+    assert caught.value.remedy == {}
+    assert "inertias='nearest'" in str(caught.value)
+
+
+def test_a_link_that_cannot_be_read_is_not_reported_again():
+    with pytest.raises(InvalidNumber, match="'two', not a number") as caught:
+        Robot.from_urdf_text(changed('value="2"', 'value="two"'))
+    assert len(caught.value.problems) == 1
+
+
+def test_many_alike_are_counted():
+    problems = Problems("file")
+    problems.errors = [NonPhysicalInertia(f"file: link {k}", "; correct it.", {}) for k in range(LISTED + 5)]
+    with pytest.raises(NonPhysicalInertia, match=rf"link {LISTED - 1}; and 5 more like these; correct it\.$") as caught:
+        problems.raise_all()
+    assert len(caught.value.problems) == LISTED + 5
+
+
+IGNORED = {
+    "a negative <limit> velocity is taken as no limit": changed('velocity="3"', 'velocity="-1"'),
+    "a negative <limit> effort is taken as no limit": changed('effort="5"', 'effort="-5"'),
+    "a lower limit above the upper one is taken as no limit": changed('upper="1"', 'upper="-2"'),
+    "the first of several <axis> counts": changed("<limit", '<axis xyz="1 0 0"/><limit'),
+    "a <robot> without a name is called 'robot'": changed(' name="small"', ""),
+}
+
+
+@pytest.mark.parametrize("what", IGNORED)
+def test_what_can_be_ignored_is_a_warning_or_with_strict_an_error(what):
+    with pytest.warns(RobotFileWarning, match=f"here: {what}"):
+        robot = Robot.from_urdf_text(IGNORED[what], source="here")
+    q = torch.ones(1).double()
+    assert torch.equal(robot.mass_matrix(q), Robot.from_urdf_text(SMALL).mass_matrix(q))
+    joint = robot.joint("hinge")
+    assert (joint.velocity_limit, joint.effort_limit, joint.lower).count(float("inf")) == ("negative" in what)
+    assert joint.lower == (-float("inf") if "lower" in what else -1.0)
+    robot.with_armature([0.1])  # nothing is said twice
+    with pytest.raises(InvalidNumber, match="leave strict out"):
+        Robot.from_urdf_text(IGNORED[what], strict=True)
+
+
+def test_an_undefined_parent_is_offered_as_the_root():
+    text = changed('<link name="base"/>', "")
+    with pytest.raises(RobotModelError, match="the link 'base' is a parent, and the file does not define it") as caught:
+        Robot.from_urdf_text(text)
+    assert caught.value.remedy == {"root": "base"}
+    robot = Robot.from_urdf_text(text, **caught.value.remedy)
+    q = torch.ones(1).double()
+    assert torch.equal(robot.mass_matrix(q), Robot.from_urdf_text(SMALL).mass_matrix(q))
+    assert Robot.from_urdf_text(robot.to_urdf()).link_names == robot.link_names  # the text says so now
+    with pytest.raises(RobotModelError, match="two links are called 'base'"):
+        Robot.from_urdf_text(SMALL, root="base")
+
+
+def test_a_misspelt_parent_is_no_root():
+    with pytest.raises(RobotModelError, match="did you mean 'base'") as caught:
+        Robot.from_urdf_text(changed('parent link="base"', 'parent link="bsae"'))
+    assert caught.value.remedy == {}
