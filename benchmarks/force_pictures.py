@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from threadpoolctl import threadpool_limits
 
 from benchmarks.force_recordings import (
@@ -55,7 +56,6 @@ from forcegp.evaluation.plots.style import (
     TRUTH,
     new_figure,
     quiet,
-    speed_colors,
     window,
 )
 from forcegp.priors.contact_friction import ExpectedFriction
@@ -238,7 +238,7 @@ def payload() -> Any:
     for number, (mean, std) in enumerate(found[:4]):
         at = np.arange(3) + 0.14 * (number - 1.5)
         label = f"{counts[number]} points"
-        color = speed_colors()(number / 3)
+        color = colormaps["viridis"](0.88 * number / 3)  # its yellow end vanishes on white
         right.errorbar(at, 100.0 * mean[1:], 100.0 * BAND * std[1:], fmt="o", color=color, label=label, **style)
     right.set_xticks(range(3), ["x", "y", "z"])
     quiet(right, title="its centre of mass in the axes of link 7", x="axis", y="position [cm]")

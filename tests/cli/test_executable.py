@@ -32,6 +32,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "demo": (("--seconds", 0.5, "--points", 8, "--iterations", 2, "--out", "story"), "story/prediction.png"),
     "simulate": (("kuka-surface", "--seconds", 0.1, "--out", "simulated.h5"), "simulated.h5"),
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
+    "robot": (("arm.urdf", "--out", "arm.png"), "arm.png"),
     "check": (("log.h5", "--plots", "look"), "look/check.png"),
     "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),

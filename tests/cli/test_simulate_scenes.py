@@ -26,6 +26,18 @@ def test_free_arms_need_no_other_library(forcegp, tmp_path, arm):
     assert "lugre" in refused.stderr
 
 
+def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
+    made = forcegp("simulate", "quadruped", "--seconds", 1, "--seed", 3, "--out", "log.h5", "--json", folder=tmp_path)
+    assert made.returncode == 0, made.stderr
+    data = Dataset.load(tmp_path / "log.h5")
+    assert (len(data), data.q.shape[1], data.nv, data.u.shape[1]) == (240, 19, 18, 16)
+    words = ("identify", "log.h5", "--learn", "trunk:mass", "--prior", "joint-friction", "--points", 25, "--out", "run")
+    done = forcegp(*words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    scored = forcegp("evaluate", "run", "log.h5", "--json", folder=tmp_path)
+    assert scored.returncode == 0, scored.stderr
+
+
 @SURFACES
 @pytest.mark.parametrize(
     ("options", "expected"),

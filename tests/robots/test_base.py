@@ -43,14 +43,16 @@ BOLTED = {
 
 @pytest.mark.parametrize("name", LOOSE)
 def test_robots_that_walk_drive_or_fly_are_asked(name):
-    with pytest.raises(UnstatedBase, match=r"not bolted to the world.*base='fixed' takes it as bolted") as caught:
+    with pytest.raises(UnstatedBase, match=r"not bolted.*base='floating' lets.*base='fixed' takes") as caught:
         Robot.from_urdf_text(LOOSE[name])
-    assert caught.value.remedy == {"base": "fixed"}
-    assert "--base fixed" in str(caught.value)
+    assert caught.value.remedy == {"base": "floating"}
+    assert "--base floating" in str(caught.value)
     robot = Robot.from_urdf_text(LOOSE[name], **caught.value.remedy)
-    assert robot.base == "fixed"
-    robot = robot.with_armature([0.1] * robot.nv)  # and nobody asks again
-    assert MechanicalSystem.from_json(MechanicalSystem(robot).to_json()).robot.base == "fixed"
+    assert (robot.base, robot.nq - robot.nv) == ("floating", 1)
+    bolted = Robot.from_urdf_text(LOOSE[name], base="fixed")
+    for each in (robot, bolted):
+        again = each.with_armature([0.1] * each.nv)  # and nobody asks again
+        assert MechanicalSystem.from_json(MechanicalSystem(again).to_json()).robot.base == each.base
 
 
 @pytest.mark.parametrize("name", BOLTED)
@@ -62,8 +64,9 @@ def test_a_file_that_says_so_itself_is_not_asked():
     world = '<link name="world"/><joint name="weld" type="fixed"><parent link="world"/><child link="trunk"/></joint>'
     text = LOOSE["legs"].replace("</robot>", f"{world}</robot>")
     assert Robot.from_urdf_text(text).nv == 2
-    with pytest.raises(UnstatedBase, match="joint 'weld' is of type 'floating'"):
-        Robot.from_urdf_text(text.replace('"fixed"', '"floating"'))
+    free = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'))
+    assert (free.base, free.nq, free.nv) == ("floating", 9, 8)
+    assert Robot.from_stored(free.to_stored()).tree.equals(free.tree)
     welded = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'), base="fixed")
     q = torch.zeros(2).double()
     assert torch.equal(welded.mass_matrix(q), Robot.from_urdf_text(text).mass_matrix(q))
@@ -77,7 +80,7 @@ def test_free_joints_elsewhere_can_be_locked_at_zero():
         Robot.from_urdf_text(text, locked={"tilt": 0.1})
 
 
-@pytest.mark.parametrize("base", ["floating", "planar", "Fixed", 1])
+@pytest.mark.parametrize("base", ["Fixed", "free", 1])
 def test_other_bases_are_refused(base):
-    with pytest.raises(InvalidInput, match=r"give 'fixed'\. Floating and planar bases are not supported yet"):
+    with pytest.raises(InvalidInput, match="give one of fixed, floating, planar, spherical"):
         Robot.from_urdf_text(TREE, base=base)

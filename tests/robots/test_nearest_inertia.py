@@ -103,4 +103,4 @@ def test_another_choice_is_refused():
     problems = Problems("here")
     description = parse_urdf(BROKEN, problems)
     with pytest.raises(InvalidInput, match="strict, nearest"):
-        with_chosen_inertias("closest", BROKEN, description, lay_out(description, {}, problems), problems)
+        with_chosen_inertias("closest", BROKEN, description, lay_out(description, {}, None, problems), problems)

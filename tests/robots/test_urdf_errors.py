@@ -86,8 +86,8 @@ WRONG = {
     ),
     "floating inside": (
         with_joint("swing", "arm", "tool", '<link name="tool"/>').replace('"fixed"', '"floating"'),
-        errors.UnsupportedJoint,
-        ["joint 'swing'", "'floating'", "--lock swing=0"],
+        errors.MissingInertia,
+        ["joint 'swing'", "has no mass", "--lock swing=0"],
     ),
     "mimic of none": (
         changed("<axis", '<mimic joint="other" multiplier="2"/><axis'),

@@ -23,6 +23,8 @@ ROBOT_OPTIONS = ("robot", "inertias", "base", "root", "lock", "armature", "gravi
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp identify` wrote holds robot and known forces."""
 
+BASES = unless_given("fixed|floating|planar|spherical", "fixed; asked where a file looks otherwise")
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobotFileOptions(Command):
@@ -31,8 +33,9 @@ class RobotFileOptions(Command):
     inertias: Literal["strict", "nearest"] = "strict"
     """What to do about a physically impossible inertia. strict: refuse the URDF. nearest: use the nearest possible
     one, and warn how far it is."""
-    base: Annotated[Literal["fixed"] | None, unless_given("fixed", "asked where a file looks otherwise")] = None
-    """How the base is held. fixed: bolted to the world, also where the robot has legs, wheels or rotors."""
+    base: Annotated[Literal["fixed", "floating", "planar", "spherical"] | None, BASES] = None
+    """How the base is held. fixed: bolted to the world, also where the robot has legs, wheels or rotors.
+    floating: free. planar: free in the plane z = 0. spherical: free to turn."""
     root: Annotated[str | None, unless_given("LINK", "that of the file", str)] = None
     """A link that the URDF does not define, such as world, which the base hangs on."""
     lock: Annotated[tuple[str, ...], listed("JOINT=RAD,...", "as recorded")] = ()

@@ -25,13 +25,14 @@ NONE = (math.inf, -math.inf)
 
 @dataclass(frozen=True, kw_only=True)
 class Robot(RobotFileOptions):
-    """Print what a robot file says: its tree, joints, limits and masses, and what was ignored or repaired.
+    """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
     Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, or a xacro
     file where the package xacro is installed; meshes are not needed.
 
     For example:
       forcegp robot arm.urdf
+      forcegp robot dog.urdf --base floating
       forcegp robot arm.urdf --inertias nearest --lock finger=0 --out arm.png
       forcegp robot arm.urdf --browser
     """

@@ -20,7 +20,7 @@ from forcegp.cli.command import Command, require_free_file, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
-Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum"]
+Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped"]
 ToolFriction = Literal["viscous", "coulomb", "stribeck"]
 JointFriction = Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"]
 TOOL_FRICTION = arg(help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
@@ -33,17 +33,19 @@ class Simulate(Command):
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
     Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
-    friction in every joint, without PyBullet. Equal seeds give equal motions; train and test need different ones.
+    friction in every joint, without PyBullet. quadruped: a robot on a floating base that shifts its weight and lifts
+    its feet, with an unknown load of 2 kg. Equal seeds give equal motions; train and test need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
       forcegp simulate kuka-surface --tool-friction stribeck --patch 4 --joint-friction stribeck --out rough.h5
       forcegp simulate ur5-free --seconds 60 --seed 1 --out arm.h5
       forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
+      forcegp simulate quadruped --seconds 30 --seed 1 --out quadruped.h5
     """
 
     scenario: Annotated[Positional[Scenario], arg(metavar="SCENARIO")]
-    """What to simulate: kuka-surface, ur5-free or double-pendulum."""
+    """What to simulate: kuka-surface, ur5-free, double-pendulum or quadruped."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     seconds: Annotated[float, arg(metavar="S")] = 200.0
@@ -101,7 +103,7 @@ class Simulate(Command):
         if self.scenario != "kuka-surface":
             for word in self.words("tool_friction", "friction_coefficient", "patch", "surface", "contact_model"):
                 raise InvalidInput(f"{word} means nothing to {self.scenario}, whose arm touches nothing; leave it out.")
-            return {"arm": self.scenario, **fields}
+            return fields if self.scenario == "quadruped" else {"arm": self.scenario, **fields}
         fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}
         fields["patch_factor"] = self.patch
         if self.friction_coefficient is not None:

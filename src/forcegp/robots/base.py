@@ -42,6 +42,8 @@ def check_base(description: RobotDescription, standing: Sequence[str], problems:
 
     ``standing`` are the links that do not move, the root first.
     """
+    if not standing:
+        return  # nothing stands still
     root, still = standing[0], set(standing)
     mass = sum(inertial.mass for name in standing if (inertial := description.links[name]))
     asked = "base" in problems.given or any(isinstance(error, UnstatedBase) for error in problems.errors)

@@ -18,7 +18,7 @@ from forcegp.robots.inertia import (
     skew,
     turns_with_inertia,
 )
-from forcegp.robots.layout import WORLD, Layout
+from forcegp.robots.layout import BASE, WORLD, Layout
 from forcegp.robots.manifold import Group
 from forcegp.robots.urdf import RobotDescription
 
@@ -46,16 +46,19 @@ def bodies_without_inertia(
         if own or not broken.isdisjoint((joint.child, *carried[body])):
             continue
         others = f" and the links fixed to it ({', '.join(map(repr, carried[body]))})" if carried[body] else ""
-        link, remedy = f"{description.source}: link {joint.child!r}{others}", {"locked": {joint.name: 0.0}}
+        name = whole[body].name if body in whole else joint.name
+        link, remedy = f"{description.source}: link {joint.child!r}{others}", {"locked": {name: 0.0}}
+        if name == BASE and body in whole:
+            remedy = {"base": "fixed"}
         if pseudo[body, 3, 3] == 0.0:
-            seen = f"{link} moves with joint {joint.name!r} but has no mass, and nor has what it carries"
+            seen = f"{link} moves with joint {name!r} but has no mass, and nor has what it carries"
             advice = "; add an <inertial> element, make the joint fixed, or lock it."
             found.append((drive.joint, MissingInertia(seen, advice, remedy)))
         elif body in whole and not turns_with_inertia(whole[body].kind, pseudo[body]):
-            seen = f"{link} turns with joint {whole[body].name!r} but has no rotational inertia about some axis"
-            found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", {})))
+            seen = f"{link} turns with joint {name!r} but has no rotational inertia about some axis"
+            found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))
         elif body not in whole and joint.type != "prismatic" and axis_inertia_vanishes(pseudo[body]):
-            seen = f"{link} turns with joint {joint.name!r} but has no rotational inertia about its axis"
+            seen = f"{link} turns with joint {name!r} but has no rotational inertia about its axis"
             advice = (
                 ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "
                 "inertia of its rotor (`armature`, in kg m^2), or lock it."

@@ -1,10 +1,11 @@
-from .quadruped import QuadrupedConfig as QuadrupedConfig, simulate_quadruped as simulate_quadruped
+from .quadruped import simulate_quadruped as simulate_quadruped
 from .free_arms import simulate_free_arm as simulate_free_arm
 from .kuka_motion import kuka_file as kuka_file
 from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface
 from .kuka_surface_config import (
     FreeArmConfig as FreeArmConfig,
     KukaSurfaceConfig as KukaSurfaceConfig,
+    QuadrupedConfig as QuadrupedConfig,
     SCENARIOS as SCENARIOS,
     Scenario as Scenario,
 )

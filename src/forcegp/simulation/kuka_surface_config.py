@@ -332,6 +332,32 @@ class FreeArmConfig:
         require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class QuadrupedConfig:
+    """A robot that stands, shifts its weight and lifts its feet; `payload` in kg on its trunk is in no robot file.
+
+    With `lift` each foot in turn leaves the ground for a second. Friction as in `FreeArmConfig`, equal in all joints.
+    `noise` in rad/s^2 and m/s^2. Raises InvalidInput naming the field and its range.
+    """
+
+    seconds: float = 30.0
+    seed: int = 0
+    noise: float = 0.1
+    episodes: int = 1
+    payload: float = 2.0
+    lift: bool = True
+    joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
+
+    @usable_arguments("QuadrupedConfig")
+    def __post_init__(self) -> None:
+        checked_numbers("seconds", self.seconds, POSITIVE, None)
+        checked_numbers("noise", self.noise, NOT_NEGATIVE, None)
+        checked_numbers("payload", self.payload, NOT_NEGATIVE, None)
+        require_integer("seed", self.seed, 0, 2**31)
+        require_integer("episodes", self.episodes, 1, 10_000)
+        require_known("joint_friction", self.joint_friction, "a quadruped", ("none", "coulomb", "stribeck"))
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A simulation that makes a Dataset. Its libraries are imported at `simulate`, so that listing scenarios is quick.
@@ -361,6 +387,11 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             function="forcegp.simulation.kuka_surface:simulate_kuka_surface",
         ),
         "ur5-free": Scenario("a UR5 that touches nothing, with friction in every joint", FreeArmConfig, FREE_ARM),
+        "quadruped": Scenario(
+            "a quadruped that stands and shifts its weight, with a load and friction in every joint",
+            QuadrupedConfig,
+            "forcegp.simulation.quadruped:simulate_quadruped",
+        ),
         "double-pendulum": Scenario("two driven rods with friction in both hinges", FreeArmConfig, FREE_ARM),
     }
 )

@@ -9,7 +9,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,11 +16,11 @@ from torch import Tensor
 
 from forcegp import __version__
 from forcegp.data import Dataset, units_for
-from forcegp.errors import InvalidInput, NumericalError, require_known, usable_arguments
+from forcegp.errors import NumericalError
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, fixed_point
 from forcegp.robots import Robot, parameters_from_physical
 from forcegp.robots.inertia import pseudo_inertia
-from forcegp.simulation.kuka_surface_config import require_integer
+from forcegp.simulation.kuka_surface_config import QuadrupedConfig
 
 RATE = 240
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -34,33 +33,6 @@ COULOMB, STATIC, VISCOUS = 0.8, 1.3, 0.15  # Nm, Nm, Nms/rad in every joint
 STRIBECK, SMOOTH = 0.15, 0.02  # rad/s
 PLACE = (0.08, -0.04, 0.12)  # of the load in the trunk, m
 NEWTON = 20
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class QuadrupedConfig:
-    """Numbers of the scenario; `payload` in kg is fixed to the trunk and not in the robot that the dataset holds.
-
-    `noise` in rad/s^2 and m/s^2. With `lift` each foot in turn leaves the ground for a second. Friction is
-    (c + (s - c) exp(-(v / v_s)^2)) tanh(v / w) + d v, with s = c for "coulomb". Raises InvalidInput.
-    """
-
-    seconds: float = 30.0
-    seed: int = 0
-    noise: float = 0.1
-    episodes: int = 1
-    payload: float = 2.0
-    lift: bool = True
-    joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
-
-    @usable_arguments("QuadrupedConfig")
-    def __post_init__(self) -> None:
-        for name, least in (("seconds", 0.1), ("noise", 0.0), ("payload", 0.0)):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value >= least):
-                raise InvalidInput(f"QuadrupedConfig {name} is {value!r}; give a finite number >= {least:g}.")
-        require_integer("seed", self.seed, 0, 2**31)
-        require_integer("episodes", self.episodes, 1, 10_000)
-        require_known("joint_friction", self.joint_friction, "a quadruped", ("none", "coulomb", "stribeck"))
 
 
 def simulate_quadruped(config: QuadrupedConfig, progress: Callable[[int, int], None] | None = None) -> Dataset:

@@ -1,0 +1,68 @@
+"""Logs of bases that move: what a state estimator may have meant by its columns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from forcegp.checks import quick_check
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=5, noise=0.05))
+
+
+def test_a_clean_log_has_no_finding(log):
+    assert not quick_check(log)
+
+
+def test_a_quaternion_that_begins_with_w_is_named(log):
+    q = log.q.copy()
+    q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
+    (finding,) = quick_check(replace(log, q=q))
+    assert (finding.severity, finding.subject) == ("wrong", "base")
+    assert "w, x, y, z" in finding.seen
+    assert "Reorder" in finding.remedy
+
+
+def test_velocities_in_the_axes_of_the_world_are_named(log):
+    turn = 1.2  # far from upright, where body and world differ
+    spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn, *[0.0] * 12], dtype=torch.float64)
+    q, v = log.system.robot.integrate(torch.tensor(log.q), spin).numpy(), log.v.copy()
+    position = torch.tensor(log.q[:, :3])
+    rotation = log.system.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
+    q[:, :3] = position
+    c, s = np.cos(turn), np.sin(turn)
+    yaw = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # the base turned about its own z axis
+    v[:, :3], v[:, 3:6] = v[:, :3] @ yaw.T, v[:, 3:6] @ yaw.T
+    assert not [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
+    turned = rotation @ yaw.T
+    v[:, :3] = (turned @ v[:, :3, None])[..., 0]
+    v[:, 3:6] = (turned @ v[:, 3:6, None])[..., 0]
+    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
+    assert "axes of the world" in findings[0].seen
+
+
+def test_an_accelerometer_is_no_acceleration(log):
+    a = log.a.copy()
+    a[:, 2] += 9.81
+    (finding,) = quick_check(replace(log, a=a))
+    assert finding.subject == "base acceleration"
+
+
+def test_quaternions_of_another_length_are_refused(log):
+    q = log.q.copy()
+    q[:, 3:7] *= 0.7
+    with pytest.raises(DatasetError, match=r"base\.qx.*length 0\.7"):
+        replace(log, q=q)
+
+
+def test_what_needs_a_fixed_base_says_so(log):
+    from forcegp import check
+
+    with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
+        check(log)

@@ -1,0 +1,95 @@
+"""Points that are held, contacts that act row by row, and actuators that are a map, against dense linear algebra."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from tests.robots.test_moving_bases import LIMBS
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, fixed_frame, fixed_point
+from forcegp.robots import Robot
+
+POINT = (0.05, -0.02, 0.1)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot.from_urdf_text(LIMBS, base="floating")
+
+
+@pytest.fixture(scope="module")
+def walker(robot):
+    feet = (*fixed_point("a_foot", POINT, "a_stands"), *fixed_point("b_foot", (0.0, 0.0, 0.1), "b_stands"))
+    return MechanicalSystem(robot, feet)
+
+
+def states(robot, inputs, rows=6):
+    generator = torch.Generator().manual_seed(1)
+    v = torch.randn(rows, robot.nv, dtype=torch.float64, generator=generator)
+    u = torch.randn(rows, inputs, dtype=torch.float64, generator=generator)
+    return robot.random(generator, rows), v, u
+
+
+def test_inputs_are_actuators_then_switches(walker):
+    assert walker.inputs == ("a_hip", "a_knee", "b_slide", "a_stands", "b_stands")
+    assert walker.sizes == (10, 9, 5)
+
+
+def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walker, robot):
+    """The saddle-point system of each row with only the contacts that act there, by a dense solve."""
+    q, v, u = states(robot, 5)
+    u[:, 3:] = torch.tensor([[1, 1], [1, 0], [0, 1], [0, 0], [1, 1], [0, 1]])
+    found = walker.dynamics(q, v, u)
+    a, forces = found.acceleration(torch.zeros_like(v)), found.multiplier(torch.zeros_like(v))
+    model = pin.buildModelFromXML(LIMBS, pin.JointModelFreeFlyer())
+    assert model.nv == robot.nv
+    for k in range(len(q)):
+        M, bias = robot.mass_matrix_and_bias(q[k], v[k])
+        tau = torch.cat([torch.zeros(6), u[k, :3]]).double()
+        rows = []
+        for stands, frame, point in ((u[k, 3], "a_foot", POINT), (u[k, 4], "b_foot", (0.0, 0.0, 0.1))):
+            if stands:
+                J = robot.frame_jacobian(q[k], frame, point)[:3]
+                rows.append((J, robot.frame_bias_acceleration(q[k], v[k], frame, point)[:3]))
+        A = torch.cat([J for J, _ in rows]) if rows else torch.zeros(0, robot.nv).double()
+        drift = torch.cat([each for _, each in rows]) if rows else torch.zeros(0).double()
+        zero = torch.zeros(len(A), len(A)).double()
+        whole = torch.cat([torch.cat([M, -A.mT], 1), torch.cat([A, zero], 1)])
+        solution = torch.linalg.solve(whole, torch.cat([tau - bias, -drift]))
+        torch.testing.assert_close(a[k], solution[: robot.nv], rtol=1e-7, atol=1e-7)
+        acting = torch.repeat_interleave(u[k, 3:] > 0, 3)
+        torch.testing.assert_close(forces[k][acting], solution[robot.nv :], rtol=1e-7, atol=1e-7)
+        assert (forces[k][~acting].abs() < 1e-12).all()
+
+
+def test_a_frame_that_is_held_neither_moves_nor_turns(robot):
+    system = MechanicalSystem(robot, fixed_frame("a_foot"))
+    q, v, u = states(robot, 3)
+    v = v - v  # at rest, so that the frame has to stay without acceleration of any kind
+    a = system.dynamics(q, v, u).acceleration(torch.zeros_like(v))
+    moved = (robot.frame_jacobian(q, "a_foot") @ a[..., None])[..., 0]
+    assert moved.abs().max() < 1e-9 * a.abs().max()
+
+
+def test_switches_and_matrices_survive_files(walker, robot):
+    again = MechanicalSystem.from_json(walker.to_json())
+    assert (again.inputs, again.robot.base, again.contacts) == (walker.inputs, "floating", walker.contacts)
+    matrix = np.zeros((robot.nv, 2))
+    matrix[6:8, 0], matrix[8, 1] = (0.5, -0.5), 2.0
+    coupled = MechanicalSystem(robot, known_forces=(Actuation(matrix, ("differential", "spindle")), RigidBodyBias()))
+    again = MechanicalSystem.from_json(coupled.to_json())
+    q, v, u = states(robot, 2)
+    assert again.inputs == ("differential", "spindle")
+    tau = torch.cat([torch.zeros(len(u), 6), 0.5 * u[:, :1], -0.5 * u[:, :1], 2.0 * u[:, 1:]], -1).double()
+    expected = robot.forward_dynamics(q, v, tau)
+    torch.testing.assert_close(again.dynamics(q, v, u).acceleration(torch.zeros_like(v)), expected)
+
+
+def test_matrices_that_do_not_fit_are_refused(robot):
+    with pytest.raises(InvalidInput, match=r"9\s*rows, one per degree of freedom"):
+        MechanicalSystem(robot, known_forces=(Actuation(np.eye(3)),))
+    with pytest.raises(InvalidInput, match="give 2 different ones"):
+        MechanicalSystem(robot, known_forces=(Actuation(np.eye(9)[:, :2], ("one", "one")),))
+    with pytest.raises(InvalidInput, match="lists Actuation twice"):
+        MechanicalSystem(robot, known_forces=(Actuation(), Actuation()))
