@@ -23,6 +23,19 @@ def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
     assert float(error) < 0.3
 
 
+def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "how-to" / "moving-bases.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    sizes, step, inputs, force = run_example(example, tmp_path).splitlines()
+    assert sizes.startswith("8 7 ('base.x', ")
+    assert [round(float(x), 6) for x in re.findall(r"-?\d\.\d+(?:e-\d+)?", step)] == [0.1, 0, 0, 0, 0, 0.3, 0.2]
+    assert inputs == "('knee', 'foot_stands')"
+    assert len(re.findall(r"-?\d+\.\d+", force)) == 3
+    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    for command in re.findall(r"^forcegp (.*)$", commands, re.MULTILINE):
+        parse_arguments(shlex.split(command))
+
+
 def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "comparing-priors.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

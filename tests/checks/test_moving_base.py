@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from forcegp import Preparation, check, identify_analytical
 from forcegp.checks import quick_check
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -61,8 +62,14 @@ def test_quaternions_of_another_length_are_refused(log):
         replace(log, q=q)
 
 
-def test_what_needs_a_fixed_base_says_so(log):
-    from forcegp import check
+def test_check_reports_the_base(log):
+    report = check(log)
+    assert [(each.subject, each.severity) for each in report.findings] == [("base", "ok")]
+    assert [each["joint"] for each in report.to_dict()["joints"]] == list(log.joint_names)
 
+
+def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
-        check(log)
+        Preparation(cutoff=10.0).apply(log)
+    with pytest.raises(InvalidInput, match="need a base that is fixed"):
+        identify_analytical(log)

@@ -1,4 +1,4 @@
-"""`quadruped`: rows obey the equations of motion with Pinocchio's numbers, and what is unknown is found from 200 rows."""
+"""`quadruped`: rows obey the equations of motion with Pinocchio's numbers; what is unknown is found from few rows."""
 
 import numpy as np
 import pinocchio as pin

@@ -124,6 +124,15 @@ class CheckInput:
     compared_noise: Float[np.ndarray, " nv"] | None
     most_rows: int = MOST_ROWS
 
+    @classmethod
+    def as_recorded(cls, dataset: Dataset, system: MechanicalSystem) -> "CheckInput":
+        """A log of which nothing is filtered, compared or mended."""
+        nowhere = np.zeros(dataset.v.shape, dtype=bool)
+        return cls(
+            log=dataset, robot=system.robot, contacts=len(system.contacts), even=dataset, prepared=None, compared=None,
+            automatic=False, wraps=nowhere, jumps=nowhere, dropped={}, mended=dataset, compared_noise=None,
+        )  # fmt: skip
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the joints."""

@@ -104,8 +104,9 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
         mass = robot.link(name).mass
         return Text.assemble((name, "bold" if mass else ""), f" {mass:.4g} kg" if mass else "", (moved, "dim"))
 
-    tree = Tree(line(robot.layout.standing[0], ""))
-    branches = {robot.layout.standing[0]: tree}
+    root = next(iter(robot.layout.links))
+    tree = Tree(line(root, "" if robot.base == "fixed" else f"  ({robot.base})"))
+    branches = {root: tree}
     for joint in robot.all_joints:
         mimic = content["mimics"].get(joint.name)
         how = "locked" if joint.name in robot.locked else joint.type

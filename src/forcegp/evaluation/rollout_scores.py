@@ -38,6 +38,7 @@ class RolloutErrors:
 
 def rollout_errors(rollout: Rollout, recorded: RecordedMotions, system: MechanicalSystem) -> RolloutErrors:
     """Compare rollouts (B, T+1, nv) with the motions from whose first rows they began."""
+    system.robot.require_vectors("scores of rollouts")
     tool = constraint = recorded_constraint = spread = inside = None
     actual = torch.as_tensor(np.array(recorded.q), device=rollout.q.device)
     if system.contacts:

@@ -22,7 +22,8 @@ AXIS = 0.12
 def still_scene(robot: Robot, urdf: str | Path | None = None) -> RecordedScene:
     """The robot at rest, as `link_shapes` draws it: at zero, or where limits exclude that, at the nearest limit."""
     limits = np.array([(joint.lower, joint.upper) for joint in robot.joints])
-    q = np.clip(np.zeros(robot.nv), limits[:, 0], limits[:, 1])[None]
+    step = torch.tensor(np.clip(np.zeros(robot.nv), limits[:, 0], limits[:, 1]))
+    q = robot.integrate(robot.neutral(), step).numpy()[None]
     shapes, doubts = link_shapes(robot, urdf)
     poses = poses_of_links(robot, torch.tensor(q), [shape.link for shape in shapes])
     return RecordedScene(robot, np.zeros(1), q, shapes, poses, [], [], reach(robot), doubts)

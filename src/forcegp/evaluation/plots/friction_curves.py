@@ -25,7 +25,6 @@ from forcegp.mechanics import (
     RigidBodyBias,
     RotorInertia,
 )
-from forcegp.mechanics.gauss_principle import State
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.components import Curve, term_slices
@@ -97,7 +96,8 @@ def law_forces(system: MechanicalSystem, joint: int, velocities: Float[np.ndarra
     robot = system.robot
     v = torch.zeros(len(velocities), robot.nv, dtype=torch.float64, device=robot.device)
     v[:, joint] = torch.tensor(velocities, dtype=v.dtype, device=v.device)
-    state = State.of(robot, torch.zeros_like(v), v, torch.zeros_like(v))
+    u = v.new_zeros(len(v), len(system.inputs))
+    state = system.state(robot.neutral().expand(len(v), -1), v, u)
     laws = [force for force in system.known_forces if not isinstance(force, NOT_OF_VELOCITY)]
     return -sum((law.force(state).expand_as(v) for law in laws), torch.zeros_like(v))[:, joint].detach().cpu().numpy()
 
