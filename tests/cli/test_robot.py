@@ -43,7 +43,7 @@ def test_one_error_and_its_options_take_the_file(forcegp, file):
     assert refused.returncode == 2
     assert len(refused.stderr.splitlines()) == 1
     options = refused.stderr.strip().rpartition(", or ")[2].removesuffix(".").split()
-    assert options == ["--inertias", "nearest", "--lock", "slip=0", "--base", "fixed"]
+    assert options == ["--inertias", "nearest", "--lock", "slip=0", "--base", "floating"]
     taken = forcegp("robot", file, *options, "--json")
     assert taken.returncode == 0
     assert "FL_foot" in taken.stderr
