@@ -28,6 +28,7 @@ from defusedxml import ElementTree
 
 from forcegp.errors import RobotFileWarning, RobotModelError, UnstatedBase
 from forcegp.robots import Robot
+from forcegp.robots.layout import BASE
 
 CLOSE = 1e-9
 ASKED = "not bolted"
@@ -81,12 +82,21 @@ def difference(robot: Robot) -> float:
     """The largest relative difference of M, bias and accelerations at a random state."""
     random = np.random.default_rng(0)
     q, v, tau = random.uniform(-1.0, 1.0, (3, robot.nv))
-    model = pin.buildModelFromXML(robot.urdf_text)
+    ours_alone = any(group.name == BASE for group in robot.layout.groups)  # a base that the file does not name
+    free = [pin.JointModelFreeFlyer()] if ours_alone else []
+    model = pin.buildModelFromXML(robot.urdf_text, *free)
     model.gravity.linear = robot.gravity.numpy()
     data = model.createData()
     G, positions = np.zeros((model.nv, robot.nv)), pin.neutral(model)
+    x = robot.integrate(robot.neutral(), torch.from_numpy(q))
+    groups = {"root_joint" if group.name == BASE else group.name: group for group in robot.layout.groups}
     followed = mimics(robot.urdf_text)
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+        if name in groups:  # in the same coordinates
+            rows, places = groups[name].rows, groups[name].places
+            G[joint.idx_v : joint.idx_v + joint.nv, rows] = np.eye(joint.nv)
+            positions[joint.idx_q : joint.idx_q + joint.nq] = x[places].numpy()
+            continue
         position, row = _motion(name, robot, followed, q)
         if joint.nv == 1:
             G[joint.idx_v] = row
@@ -99,7 +109,7 @@ def difference(robot: Robot) -> float:
         a = G.T @ pin.aba(model, data, positions, G @ v, G @ tau)
     else:
         a = np.linalg.solve(M, tau - bias)
-    x, y, z = (torch.from_numpy(each) for each in (q, v, tau))
+    y, z = (torch.from_numpy(each) for each in (v, tau))
     ours = (robot.mass_matrix(x), robot.bias_forces(x, y), robot.forward_dynamics(x, y, z))
     triples = zip((mine.numpy() for mine in ours), (M, bias, a), (0.0, np.abs(M).max(), 0.0), strict=True)
     return max(float(np.abs(mine - their).max() / max(np.abs(their).max(), least)) for mine, their, least in triples)

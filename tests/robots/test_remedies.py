@@ -19,11 +19,11 @@ def test_all_problems_are_in_one_report_with_one_remedy():
     with pytest.raises(RobotModelError) as caught:
         Robot.from_urdf_text(MANY, source="dog.urdf")
     message, error = str(caught.value), caught.value
-    assert message.startswith("dog.urdf: 4 problems: ")
-    assert all(part in message for part in ("'FL_foot'", "'FR_foot'", "'slip'", "not bolted"))
+    assert message.startswith("dog.urdf: 5 problems: ")
+    assert all(part in message for part in ("'trunk'", "'FL_foot'", "'FR_foot'", "'slip'", "not bolted"))
     assert message.count("Correct its <inertial>") == 1  # what to do is said once
     assert message.count("dog.urdf") == 1
-    assert len(error.problems) == 4
+    assert len(error.problems) == 5  # of the trunk, too, since it moves
     assert error.remedy == {"inertias": "nearest", "locked": {"slip": 0.0}, "base": "floating"}
     assert "Robot.from_urdf(path, inertias='nearest', locked={'slip': 0.0}, base='floating')" in message
     assert message.endswith("or --inertias nearest --lock slip=0 --base floating.")
@@ -44,7 +44,7 @@ def test_the_remedy_keeps_what_was_given():
 
 
 def test_what_must_be_corrected_in_the_file_leaves_no_remedy():
-    with pytest.raises(RobotModelError, match=r"4 problems: .*two.*The remedy for the others, when the file") as caught:
+    with pytest.raises(RobotModelError, match=r"5 problems: .*two.*The remedy for the others, when the file") as caught:
         Robot.from_urdf_text(MANY.replace('mass value="1.0"', 'mass value="two"', 1))
     assert caught.value.remedy == {}
     assert "inertias='nearest'" in str(caught.value)

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.errors import InvalidInput, UnstatedBase, usable_arguments
 from forcegp.robots.arguments import (
     Inertials,
     JointValues,
@@ -115,8 +116,37 @@ class Robot(RobotStructure):
         check_choice(base)
         locked = locked_positions(locked or {})
         given = {"locked": locked, "inertias": inertias if inertias != "strict" else None, "base": base, "root": root}
-        problems = Problems(source, {name: value for name, value in given.items() if value}, strict=bool(strict))
+        named = {name: value for name, value in given.items() if value}
         text = text.lstrip() if root is None else with_root(text.lstrip(), root)
+        numbers = finite_vector("gravity", gravity, 3), armature, locked, inertias
+
+        def read(held: BaseChoice | None) -> tuple[Robot | None, Problems]:
+            problems = Problems(source, named, strict=bool(strict))
+            return cls._read(text, problems, held, *numbers), problems
+
+        robot, problems = read(base)
+        asked = [error for error in problems.errors if isinstance(error, UnstatedBase)]
+        if asked:  # what else is wrong depends on the answer: a base that moves needs an inertia
+            _, others = read("floating")
+            problems.errors = [*others.errors, *asked]
+        problems.raise_all()
+        assert robot is not None, "a problem was collected otherwise"
+        if strict is not None:
+            problems.warn(stacklevel=4)
+        return robot
+
+    @classmethod
+    def _read(
+        cls,
+        text: str,
+        problems: Problems,
+        base: BaseChoice | None,
+        gravity: np.ndarray,
+        armature: Vector | Mapping[str, float | int] | None,
+        locked: Mapping[str, float],
+        inertias: InertiaChoice,
+    ) -> "Robot | None":
+        """The robot of a text, None where it cannot be made; ``problems`` collects what is wrong."""
         description = parse_urdf(text, problems)
         if not description.complete:  # nothing can be said of a tree that lacks joints
             problems.raise_all()
@@ -125,7 +155,7 @@ class Robot(RobotStructure):
             text, description = with_chosen_inertias(inertias, text, description, layout, problems)
             names = tuple(joint.name for joint in layout.joints)
             rotor_inertias = armature_values(armature, names, description.name)
-            tree = compile_tree(description, layout, finite_vector("gravity", gravity, 3), rotor_inertias)
+            tree = compile_tree(description, layout, gravity, rotor_inertias)
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
             robot = cls(description, layout, tree, text, tuple(locked.items()), frames, base or free_base(layout))
             without = bodies_without_inertia(description, layout, tree, problems.broken)
@@ -133,10 +163,8 @@ class Robot(RobotStructure):
             problems.errors += [error for coordinate, error in without if coordinate in limp]
             problems.offer_no_lock_of(names)
             check_base(description, layout.standing, problems)
-        problems.raise_all()
-        if strict is not None:
-            problems.warn(stacklevel=4)
-        return robot
+            return robot
+        return None
 
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
