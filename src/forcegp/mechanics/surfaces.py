@@ -66,8 +66,22 @@ class Surface(ABC):
         return torch.func.vmap(function)(flat).reshape(*p.shape[:-1], *trailing)
 
 
+class _Flat(Surface):
+    """A surface with the same unit normal everywhere."""
+
+    normal: Vector
+
+    @override
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return _tensor(self.normal, p).expand(p.shape)
+
+    @override
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        return p.new_zeros(*p.shape[:-1], 3, 3)
+
+
 @dataclass(frozen=True)
-class Plane(Surface):
+class Plane(_Flat):
     """The plane n . p = offset; `normal` need not be a unit vector (then n and offset are divided by its length)."""
 
     normal: Vector
@@ -82,17 +96,9 @@ class Plane(Surface):
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return p @ _tensor(self.normal, p) - self.offset
 
-    @override
-    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        return _tensor(self.normal, p).expand(p.shape)
-
-    @override
-    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-        return p.new_zeros(*p.shape[:-1], 3, 3)
-
 
 @dataclass(frozen=True)
-class Held(Surface):
+class Held(_Flat):
     """No place but a direction: a point on it does not move along `normal`, wherever it stands.
 
     Its value is 0 everywhere, so nothing pulls the point back, and the multiplier is the force along `normal` in N.
@@ -106,14 +112,6 @@ class Held(Surface):
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return torch.zeros_like(p[..., 0])
-
-    @override
-    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        return _tensor(self.normal, p).expand(p.shape)
-
-    @override
-    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-        return p.new_zeros(*p.shape[:-1], 3, 3)
 
 
 class _Round(Surface):
