@@ -49,6 +49,9 @@ def test_a_consistent_robot_and_a_fit_that_begins_with_it(forcegp, folder):
     robot = Robot.from_urdf(folder / "found" / "identified.urdf")
     q = torch.zeros(3).double()
     torch.testing.assert_close(robot.mass_matrix(q), system.robot.mass_matrix(q))
+    text = (folder / "found" / "identified.urdf").read_text()
+    assert all(f"{link}: {count:.0f}" in text for link, count in kept["weak"].items())
+    assert not kept["weak"] or "the log holds nothing of" in text
     assert robot.joint("pan").friction == kept["parameters"]["coulomb.pan"]["identified"]
     config = json.loads((folder / "found" / "config.json").read_text())
     assert sorted(config["files"]) == sorted(file.name for file in (folder / "found").iterdir())

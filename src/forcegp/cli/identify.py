@@ -120,7 +120,11 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
         write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
-            identified.robot.to_urdf(folder / "identified.urdf")
+            robot = identified.robot
+            if found.weak_directions:  # a URDF has no place for standard errors
+                held = "; ".join(f"{link}: {count:.0f}" for link, count in found.weak_directions)
+                robot = robot.with_note(f"of each body's ten inertial directions the log holds nothing of: {held}")
+            robot.to_urdf(folder / "identified.urdf")
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*tables, *_report_of_regression(command, found, content, identified))

@@ -27,7 +27,7 @@ from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import free_base, lay_out
 from forcegp.robots.problems import Problems
-from forcegp.robots.robot_file import read_armature, read_robot_file, with_comment, write_robot_file
+from forcegp.robots.robot_file import before_the_end, read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.tree import bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
@@ -223,6 +223,10 @@ class Robot(RobotStructure):
         given["armature"] = self.armature if armature is None else armature
         robot = Robot.from_urdf_text(text, source=self.source, strict=None, **given)
         return robot if self.device.type == "cpu" else robot.to(self.device)
+
+    def with_note(self, note: str) -> "Robot":
+        """The same robot, whose URDF text ends with this comment."""
+        return self.with_text(before_the_end(self.urdf_text, f"<!-- {note.replace('--', '- -')} -->\n"))
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given.

@@ -66,8 +66,13 @@ def with_comment(text: str, armature: Mapping[str, float], *, source: str, stack
         RobotFileWarning,
         stacklevel=stacklevel,
     )
+    return text if COMMENT in text else before_the_end(text, COMMENT)
+
+
+def before_the_end(text: str, added: str) -> str:
+    """URDF text with more before its last tag, a comment for example."""
     end = text.rindex("</robot")
-    return text if COMMENT in text else f"{text[:end]}{COMMENT}{text[end:]}"
+    return f"{text[:end]}{added}{text[end:]}"
 
 
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:
