@@ -8,6 +8,7 @@ import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from forcegp.atomic_files import write_json
 from forcegp.errors import InvalidNumber, MalformedUrdf, MissingExtra, RobotFileWarning
@@ -31,7 +32,8 @@ def read_robot_file(path: str | Path) -> str:
             f"{path}: xacro files need the package xacro: pip install 'forcegp[xacro]'; or expand it elsewhere."
         ) from None
     try:
-        return xacro.process_file(str(path)).toxml()
+        document: Any = xacro.process_file(str(path))  # a document of minidom; its annotation is too wide
+        return document.toxml()
     except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
         raise MalformedUrdf(
             f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it."
