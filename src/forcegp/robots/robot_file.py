@@ -64,7 +64,7 @@ def with_comment(text: str, armature: Mapping[str, float], *, source: str, stack
         return text
     warnings.warn(
         f"{source}: URDF has no element for rotor inertias ({', '.join(present)}): they go into a file beside it "
-        "(.armature.json), which Robot.from_urdf reads back; tell other programs.",
+        "(.armature.json), which Robot.from_urdf reads back; give them to other programs by hand.",
         RobotFileWarning,
         stacklevel=stacklevel,
     )
