@@ -36,6 +36,8 @@ from .simulation import simulate_kuka_surface as simulate_kuka_surface
 
 # what is unknown, and the model that learns it
 from .priors import JointForces as JointForces
+from .priors import AerodynamicForce as AerodynamicForce
+from .priors import BaseWrench as BaseWrench
 from .priors import JointFriction as JointFriction
 from .priors import PeriodicJointForces as PeriodicJointForces
 from .priors import ToolForces as ToolForces

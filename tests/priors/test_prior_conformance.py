@@ -7,6 +7,8 @@ from tests.priors.prior_conformance import PriorConformance
 from tests.priors.third_party_prior import AirDrag
 
 from forcegp.priors import (
+    AerodynamicForce,
+    BaseWrench,
     ContactFriction,
     JointAccelerations,
     JointForces,
@@ -43,6 +45,14 @@ class TestJointFriction(PriorConformance):
 
 class TestJointFrictionOfTwoJoints(PriorConformance):
     prior = JointFriction(("bend", "pan"), kernel="linear + squared-exponential")
+
+
+class TestBaseWrench(PriorConformance):
+    prior = BaseWrench("fore", ("velocity", "angular-velocity", "height", "attitude"))
+
+
+class TestAerodynamicForce(PriorConformance):
+    prior = AerodynamicForce("fore", kernel="linear")
 
 
 class TestToolForces(PriorConformance):

@@ -15,7 +15,7 @@ import forcegp.models
 import forcegp.report
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Command, listed, require_free_file, unless_given
-from forcegp.cli.input_options import SystemChoice, carried_over
+from forcegp.cli.input_options import SystemChoice, carried_over, with_observed_wind
 from forcegp.cli.learning_options import CONTACTS, parse_contacts
 from forcegp.cli.terminal import (
     NORMAL_FORCES,
@@ -69,8 +69,10 @@ class Evaluate(Command):
             require_free_file(self.report, overwrite=self.overwrite, own=forcegp.report.is_page, what="a report")
 
         posterior = forcegp.load_posterior(self.run_folder)
-        dataset = forcegp.Dataset.load(self.data).rows(slice(None, None, self.every))
+        dataset = forcegp.Dataset.load(self.data)
         posterior = carried_over(terminal, posterior, dataset, self.system)
+        posterior, dataset = with_observed_wind(terminal, posterior, dataset)
+        dataset = dataset.rows(slice(None, None, self.every))
         if self.contact:
             posterior = posterior.with_system(posterior.system.with_contacts(parse_contacts(self.contact)))
         evaluation = evaluate_with_progress(terminal, posterior, dataset)

@@ -191,6 +191,16 @@ def carried_over(
     return posterior.with_system(system)
 
 
+def with_observed_wind(
+    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset
+) -> tuple[forcegp.models.Posterior, forcegp.Dataset]:
+    """Both with the slow force that a model of air observes from the past of the recording, reported on stderr."""
+    observed, seen = forcegp.models.observing(posterior, dataset)
+    if observed is not posterior:
+        terminal.note("wind: observed from earlier rows of each episode (aerodynamic:observe=0 leaves it unknown)")
+    return observed, seen
+
+
 def require_same_joints(posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
     """Refuse a recording of another robot: InvalidInput."""
     if tuple(posterior.joint_names) != dataset.joint_names:

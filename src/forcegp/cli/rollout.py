@@ -15,7 +15,7 @@ import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Command, listed, numbers_of, unless_given
-from forcegp.cli.input_options import SystemChoice, carried_over, require_same_joints
+from forcegp.cli.input_options import SystemChoice, carried_over, require_same_joints, with_observed_wind
 from forcegp.cli.terminal import Terminal, columns, facts, number, percent, shown
 from forcegp.errors import InvalidInput
 
@@ -70,6 +70,7 @@ class Rollout(Command):
         dataset = forcegp.Dataset.load(self.data)
         require_same_joints(posterior, dataset, self.data)
         posterior = carried_over(terminal, posterior, dataset, self.system)
+        posterior, dataset = with_observed_wind(terminal, posterior, dataset)
         for sentence in forcegp.evaluation.system_warnings(posterior, dataset):
             terminal.warn(sentence)
         recorded = forcegp.data.recorded_motions(dataset, rows, self.seconds)

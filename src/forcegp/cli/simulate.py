@@ -20,7 +20,7 @@ from forcegp.cli.command import Command, require_free_file, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
-Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped"]
+Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped", "quadrotor"]
 ToolFriction = Literal["viscous", "coulomb", "stribeck"]
 JointFriction = Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"]
 TOOL_FRICTION = arg(help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
@@ -34,7 +34,7 @@ class Simulate(Command):
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
     Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
     friction in every joint, without PyBullet. quadruped: a robot on a floating base that shifts its weight and lifts
-    its feet, with an unknown load of 2 kg. Equal seeds give equal motions; train and test need different ones.
+    its feet, with an unknown load of 2 kg. quadrotor: a drone on a path in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
@@ -42,10 +42,11 @@ class Simulate(Command):
       forcegp simulate ur5-free --seconds 60 --seed 1 --out arm.h5
       forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
       forcegp simulate quadruped --seconds 30 --seed 1 --out quadruped.h5
+      forcegp simulate quadrotor --seconds 60 --seed 1 --wind 4 --out drone.h5
     """
 
     scenario: Annotated[Positional[Scenario], arg(metavar="SCENARIO")]
-    """What to simulate: kuka-surface, ur5-free, double-pendulum or quadruped."""
+    """What to simulate: kuka-surface, ur5-free, double-pendulum, quadruped or quadrotor."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     seconds: Annotated[float, arg(metavar="S")] = 200.0
@@ -70,6 +71,8 @@ class Simulate(Command):
     """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
     contact_model: Literal["ideal", "bullet"] = "ideal"
     """ideal: the tool never leaves the surface. bullet: PyBullet's contact, which it leaves now and then."""
+    wind: Annotated[float | None, unless_given("M/S", "4; only of quadrotor", float)] = None
+    """Mean wind of a quadrotor in m/s, from a random side, with gusts."""
     overwrite: bool = False
     """Replace the file if it exists."""
 
@@ -99,10 +102,16 @@ class Simulate(Command):
     def _config(self) -> dict[str, Any]:
         """The fields of the scenario's configuration that the options set."""
         given = {name: getattr(self, name) for name in ("seconds", "seed", "noise", "joint_friction")}
+        if self.wind is not None and self.scenario != "quadrotor":
+            raise InvalidInput(f"--wind means nothing to {self.scenario}; only a quadrotor flies.")
         fields = {name: value for name, value in given.items() if value is not None} | {"episodes": self.trajectories}
         if self.scenario != "kuka-surface":
             for word in self.words("tool_friction", "friction_coefficient", "patch", "surface", "contact_model"):
                 raise InvalidInput(f"{word} means nothing to {self.scenario}, whose arm touches nothing; leave it out.")
+            if self.scenario == "quadrotor":
+                if self.joint_friction is not None:
+                    raise InvalidInput("--joint-friction means nothing to quadrotor, which has no joints; leave it out.")
+                return fields if self.wind is None else {**fields, "wind": self.wind}
             return fields if self.scenario == "quadruped" else {"arm": self.scenario, **fields}
         fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}
         fields["patch_factor"] = self.patch

@@ -23,3 +23,4 @@ from .spectrum import (
 from .windows import (
     WeakForm as WeakForm, Windows as Windows,
 )
+from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag

@@ -133,12 +133,12 @@ class State:
     kinematics: Kinematics
     inertials: Mapping[str, Tensor] | None = None
     inputs: tuple[str, ...] = ()
-    delivered_by: Callable[[Tensor], Tensor] | None = None
+    delivered_by: "Callable[[State], Tensor] | None" = None
 
     @property
     def delivered(self) -> Float[Tensor, "*batch nv"]:
-        """Joint forces of the actuators in Nm or N."""
-        return self.u if self.delivered_by is None else self.delivered_by(self.u)
+        """Joint forces of the actuators, thrusters included, in Nm or N."""
+        return self.u if self.delivered_by is None else self.delivered_by(self)
 
     @classmethod
     def of(
@@ -149,7 +149,7 @@ class State:
         u: Tensor,
         inertials: Inertials | None = None,
         inputs: tuple[str, ...] = (),
-        delivered_by: Callable[[Tensor], Tensor] | None = None,
+        delivered_by: "Callable[[State], Tensor] | None" = None,
     ) -> "State":
         """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
         q, v = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v)))

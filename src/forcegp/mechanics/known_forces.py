@@ -36,6 +36,11 @@ class KnownForce(ABC):
     learned: ClassVar[str | None] = None
     """Name of the one of them that an identification estimates."""
 
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Columns of u that this reads besides those of the actuators."""
+        return ()
+
     @abstractmethod
     def force(self, state: State) -> Float[Tensor, "*#batch nv"]:
         """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""
@@ -120,7 +125,7 @@ class Actuation(KnownForce):
 
     @override
     def force(self, state: State) -> Tensor:
-        return state.delivered
+        return self.delivered(state.u[..., : len(self.names)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,5 +331,6 @@ def known_force_to_dict(force: KnownForce) -> dict[str, Any]:
         value = getattr(force, f.name)
         if isinstance(force, Actuation) and force.matrix is None:
             continue  # files of robots that are driven in every joint stay as they were
-        stored[f.name] = list(value) if f.name == "names" else torch.as_tensor(value).tolist()
+        plain = list(value) if f.name == "names" else value
+        stored[f.name] = plain if isinstance(plain, list | str | int) else torch.as_tensor(value).tolist()
     return stored

@@ -20,6 +20,7 @@ from forcegp.mechanics.known_forces import (
     known_force_to_dict,
 )
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
+from forcegp.mechanics.thrusters import ObservedWrench, Thrusters
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
 from forcegp.summary import Summary, listed
@@ -58,6 +59,8 @@ class MechanicalSystem(Summary):
         object.__setattr__(self, "known_forces", tuple(force.bound_to(self.robot) for force in self.known_forces))
         if sum(isinstance(force, Actuation) for force in self.known_forces) > 1:
             raise InvalidInput("known_forces lists Actuation twice; u acts once: put both into one matrix.")
+        if len(set(self.inputs)) < len(self.inputs):
+            raise InvalidInput(f"columns of u are called {', '.join(self.inputs)}; give each input its own name.")
         for contact in self.contacts:
             body, _ = self.robot.frame(contact.frame)
             if body < 0:
@@ -84,9 +87,15 @@ class MechanicalSystem(Summary):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the columns of u: the actuators, then the switches of contacts (1 where they act, else 0)."""
+        """Names of the columns of u: actuators, then what known forces read, then switches of contacts (1 or 0)."""
         switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)
-        return (*self.actuation.names, *switches)
+        return (*self.actuation.names, *(name for force in self.known_forces for name in force.input_names), *switches)
+
+    @property
+    def held_inputs(self) -> tuple[int, ...]:
+        """Columns of u that are observed, not commanded: predicted motions keep those of their start."""
+        held = {name for force in self.known_forces if isinstance(force, ObservedWrench) for name in force.names}
+        return tuple(index for index, name in enumerate(self.inputs) if name in held)
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -98,7 +107,8 @@ class MechanicalSystem(Summary):
         actuation, inputs = self.actuation, self.inputs
         count = len(actuation.names)
         plain = actuation.matrix is None and len(inputs) == count
-        delivered_by = None if plain else lambda u: actuation.delivered(u[..., :count])
+        pushing = (actuation, *(force for force in self.known_forces if isinstance(force, Thrusters)))
+        delivered_by = None if plain else lambda state: sum(force.force(state) for force in pushing)
         return State.of(self.robot, q, v, u, inertials, inputs, delivered_by)
 
     def dynamics(

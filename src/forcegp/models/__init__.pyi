@@ -7,6 +7,7 @@ from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .identification.identification import Identification as Identification
 from .identification.physical_parameters import Coefficients as Coefficients, Learned as Learned
+from .observed_wrench import observing as observing
 from .prediction import Linearization as Linearization, Gaussian as Gaussian, Prediction as Prediction
 from .predictor import Predictor as Predictor
 from .protocol import Model as Model, Posterior as Posterior

@@ -241,7 +241,8 @@ class Posterior(MotionModel, Summary, ABC):
         Parameters
         ----------
         q0, v0: initial states (..., nv) in rad and rad/s (m and m/s), any batch.
-        u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast.
+        u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast. An `ObservedWrench`
+            stays as in the first row.
         dt: time step in s.
         integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order),
             "implicit-midpoint" (second order, for stiff friction) or "projected" (second order; contacts hold exactly
@@ -262,6 +263,9 @@ class Posterior(MotionModel, Summary, ABC):
         `grad`, NumericalError where the initial state cannot be projected.
         """
         model = self.accelerations(baumgarte)
+        if held := list(self.system.held_inputs):
+            u = _tensor("u", u, self.system.sizes[2], self.system.robot.device).clone()
+            u[..., held] = u[..., :1, held]
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed, "grad": grad}
         return replace(roll_out(model, q0, v0, u, dt, **how, progress=progress), intervals=self.motion_intervals)
 

@@ -10,6 +10,7 @@ from typing import Any
 from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.surfaces import object_from_dict
+from forcegp.priors.base_wrench import AerodynamicForce, BaseWrench
 from forcegp.priors.contact_friction import ContactFriction
 from forcegp.priors.force_prior import ForcePrior, SumPrior
 from forcegp.priors.joint_forces import JointAccelerations, JointForces, JointFriction, NoForces, PeriodicJointForces
@@ -25,6 +26,8 @@ PRIORS: dict[str, type[ForcePrior]] = {
     "contact-friction": ContactFriction,
     "periodic-joint-forces": PeriodicJointForces,
     "payload": Payload,
+    "base-wrench": BaseWrench,
+    "aerodynamic": AerodynamicForce,
     "no-forces": NoForces,
 }
 """Priors that stored models can name, besides sums of them."""
@@ -93,6 +96,8 @@ NAMED_PRIORS: dict[str, NamedPrior] = {
         (("viscous", True), ("inputs", ("position",))),
     ),
     "payload": NamedPrior("weight and place of an unknown load: payload:frame=LINK", Payload),
+    "base-wrench": NamedPrior("force and torque on a base that moves, on its motion and attitude", BaseWrench),
+    "aerodynamic": NamedPrior("what air and wind do to a robot that flies", AerodynamicForce),
     "joint-accelerations": NamedPrior("accelerations without the contacts, on (q, v, u)", JointAccelerations),
     "none": NamedPrior("no unknown force at all", NoForces),
 }

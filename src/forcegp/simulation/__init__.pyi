@@ -1,3 +1,4 @@
+from .quadrotor import simulate_quadrotor as simulate_quadrotor
 from .quadruped import simulate_quadruped as simulate_quadruped
 from .free_arms import simulate_free_arm as simulate_free_arm
 from .kuka_motion import kuka_file as kuka_file
@@ -5,6 +6,7 @@ from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface
 from .kuka_surface_config import (
     FreeArmConfig as FreeArmConfig,
     KukaSurfaceConfig as KukaSurfaceConfig,
+    QuadrotorConfig as QuadrotorConfig,
     QuadrupedConfig as QuadrupedConfig,
     SCENARIOS as SCENARIOS,
     Scenario as Scenario,

@@ -358,6 +358,31 @@ class QuadrupedConfig:
         require_known("joint_friction", self.joint_friction, "a quadruped", ("none", "coulomb", "stribeck"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class QuadrotorConfig:
+    """A drone that follows a path in `wind` [m/s] from a random side, with gusts; rotors follow within `lag` [s].
+
+    `seed` draws path, side and gusts; the drone is always the same. `noise` in rad/s^2 and m/s^2. Raises InvalidInput
+    naming the field and its range.
+    """
+
+    seconds: float = 60.0
+    seed: int = 0
+    noise: float = 0.1
+    episodes: int = 1
+    wind: float = 4.0
+    lag: float = 0.06
+
+    @usable_arguments("QuadrotorConfig")
+    def __post_init__(self) -> None:
+        checked_numbers("seconds", self.seconds, POSITIVE, None)
+        checked_numbers("noise", self.noise, NOT_NEGATIVE, None)
+        checked_numbers("wind", self.wind, ("from 0 to 15 m/s", 0.0, 15.0), None)
+        checked_numbers("lag", self.lag, ("from 0.005 to 0.2 s", 0.005, 0.2), None)
+        require_integer("seed", self.seed, 0, 2**31)
+        require_integer("episodes", self.episodes, 1, 10_000)
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A simulation that makes a Dataset. Its libraries are imported at `simulate`, so that listing scenarios is quick.
@@ -391,6 +416,11 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             "a quadruped that stands and shifts its weight, with a load and friction in every joint",
             QuadrupedConfig,
             "forcegp.simulation.quadruped:simulate_quadruped",
+        ),
+        "quadrotor": Scenario(
+            "a drone that follows a path in wind, with late rotors and air forces that nobody models",
+            QuadrotorConfig,
+            "forcegp.simulation.quadrotor:simulate_quadrotor",
         ),
         "double-pendulum": Scenario("two driven rods with friction in both hinges", FreeArmConfig, FREE_ARM),
     }

@@ -250,6 +250,7 @@ class StructuredPosterior(Posterior):
             )
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(system.robot.device) for x in (self.training.q, self.training.v, self.training.u))
+        u = u.new_zeros(1, system.sizes[2]) if len(u[0]) != system.sizes[2] else u
         self.model.prior.mixing(system.dynamics(q, v, u, inertials_of(self.parameters) or None))
         # the training rows are always conditioned in their own system: nothing is factorised again, no number changes
         # widths of intervals of motions were found in the system before

@@ -1,0 +1,141 @@
+"""Forces on one link that come with u: thrusters such as propellers, and a wrench that an observer estimates."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.mechanics.gauss_principle import State
+from forcegp.mechanics.known_forces import KNOWN_FORCES, KnownForce
+from forcegp.robots import Robot
+
+
+class LinkForce(KnownForce):
+    """A force and a torque on the link `frame` that follow from columns of u called `names`."""
+
+    frame: str
+    names: tuple[str, ...]
+
+    @property
+    @override
+    def input_names(self) -> tuple[str, ...]:
+        return self.names
+
+    @abstractmethod
+    def wrench(self, state: State) -> Float[Tensor, "*batch 6"]:
+        """Force [N], then torque [Nm] about the origin of the link, in the link's axes."""
+
+    @override
+    def force(self, state: State) -> Tensor:
+        axes = state.kinematics.frame_pose(self.frame)[..., :3, :3]
+        wrench = self.wrench(state).unflatten(-1, (2, 3))
+        world = (axes[..., None, :, :] @ wrench[..., None]).flatten(-3)
+        return (state.kinematics.frame_jacobian(self.frame).mT @ world[..., None])[..., 0]
+
+    def _inputs(self, state: State) -> Tensor:
+        first = state.inputs.index(self.names[0])
+        return state.u[..., first : first + len(self.names)]
+
+
+@dataclass(frozen=True, eq=False)
+class Thrusters(LinkForce):
+    """Thruster k at `places[k]` (m) pushes link `frame` along `axes[k]`: T = thrust[k] s, and torque[k] s about it.
+
+    s = u for `power` 1 (u is a thrust, or a share of it) and s = u |u| for `power` 2 (u is a rotor's speed). `thrust`
+    in N per unit of s, `torque` in Nm per unit of s, positive for a torque on the link along the axis, so its sign is
+    against the turn of the rotor. Both are one number, or one for each thruster. Columns of u are called `names`.
+    Source: Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012, eqs. 6-8. That u is a command which
+    rotors follow late is no part of it: `Preparation(lag=...)` filters u.
+    Raises InvalidInput for numbers that do not fit each other.
+    """
+
+    frame: str
+    places: Sequence[Sequence[float]] | Tensor
+    thrust: float | Sequence[float] | Tensor = 1.0
+    torque: float | Sequence[float] | Tensor = 0.0
+    axes: Sequence[float] | Sequence[Sequence[float]] | Tensor = (0.0, 0.0, 1.0)
+    power: int = 1
+    names: tuple[str, ...] = ()
+
+    @override
+    def bound_to(self, robot: Robot) -> "Thrusters":
+        robot.frame(self.frame)
+        places = _numbers("places", self.places, robot)
+        if places.dim() != 2 or places.shape[-1] != 3 or not len(places):
+            raise InvalidInput(f"Thrusters places are {self.places!r}; give x, y, z in m for each thruster.")
+        count = len(places)
+        axes = _fitting("axes", self.axes, (count, 3), robot)
+        length = torch.linalg.vector_norm(axes, dim=-1, keepdim=True)
+        if not bool((length > 0).all()):
+            raise InvalidInput(f"Thrusters axes are {self.axes!r}; give a direction for each thruster.")
+        if self.power not in (1, 2):
+            raise InvalidInput(f"Thrusters power is {self.power!r}; give 1 for thrusts or 2 for rotor speeds.")
+        thrust, torque = (_fitting(name, getattr(self, name), (count,), robot) for name in ("thrust", "torque"))
+        names = tuple(self.names) or tuple(f"rotor_{k + 1}" for k in range(count))
+        if len(names) != count or len(set(names)) != count:
+            raise InvalidInput(f"Thrusters names are {names}; give {count} different ones, one for each thruster.")
+        return Thrusters(self.frame, places, thrust, torque, axes / length, int(self.power), names)
+
+    @override
+    def wrench(self, state: State) -> Tensor:
+        u = self._inputs(state)
+        s = u if self.power == 1 else u * u.abs()
+        places, axes, thrust, torque = (torch.as_tensor(x) for x in (self.places, self.axes, self.thrust, self.torque))
+        turning = thrust[:, None] * torch.linalg.cross(places, axes) + torque[:, None] * axes
+        return s @ torch.cat([thrust[:, None] * axes, turning], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedWrench(LinkForce):
+    """A slow force on link `frame` that an observer estimates from the past, as wind makes it; columns of u hold it.
+
+    They are called `names`: a force [N] at the origin of the link in the axes of the world, and where six are named a
+    torque [Nm]. `forcegp.data.with_observed_wrench` computes them from a recording. A prediction of motions keeps the
+    values of its start, since nobody can observe the future (`MechanicalSystem.held_inputs`).
+    """
+
+    frame: str
+    names: tuple[str, ...] = ("wind_x", "wind_y", "wind_z")
+
+    @override
+    def bound_to(self, robot: Robot) -> "ObservedWrench":
+        robot.frame(self.frame)
+        if len(self.names) not in (3, 6) or len(set(self.names)) < len(self.names):
+            raise InvalidInput(f"ObservedWrench names are {self.names}; give three different ones, or six.")
+        return ObservedWrench(self.frame, tuple(self.names))
+
+    @override
+    def wrench(self, state: State) -> Tensor:
+        axes = state.kinematics.frame_pose(self.frame)[..., :3, :3]
+        world = self._inputs(state).unflatten(-1, (-1, 3))
+        own = (axes.mT[..., None, :, :] @ world[..., None]).flatten(-3)
+        return torch.cat([own, torch.zeros_like(own)], dim=-1) if len(self.names) == 3 else own
+
+
+KNOWN_FORCES["thrusters"] = Thrusters  # here, since these build on the classes of that module
+KNOWN_FORCES["observed-wrench"] = ObservedWrench
+
+
+def _numbers(name: str, given: object, robot: Robot) -> Tensor:
+    try:
+        values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(f"Thrusters {name} is {given!r}; give numbers.") from None
+    if not bool(torch.isfinite(values).all()):
+        raise InvalidInput(f"Thrusters {name} is {given!r}; give finite numbers.")
+    return values
+
+
+def _fitting(name: str, given: object, shape: tuple[int, ...], robot: Robot) -> Tensor:
+    values = _numbers(name, given, robot)
+    try:
+        return values.expand(shape).clone()
+    except RuntimeError:
+        raise InvalidInput(
+            f"Thrusters {name} has shape {tuple(values.shape)}; give one for all, or {shape[0]}, one for each thruster."
+        ) from None

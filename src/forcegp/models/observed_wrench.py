@@ -1,0 +1,68 @@
+"""A slow force that no feature explains, such as wind: observed from the past rows of a recording, then known."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset
+from forcegp.data.filtering import episodes_in_order
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import ObservedWrench
+from forcegp.models.protocol import AnyPosterior
+from forcegp.priors import AerodynamicForce, ForcePrior
+
+NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+
+
+def observing(
+    posterior: AnyPosterior, dataset: Dataset, *, seconds: float | None = None, frame: str | None = None
+) -> tuple[AnyPosterior, Dataset]:
+    """The posterior and the recording with an `ObservedWrench` on link `frame`, in six more columns of u.
+
+    Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
+    episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
+    et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016, section II). No row sees itself or
+    what follows. First rows of an episode hold zero. By default the prior's `AerodynamicForce` gives frame and time;
+    without one, or where its time is 0, both come back as they are.
+
+    Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
+    for a recording whose rows are not in order of time.
+    """
+    prior: ForcePrior | None = getattr(posterior.model, "prior", None)
+    own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
+    if seconds is None:
+        seconds = 0.0 if own is None else own.observe
+        if seconds == 0.0 or ObservedWrench in map(type, posterior.system.known_forces):
+            return posterior, dataset
+    if not 0.0 < seconds < 1e6:
+        raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
+    robot = posterior.system.robot
+    frame = (own or AerodynamicForce(frame)).link(robot) if frame is None else frame
+    q, v, u = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.u))
+    with torch.no_grad():
+        dynamics = posterior.dynamics(q, v, u)
+        unexplained = torch.as_tensor(dataset.a, device=robot.device) - posterior.predict(q, v, u, covariance=False).mean
+        effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
+        wrench = (torch.linalg.pinv(effect, rtol=1e-9) @ unexplained[..., None])[..., 0].cpu().numpy()
+    observed = np.zeros((len(dataset), 6))
+    for number, rows, _ in episodes_in_order(dataset):
+        own_rows = np.flatnonzero(dataset.episode == number)
+        observed[own_rows] = _past_mean(wrench[own_rows], rows.time, seconds)
+    system = replace(
+        posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES))
+    )
+    truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
+    return posterior.with_system(system), replace(
+        dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth
+    )
+
+
+def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:
+    """Means of the rows before each, with weights exp(-age / seconds); zero for the first."""
+    means, total, weight = np.zeros_like(values), np.zeros(values.shape[1]), 0.0
+    keep = np.exp(-np.diff(time) / seconds)
+    for row in range(1, len(values)):
+        total, weight = keep[row - 1] * (total + values[row - 1]), keep[row - 1] * (weight + 1.0)
+        means[row] = total / weight
+    return means

@@ -1,0 +1,107 @@
+"""Thrusters and observed wrenches against Pinocchio's external forces, by hand, and through files."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+
+from forcegp import MechanicalSystem, Robot
+from forcegp.errors import InvalidInput, UnknownFrame
+from forcegp.mechanics import Actuation, ObservedWrench, RigidBodyBias, Thrusters
+
+INERTIA = '<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0.001" ixz="0" iyz="0.002"/>'
+DRONE = f"""<robot name="drone"><link name="body"><inertial><origin xyz="0.01 -0.02 0.03"/><mass value="1.5"/>{INERTIA}
+</inertial></link><joint name="tilt" type="revolute"><origin xyz="0.1 0 0.05" rpy="0.2 0 0.1"/><parent link="body"/>
+<child link="pod"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="5" velocity="9"/></joint><link name="pod">
+<inertial><origin xyz="0 0 0.02"/><mass value="0.4"/>{INERTIA}</inertial></link></robot>"""
+PLACES = [(0.1, 0.05, 0.02), (-0.1, 0.0, 0.03)]
+AXES = [(0.0, 0.2, 1.0), (0.0, 0.0, 2.0)]
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot.from_urdf_text(DRONE, base="floating")
+
+
+def states(robot, rows=5):
+    generator = torch.Generator().manual_seed(3)
+    q = robot.random(generator, rows)
+    return q, *(torch.randn(rows, size, generator=generator, dtype=torch.float64) for size in (robot.nv, 3))
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_accelerations_are_those_of_external_forces_in_pinocchio(robot, power):
+    pushing = Thrusters("pod", PLACES, (2.0, 3.0), (0.1, -0.2), AXES, power)
+    system = MechanicalSystem(robot, (), (Actuation(), pushing, RigidBodyBias()))
+    assert system.inputs == ("tilt", "rotor_1", "rotor_2")
+    q, v, u = states(robot)
+    a = system.dynamics(q, v, u).acceleration_map().offset
+    model = pin.buildModelFromXML(DRONE, pin.JointModelFreeFlyer())
+    data = model.createData()
+    for k in range(len(q)):
+        wrench = np.zeros(6)
+        for place, axis, size, turn, s in zip(PLACES, AXES, (2.0, 3.0), (0.1, -0.2), u[k, 1:].tolist(), strict=True):
+            unit, signal = np.array(axis) / np.linalg.norm(axis), s if power == 1 else s * abs(s)
+            wrench[:3] += size * signal * unit
+            wrench[3:] += np.cross(place, size * signal * unit) + turn * signal * unit
+        outside = [pin.Force.Zero()] * 2 + [pin.Force(wrench)]  # the pod's frame is that of its joint
+        tau = np.concatenate([np.zeros(6), u[k, :1].numpy()])
+        expected = pin.aba(model, data, q[k].numpy(), v[k].numpy(), tau, outside)
+        np.testing.assert_allclose(a[k].numpy(), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_an_observed_wrench_acts_along_the_axes_of_the_world(robot):
+    system = MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), ObservedWrench("pod")))
+    assert (system.inputs, system.held_inputs) == (("tilt", "wind_x", "wind_y", "wind_z"), (1, 2, 3))
+    q, v, u = states(robot)
+    u = torch.cat([u[:, :1], torch.ones(5, 3, dtype=torch.float64) * torch.tensor([1.0, -2.0, 0.5])], -1)
+    calm = MechanicalSystem(robot).dynamics(q, v, u[:, :1])
+    push = calm.state.kinematics.frame_jacobian("pod")[:, :3].mT @ u[0, 1:]
+    blown = system.dynamics(q, v, u)
+    torch.testing.assert_close(blown.Q_K - calm.Q_K, push)
+    six = MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), ObservedWrench("pod", tuple("abcdef"))))
+    turned = six.dynamics(q, v, torch.cat([u, u[:, 1:]], -1)).Q_K - blown.Q_K
+    torch.testing.assert_close(turned, calm.state.kinematics.frame_jacobian("pod")[:, 3:].mT @ u[0, 1:])
+
+
+def test_gradients(robot):
+    system = MechanicalSystem(robot, (), (Actuation(), Thrusters("pod", PLACES, 2.0, 0.1, AXES, 2), RigidBodyBias()))
+    q, v, u = states(robot, 1)
+    torch.autograd.gradcheck(lambda u: system.dynamics(q, v, u).Q_K, u[0].clone().requires_grad_())
+
+
+def test_files_carry_them(robot):
+    pushing = Thrusters("pod", PLACES, (2.0, 3.0), (0.1, -0.2), AXES, 2, ("left", "right"))
+    system = MechanicalSystem(robot, (), (Actuation(), pushing, RigidBodyBias(), ObservedWrench("body")))
+    again = MechanicalSystem.from_json(system.to_json())
+    q, v, u = states(robot)
+    u = torch.cat([u, torch.ones(5, 3, dtype=torch.float64)], -1)
+    assert again.inputs == system.inputs == ("tilt", "left", "right", "wind_x", "wind_y", "wind_z")
+    torch.testing.assert_close(again.dynamics(q, v, u).Q_K, system.dynamics(q, v, u).Q_K, rtol=1e-14, atol=1e-15)
+    delivered = system.state(q, v, u).delivered
+    torch.testing.assert_close(delivered[:, 6:], (pushing.bound_to(robot).force(system.state(q, v, u))[:, 6:] + u[:, :1]))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Thrusters("pod", [(0.0, 1.0)]), "x, y, z in m"),
+        (lambda: Thrusters("pod", PLACES, (1.0, 2.0, 3.0)), "one for all, or 2"),
+        (lambda: Thrusters("pod", PLACES, math.nan), "finite numbers"),
+        (lambda: Thrusters("pod", PLACES, axes=(0.0, 0.0, 0.0)), "a direction"),
+        (lambda: Thrusters("pod", PLACES, power=3), "1 for thrusts or 2"),
+        (lambda: Thrusters("pod", PLACES, names=("a", "a")), "2 different ones"),
+        (lambda: Thrusters("pod", PLACES, names=("tilt", "b")), "its own name"),
+        (lambda: ObservedWrench("pod", ("a", "b")), "three different ones, or six"),
+    ],
+)
+def test_what_does_not_fit_is_refused(robot, make, words):
+    with pytest.raises(InvalidInput, match=words):
+        MechanicalSystem(robot, (), (Actuation(), make(), RigidBodyBias()))
+
+
+def test_an_unknown_link_is_named(robot):
+    with pytest.raises(UnknownFrame, match="wing"):
+        MechanicalSystem(robot, (), (Actuation(), Thrusters("wing", PLACES)))

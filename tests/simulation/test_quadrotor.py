@@ -1,0 +1,119 @@
+"""`quadrotor`: rows obey Newton and Euler, its lag is found, and its air forces are learned in wind that is new."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from forcegp import AerodynamicForce, StructuredGP
+from forcegp.data import estimate_thruster_lag
+from forcegp.data.delay import lagged
+from forcegp.errors import InvalidInput
+from forcegp.models import observing
+from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
+
+
+@pytest.fixture(scope="module")
+def train():
+    return simulate_quadrotor(QuadrotorConfig(seconds=20.0, seed=1))
+
+
+@pytest.fixture(scope="module")
+def test():
+    return simulate_quadrotor(QuadrotorConfig(seconds=6.0, seed=2, wind=8.0))
+
+
+def acting(dataset, lag=0.06):
+    """With the rotor speeds that act, from half a second on."""
+    late = np.stack([lagged(column, dataset.time, lag) for column in dataset.u.T], axis=1)
+    return replace(dataset, u=late).rows(np.arange(120, len(dataset)))
+
+
+@pytest.fixture(scope="module")
+def posterior(train):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return StructuredGP(train.system, AerodynamicForce()).fit(acting(train), points=80, restarts=1)
+
+
+def test_velocities_and_accelerations_are_derivatives(test):
+    inside = np.arange(1, 400)
+    q = torch.tensor(test.q)
+    slope = 120.0 * test.system.robot.difference(q[inside - 1], q[inside + 1])
+    np.testing.assert_allclose(slope, test.v[inside], atol=1e-3)
+    speed = 120.0 * (test.v[inside + 1] - test.v[inside - 1])
+    np.testing.assert_allclose(speed, test.truth["a"][inside], atol=0.2)
+
+
+def test_without_wind_at_rest_only_thrust_and_lag_are_unknown():
+    calm = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1, wind=0.0, noise=0.0))
+    windy = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1, wind=12.0, noise=0.0))
+    assert np.abs(calm.truth["Q_U"][:, :2]).max() < 0.25 * np.abs(windy.truth["Q_U"][:, :2]).max()
+    known = calm.system.dynamics(*(torch.tensor(x) for x in (calm.q, calm.v, calm.u)))
+    a = known.acceleration(torch.tensor(calm.truth["Q_U"]))
+    np.testing.assert_allclose(a, calm.truth["a"], atol=1e-9)
+
+
+def test_equal_seeds_give_equal_flights(test):
+    again = simulate_quadrotor(QuadrotorConfig(seconds=6.0, seed=2, wind=8.0))
+    np.testing.assert_array_equal(again.a, test.a)
+
+
+@pytest.mark.parametrize("lag", [0.04, 0.1])
+def test_the_lag_of_the_rotors_is_found(lag):
+    dataset = simulate_quadrotor(QuadrotorConfig(seconds=30.0, seed=1, lag=lag))
+    found, std = estimate_thruster_lag(dataset)
+    assert found == pytest.approx(lag, rel=0.2)
+    assert 0.0 < std < 0.02
+
+
+def test_a_lag_needs_thrusters(train):
+    bare = replace(train.system, known_forces=train.system.known_forces[2:])
+    with pytest.raises(InvalidInput, match="Thrusters"):
+        estimate_thruster_lag(replace(train, system=None))
+    assert bare.inputs == ()
+
+
+def test_new_wind_is_observed_from_the_past(posterior, test):
+    rows = acting(test)
+    a = test.truth["a"][120:]
+    seeing, seen = observing(posterior, rows)
+    blind = a - posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy()
+    left = a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.numpy()
+    assert np.all(np.square(left[24:]).mean(0) < 0.05 * np.square(blind[24:]).mean(0))
+    assert seen.system.held_inputs == tuple(range(4, 10))
+    assert "Q_U" not in seen.truth
+
+
+def test_an_observer_sees_the_past_only(posterior, test):
+    rows = acting(test)
+    _, seen = observing(posterior, rows)
+    other = rows.a.copy()
+    other[200:] += 5.0
+    _, changed = observing(posterior, replace(rows, a=other))
+    np.testing.assert_array_equal(changed.u[:201], seen.u[:201])
+    assert np.abs(changed.u[201] - seen.u[201]).max() > 0.0
+
+
+def test_predicted_motions_keep_the_wind_of_their_start(posterior, test):
+    seeing, seen = observing(posterior, acting(test))
+    u = seen.u[300:330]
+    other = u.copy()
+    other[1:, 4:] += 3.0
+    first, second = (seeing.rollout(seen.q[300], seen.v[300], given, 1 / 240) for given in (u, other))
+    torch.testing.assert_close(first.q, second.q, rtol=0.0, atol=0.0)
+    after = np.linalg.norm(first.q[-1, :3].numpy() - seen.q[300 + len(first.q) - 1, :3])
+    blind = posterior.rollout(seen.q[300], seen.v[300], u[:, :4], 1 / 240)
+    assert after < 0.3 * np.linalg.norm(blind.q[-1, :3].numpy() - seen.q[300 + len(first.q) - 1, :3])
+
+
+def test_what_cannot_be_observed_is_refused(posterior, test):
+    with pytest.raises(InvalidInput, match="looks back"):
+        observing(posterior, acting(test), seconds=-1.0)
+    calm = StructuredGP(test.system, AerodynamicForce(observe=0.0, kernel="linear"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fitted = calm.fit(acting(test), points=30, restarts=1)
+    assert observing(fitted, test) == (fitted, test)
