@@ -64,7 +64,10 @@ def test_quaternions_of_another_length_are_refused(log):
 
 def test_check_reports_the_base(log):
     report = check(log)
-    assert [(each.subject, each.severity) for each in report.findings] == [("base", "ok")]
+    assert [(each.subject, each.severity) for each in report.findings] == [
+        ("base", "ok"),
+        *[("contact flag", "ok")] * 4,
+    ]
     assert [each["joint"] for each in report.to_dict()["joints"]] == list(log.joint_names)
 
 

@@ -81,7 +81,9 @@ def test_files_carry_them(robot):
     assert again.inputs == system.inputs == ("tilt", "left", "right", "wind_x", "wind_y", "wind_z")
     torch.testing.assert_close(again.dynamics(q, v, u).Q_K, system.dynamics(q, v, u).Q_K, rtol=1e-14, atol=1e-15)
     delivered = system.state(q, v, u).delivered
-    torch.testing.assert_close(delivered[:, 6:], (pushing.bound_to(robot).force(system.state(q, v, u))[:, 6:] + u[:, :1]))
+    torch.testing.assert_close(
+        delivered[:, 6:], (pushing.bound_to(robot).force(system.state(q, v, u))[:, 6:] + u[:, :1])
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,8 @@ from tests.models.arm import arm_system
 from forcegp.errors import FileFormatError, InvalidInput, UnknownFrame, UnknownJoint
 from forcegp.priors import (
     NAMED_PRIORS,
+    AerodynamicForce,
+    BaseWrench,
     ContactFriction,
     JointAccelerations,
     JointForces,
@@ -35,6 +37,8 @@ NAMES = {
     "load-friction": ContactFriction(load=True),
     "friction-map": ContactFriction(viscous=True, inputs=("position",)),
     "payload:frame=hand": Payload("hand"),
+    "base-wrench:frame=hand": BaseWrench("hand"),
+    "aerodynamic:frame=hand,observe=0.2": AerodynamicForce("hand", observe=0.2),
     "joint-accelerations": JointAccelerations(),
     "none": NoForces(),
 }

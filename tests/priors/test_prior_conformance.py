@@ -49,10 +49,12 @@ class TestJointFrictionOfTwoJoints(PriorConformance):
 
 class TestBaseWrench(PriorConformance):
     prior = BaseWrench("fore", ("velocity", "angular-velocity", "height", "attitude"))
+    acts_at = ("fore", (0.0, 0.0, 0.0))
 
 
 class TestAerodynamicForce(PriorConformance):
     prior = AerodynamicForce("fore", kernel="linear")
+    acts_at = ("fore", (0.0, 0.0, 0.0))
 
 
 class TestToolForces(PriorConformance):

@@ -11,6 +11,7 @@ from forcegp import AerodynamicForce, StructuredGP
 from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
+from forcegp.mechanics import Actuation, RigidBodyBias
 from forcegp.models import observing
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -70,10 +71,10 @@ def test_the_lag_of_the_rotors_is_found(lag):
 
 
 def test_a_lag_needs_thrusters(train):
-    bare = replace(train.system, known_forces=train.system.known_forces[2:])
+    joints = Actuation(torch.eye(6, dtype=torch.float64)[:, 2:], ("a", "b", "c", "d"))
+    system = replace(train.system, known_forces=(joints, RigidBodyBias()))
     with pytest.raises(InvalidInput, match="Thrusters"):
-        estimate_thruster_lag(replace(train, system=None))
-    assert bare.inputs == ()
+        estimate_thruster_lag(replace(train, system=system, truth={}))
 
 
 def test_new_wind_is_observed_from_the_past(posterior, test):

@@ -20,6 +20,7 @@ from forcegp.checks.motion import motion_findings, sampling_findings
 from forcegp.checks.moving_base import base_findings
 from forcegp.checks.parameters import parameter_findings
 from forcegp.checks.signals import signal_findings
+from forcegp.checks.stance import stance_findings, unmeasured_base_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
@@ -170,7 +171,7 @@ def check(
         require_rows("dataset", dataset, robot.joint_names, robot.name)
         if robot.layout.groups:  # torques and filters are not looked at
             inputs = CheckInput.as_recorded(dataset, system)
-            return CheckReport(findings=_sorted([*base_findings(dataset, system)]), inputs=inputs, comparison=None)
+            return CheckReport(findings=_of_base(dataset, system), inputs=inputs, comparison=None)
     preparation = Preparation(cutoff="auto") if preparation is None else preparation
     inputs = CheckInput.of(dataset, system, require_type("preparation", preparation, Preparation))
     findings, comparison = _findings(inputs, system)
@@ -196,7 +197,7 @@ def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tup
     if system is not None:
         require_rows("dataset", dataset, system.robot.joint_names, system.robot.name)
         if system.robot.layout.groups:
-            return _sorted([each for each in base_findings(dataset, system) if each.severity != "ok"])
+            return tuple(each for each in _of_base(dataset, system) if each.severity != "ok")
     findings, _ = _findings(CheckInput.quick(dataset, system), system)
     said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
     if dataset.nv > 1:  # friction of one joint can look like a delay
@@ -210,7 +211,7 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
     if inputs.log.time_ordered:
         findings = [*sampling_findings(inputs), *findings, *motion_findings(inputs)]
     contacts = contact_findings(inputs, system)
-    findings += contacts
+    findings += [*contacts, *(stance_findings(inputs.log, system) if system is not None else ())]
     comparison = None
     if inputs.compared is None:
         return findings, None
@@ -225,6 +226,12 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
             compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
         findings += [*corrections, *compared]
     return findings, comparison
+
+
+def _of_base(dataset: Dataset, system: MechanicalSystem) -> tuple[Finding, ...]:
+    """What is seen of a base that moves and of what holds it; torques and filters are not looked at."""
+    unmeasured = list(unmeasured_base_findings(dataset, system))
+    return _sorted([*(unmeasured or base_findings(dataset, system)), *stance_findings(dataset, system)])
 
 
 def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:

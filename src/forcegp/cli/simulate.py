@@ -34,7 +34,8 @@ class Simulate(Command):
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
     Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
     friction in every joint, without PyBullet. quadruped: a robot on a floating base that shifts its weight and lifts
-    its feet, with an unknown load of 2 kg. quadrotor: a drone on a path in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
+    its feet, with an unknown load of 2 kg. quadrotor: a drone on a path in wind, with late rotors.
+    Equal seeds give equal motions; train and test need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
@@ -110,7 +111,9 @@ class Simulate(Command):
                 raise InvalidInput(f"{word} means nothing to {self.scenario}, whose arm touches nothing; leave it out.")
             if self.scenario == "quadrotor":
                 if self.joint_friction is not None:
-                    raise InvalidInput("--joint-friction means nothing to quadrotor, which has no joints; leave it out.")
+                    raise InvalidInput(
+                        "--joint-friction means nothing to quadrotor, which has no joints; leave it out."
+                    )
                 return fields if self.wind is None else {**fields, "wind": self.wind}
             return fields if self.scenario == "quadruped" else {"arm": self.scenario, **fields}
         fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}

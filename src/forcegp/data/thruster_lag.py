@@ -25,8 +25,8 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     velocity, speed times velocity, rates, their products, attitude, and thrust times velocity. All columns lose their
     slow part first, for wind is slow and controllers answer it, which made lags up to a third too short. The best T has
     the least sum of log residuals, by a parabola; its deviation comes from leaving out each eighth of the time (block
-    jackknife, as in `estimate_delay`). Raises InvalidInput without `Thrusters` on a base that moves freely, DatasetError
-    where the recording is too short, or shows no lag below .3 s.
+    jackknife, as in `estimate_delay`). Raises InvalidInput without `Thrusters` on a base that moves freely, and
+    DatasetError where the recording is too short, or shows no lag below .3 s.
     """
     columns, powers, row = _thrusters(dataset)
     episodes = [part for _, part, _ in episodes_in_order(dataset) if part.time[-1] - part.time[0] > 2.0 * SETTLED]

@@ -12,6 +12,7 @@ from forcegp.mechanics import ObservedWrench
 from forcegp.models.protocol import AnyPosterior
 from forcegp.priors import AerodynamicForce, ForcePrior
 
+USUAL, TRIED = 0.1, (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
 
@@ -23,8 +24,8 @@ def observing(
     Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016, section II). No row sees itself or
-    what follows. First rows of an episode hold zero. By default the prior's `AerodynamicForce` gives frame and time;
-    without one, or where its time is 0, both come back as they are.
+    what follows. First rows of an episode hold zero. By default the prior's `AerodynamicForce` gives frame and time, or
+    the fit chose the time (`with_observer`); without one, or where its time is 0, both come back as they are.
 
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording whose rows are not in order of time.
@@ -32,7 +33,8 @@ def observing(
     prior: ForcePrior | None = getattr(posterior.model, "prior", None)
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
     if seconds is None:
-        seconds = 0.0 if own is None else own.observe
+        chosen = posterior.settings.get("observe_seconds", USUAL)
+        seconds = 0.0 if own is None else chosen if own.observe is None else own.observe
         if seconds == 0.0 or ObservedWrench in map(type, posterior.system.known_forces):
             return posterior, dataset
     if not 0.0 < seconds < 1e6:
@@ -42,20 +44,36 @@ def observing(
     q, v, u = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.u))
     with torch.no_grad():
         dynamics = posterior.dynamics(q, v, u)
-        unexplained = torch.as_tensor(dataset.a, device=robot.device) - posterior.predict(q, v, u, covariance=False).mean
+        unexplained = torch.tensor(dataset.a, device=robot.device) - posterior.predict(q, v, u, covariance=False).mean
         effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
         wrench = (torch.linalg.pinv(effect, rtol=1e-9) @ unexplained[..., None])[..., 0].cpu().numpy()
     observed = np.zeros((len(dataset), 6))
     for number, rows, _ in episodes_in_order(dataset):
         own_rows = np.flatnonzero(dataset.episode == number)
         observed[own_rows] = _past_mean(wrench[own_rows], rows.time, seconds)
-    system = replace(
-        posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES))
-    )
+    system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     return posterior.with_system(system), replace(
         dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth
     )
+
+
+def with_observer(posterior: AnyPosterior, dataset: Dataset) -> AnyPosterior:
+    """The posterior with the time in `settings` at which an observer predicts the rows of this recording best.
+
+    Only where the prior leaves it open (`AerodynamicForce(observe=None)`) and rows are in order of time.
+    """
+    prior: ForcePrior = posterior.model.prior
+    open_ones = [term for term in prior.summands() if isinstance(term, AerodynamicForce) and term.observe is None]
+    if not open_ones or not dataset.time_ordered or len(dataset) < 100:
+        return posterior
+
+    def error(seconds: float) -> float:
+        seeing, seen = observing(posterior, dataset, seconds=seconds)
+        wrong = dataset.a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.cpu().numpy()
+        return float(np.log(np.square(wrong).mean(0)).sum())
+
+    return posterior.with_settings(observe_seconds=min(TRIED, key=error))
 
 
 def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:

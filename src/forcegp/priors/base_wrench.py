@@ -84,7 +84,9 @@ class BaseWrench(ExpressedKernels):
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state, where = dynamics.state, self._point(dynamics)
-        linear, angular = ((where.orientation.mT @ part[..., None])[..., 0] for part in _halves(where.velocity(state.v)))
+        linear, angular = (
+            (where.orientation.mT @ part[..., None])[..., 0] for part in _halves(where.velocity(state.v))
+        )
         columns: dict[str, Callable[[], Tensor]] = {
             "velocity": lambda: linear,
             "drag": lambda: (linear.square().sum(-1, keepdim=True) + 1e-12).sqrt() * linear,
@@ -134,17 +136,25 @@ class AerodynamicForce(BaseWrench):
     actuators deliver, so that a linear kernel holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018) and
     a thrust that differs from the data sheet. The wind of the training data is a constant force of the world in them.
     Another wind is an unknown slow input: `forcegp evaluate` and `forcegp rollout` observe it from the last `observe`
-    seconds of the recording, as a disturbance observer does in flight (`Posterior.observing`). 0 observes nothing.
+    seconds of the recording, as a disturbance observer does in flight (`forcegp.models.observing`). With None the fit
+    chooses the time on its own rows; 0 observes nothing.
     """
 
     inputs: tuple[str, ...] = ("velocity", "drag", "angular-velocity", "thrust", "height", "attitude")
-    observe: float = 0.1
+    observe: float | None = None
 
     @override
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.observe, int | float) or not 0.0 <= self.observe < 1e6:
-            raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, or 0.")
+        if self.observe is None:
+            return
+        try:  # files and commands hold text
+            seconds = float(self.observe)
+        except (TypeError, ValueError):
+            seconds = -1.0
+        if not 0.0 <= seconds < 1e6:
+            raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, 0, or None.")
+        object.__setattr__(self, "observe", seconds)
 
 
 def _halves(six: Tensor) -> tuple[Tensor, Tensor]:

@@ -87,7 +87,7 @@ def _episode(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) ->
 
     def path(t: float) -> tuple[np.ndarray, ...]:
         waves = rate * t + phase
-        x = (amplitude * np.sin(waves)).sum(0) + [0.0, 0.0, HEIGHT]
+        x = (amplitude * np.sin(waves)).sum(0) + np.array([0.0, 0.0, HEIGHT])
         return x, (amplitude * rate * np.cos(waves)).sum(0), -(amplitude * rate**2 * np.sin(waves)).sum(0)
 
     def accelerations(R: np.ndarray, x: np.ndarray, V: np.ndarray, speeds: np.ndarray, air: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ def _episode(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) ->
         thrust = THRUST * speeds**2 * ratio * ground
         drag = -BODY_DRAG * np.linalg.norm(flow) * flow
         force = drag - ROTOR_DRAG * speeds.sum() * flow + [0.0, 0.0, thrust.sum()]
-        torque = np.cross(CENTRE, drag) + [PLACES[:, 1] @ thrust, -PLACES[:, 0] @ thrust, TORQUE @ thrust]
+        torque = np.cross(CENTRE, drag) + np.stack([PLACES[:, 1], -PLACES[:, 0], TORQUE]) @ thrust
         torque = torque + FLAPPING * np.array([-flow[1], flow[0], 0.0])
         linear = force / mass + R.T @ gravity - np.cross(V[3:], V[:3])
         return np.concatenate([linear, np.linalg.solve(inertia, torque - np.cross(V[3:], inertia @ V[3:]))])

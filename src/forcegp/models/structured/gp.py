@@ -14,6 +14,7 @@ from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
+from forcegp.models.observed_wrench import with_observer
 from forcegp.models.search import (
     ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
@@ -234,7 +235,7 @@ class StructuredGP(StructuredModel):
         warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
         described = described_rows(all_rows, dataset)
-        return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
+        return with_observer(on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report), dataset)
 
     def _fit_windows(
         self, dataset: Dataset, observe: WeakForm, points: int | None, search: Search

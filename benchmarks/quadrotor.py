@@ -1,0 +1,104 @@
+"""A drone in wind that it has not met: force priors against the best parametric model and against an independent GP.
+
+Each seed trains on one flight of 60 s in wind of 4 m/s and tests on four others in 0, 3, 8 and 12 m/s. The lag of the
+rotors is estimated from the training flight. The parametric model is least squares from all training rows on thrust,
+drag (linear and quadratic, along each axis), products of thrust and velocity, rates, height and a constant force of
+the world. `observed` adds the wrench that its residuals leave, from the past .1 s, as ours does.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from forcegp import AerodynamicForce, Dataset, StructuredGP
+from forcegp.data import estimate_thruster_lag
+from forcegp.data.delay import lagged
+from forcegp.models import IndependentGP, Posterior, observing
+from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
+
+WINDS = (0.0, 3.0, 8.0, 12.0)
+HORIZON, STRIDE = 120, 60  # rows: of .5 s, and between starts
+
+
+def acting(dataset: Dataset, lag: float) -> Dataset:
+    late = np.stack([lagged(column, dataset.time, lag) for column in dataset.u.T], axis=1)
+    keep = np.arange(240, len(dataset))
+    return replace(dataset, u=late).rows(keep)
+
+
+def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
+    """nRMSE of accelerations (mean over the six), and RMSE of the position after .5 s in m."""
+    rows = np.arange(60, len(dataset))  # the observer has begun
+    a = posterior.predict(dataset.q, dataset.v, dataset.u, covariance=False).mean.numpy()
+    error = (a - dataset.truth["a"])[rows]
+    starts = np.arange(60, len(dataset) - HORIZON, STRIDE)
+    u = np.stack([dataset.u[k : k + HORIZON] for k in starts])
+    moved = posterior.rollout(dataset.q[starts], dataset.v[starts], u, 1.0 / 240.0)
+    last = moved.q.shape[-2] - 1
+    away = moved.q[:, -1, :3].numpy() - dataset.q[starts + last][:, :3]
+    return (
+        float(np.mean(np.sqrt(np.square(error).mean(0)) / dataset.truth["a"][rows].std(0))),
+        float(np.sqrt(np.nanmean(np.square(away).sum(1)))) if np.isfinite(away).all() else float("nan"),
+    )
+
+
+def seed_scores(seed: int, lag: float, points: int) -> dict[str, object]:
+    train = simulate_quadrotor(QuadrotorConfig(seconds=60.0, seed=seed, lag=lag))
+    found, _ = estimate_thruster_lag(train)
+    rows = acting(train, found)
+    tests = [
+        acting(simulate_quadrotor(QuadrotorConfig(seconds=20.0, seed=1000 * seed + k, wind=wind, lag=lag)), found)
+        for k, wind in enumerate(WINDS)
+    ]
+    models: dict[str, Posterior] = {}
+    seconds = {}
+    for name, fit in {
+        "force prior": lambda: StructuredGP(train.system, AerodynamicForce()).fit(rows, points=points, restarts=1),
+        "parametric": lambda: parametric(rows),
+        "independent GP": lambda: IndependentGP(train.system).fit(rows, points=points, restarts=1),
+    }.items():
+        begun = time.process_time()
+        models[name] = fit()
+        seconds[name] = round(time.process_time() - begun, 1)
+    result: dict[str, object] = {"seed": seed, "lag": lag, "found lag": round(found, 4), "fit CPU s": seconds}
+    for name, posterior in models.items():
+        result[name] = [scores(*observing(posterior, test)) for test in tests]
+        if name != "independent GP":
+            result[f"{name}, unobserved"] = [scores(posterior, test) for test in tests]
+    return result
+
+
+def parametric(rows: Dataset) -> Posterior:
+    """Least squares from all rows: the linear kernel of the same features, with variances that do not shrink."""
+    model = StructuredGP(rows.system, AerodynamicForce(kernel="linear"))
+    return model.fit(rows, points=1000, restarts=1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--points", type=int, default=300)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    lags = np.random.default_rng(0).uniform(0.04, 0.10, options.seeds)
+    results = []
+    for seed in range(1, options.seeds + 1):
+        results.append(seed_scores(seed, float(round(lags[seed - 1], 3)), options.points))
+        print(json.dumps(results[-1]), flush=True)
+    ours = np.array([result["force prior"] for result in results])  # (seeds, winds, 2)
+    for name in results[0]:
+        if isinstance(results[0][name], list) and name != "force prior":
+            ratio = np.sqrt(np.square(ours).mean(1)) / np.sqrt(np.square([r[name] for r in results]).mean(1))
+            print(f"force prior over {name}: accelerations, position after .5 s: {np.median(ratio, 0).round(3)}")
+    if options.out:
+        options.out.write_text(json.dumps(results, indent=1))
+
+
+if __name__ == "__main__":
+    main()

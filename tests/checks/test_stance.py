@@ -1,0 +1,65 @@
+"""Flags of contacts that the motion does not support, and bases that nobody measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forcegp import check
+from forcegp.checks import quick_check
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate_quadruped(QuadrupedConfig(seconds=6.0, seed=5, noise=0.05))
+
+
+def of(dataset, subject="contact flag"):
+    return [each for each in quick_check(dataset) if each.subject == subject]
+
+
+def flagged(log, foot, change):
+    u = log.u.copy()
+    place = log.system.inputs.index(foot)
+    u[:, place] = change(u[:, place])
+    return replace(log, u=u, truth={})
+
+
+def test_flags_that_the_motion_supports_are_in_order(log):
+    assert not of(log)
+    assert {each.severity for each in check(log).findings if each.subject == "contact flag"} == {"ok"}
+
+
+def test_a_foot_that_moves_while_it_stands_is_named(log):
+    feet = log.system.inputs[12:]
+    lifted = next(foot for foot in feet if (log.u[:, log.system.inputs.index(foot)] == 0.0).any())
+    (finding,) = of(flagged(log, lifted, np.ones_like))
+    assert finding.severity == "wrong"
+    assert repr(lifted) in finding.seen
+    assert repr(lifted.replace("_stands", "_foot")) in finding.seen
+    rows = np.flatnonzero(log.u[:, log.system.inputs.index(lifted)] == 0.0)
+    assert int(finding.seen.split("row ")[1].split(" ")[0]) in rows
+    assert "Set the flag to 0" in finding.remedy
+
+
+def test_a_foot_that_rests_while_it_is_free_is_a_suspicion(log):
+    (finding,) = of(flagged(log, log.system.inputs[12], np.zeros_like))
+    assert finding.severity == "look"
+    assert "at rest" in finding.seen
+
+
+def test_flags_that_are_no_flags_are_named(log):
+    (finding,) = of(flagged(log, log.system.inputs[13], lambda flags: 0.9 * flags))
+    assert "neither 0 nor 1" in finding.seen
+    assert finding.numbers["rows"] == int((log.u[:, 13] != 0.0).sum())
+
+
+def test_a_base_that_nobody_measured_is_named(log):
+    q, v = log.q.copy(), log.v.copy()
+    q[:, :7], v[:, :6] = q[0, :7], 0.0
+    findings = of(replace(log, q=q, v=v, truth={}), "base")
+    assert findings[0].severity == "wrong"
+    assert "not measured" in findings[0].seen
+    assert "motion capture" in findings[0].remedy
+    assert "base='fixed'" in findings[0].remedy
