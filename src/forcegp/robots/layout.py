@@ -137,7 +137,7 @@ def lay_out(
         above = links[joint.parent]
         offset = above.offset @ joint.origin
         free = joint.type in MOTIONS
-        bolted = free and base == "fixed" and above.body == WORLD
+        bolted = free and joint.type != "spherical" and base == "fixed" and above.body == WORLD
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else _joint_motion(joint, held.get(joint.name, 0.0))
             links[joint.child] = Placement(above.body, offset @ still)
@@ -180,8 +180,9 @@ def lay_out(
 
 def free_base(layout: Layout) -> BaseChoice:
     """How the root is held where nobody said it: by a joint of the file, or bolted."""
-    first = next((group for group in layout.groups if layout.parents[group.body] == WORLD), None)
-    return "fixed" if first is None else first.kind  # type: ignore[return-value]  # kinds of groups are choices
+    root = next(iter(layout.links))
+    kinds = [group.kind for group in layout.groups if layout.bodies[group.body].parent == root]
+    return next((kind for kind in kinds if kind != "spherical"), "fixed")  # type: ignore[return-value]  # kinds of groups are choices
 
 
 def _rows_of(joint: JointDescription) -> list[JointDescription]:

@@ -26,12 +26,14 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import free_base, lay_out
+from forcegp.robots.mjcf import is_mjcf, translate
+from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.problems import Problems
 from forcegp.robots.robot_file import before_the_end, read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.tree import bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import InertiaChoice, replace_inertial, with_chosen_inertias, with_root
+from forcegp.robots.urdf_file import InertiaChoice, read_text, replace_inertial, with_chosen_inertias, with_root
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -113,15 +115,86 @@ class Robot(RobotStructure):
 
         ``strict`` of None warns of nothing: for text that was warned of before.
         """
-        check_choice(base)
-        locked = locked_positions(locked or {})
-        given = {"locked": locked, "inertias": inertias if inertias != "strict" else None, "base": base, "root": root}
-        named = {name: value for name, value in given.items() if value}
         text = text.lstrip() if root is None else with_root(text.lstrip(), root)
-        numbers = finite_vector("gravity", gravity, 3), armature, locked, inertias
+        given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
+        return cls._made(text, Problems(source, given, strict=bool(strict)), gravity, armature, quiet=strict is None)
+
+    @classmethod
+    @usable_arguments("Robot.from_mjcf")
+    def from_mjcf(cls, path: str | Path, **options: Any) -> "Robot":
+        """Read an MJCF file by MuJoCo's own compiler: masses may follow from shapes, and files may include others.
+
+        Every body is a link of that name, whose frame is the body's; joints follow in MuJoCo's order, with armature,
+        damping, dry friction and limits, and named sites are links without mass. An equality of two joints that is
+        linear is a mimic joint. Meshes are needed only where a mass follows from them. q is MuJoCo's `qpos`, but
+        quaternions are x, y, z, w, and the linear velocity of a free body has the axes of the body.
+
+        Parameters are those of :meth:`from_urdf`, without ``root``: ``gravity`` (default: the file's), ``armature``
+        (default: the file's), ``locked``, ``inertias``, ``base`` (default: as in the file) and ``strict``. A
+        RobotFileWarning names what acts in MuJoCo and not here: springs, tendons, gains of actuators, closed loops
+        (which :meth:`MechanicalSystem.from_mjcf <forcegp.mechanics.MechanicalSystem.from_mjcf>` has) and others.
+
+        Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
+        :class:`~forcegp.errors.MissingExtra` without the package mujoco.
+        """
+        return cls.with_loops(read_text(path), str(path), Path(path).parent, **options)[0]
+
+    @classmethod
+    @usable_arguments("Robot.from_mjcf_text")
+    def from_mjcf_text(cls, text: str, *, source: str = "<text>", **options: Any) -> "Robot":
+        """As :meth:`from_mjcf`, from text that names no other files; ``source`` is what error messages call it."""
+        return cls.with_loops(text, source, None, **options)[0]
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> "Robot":
+        """:meth:`from_mjcf` where the root element is <mujoco>, else :meth:`from_urdf`; ``options`` are theirs."""
+        return (cls.from_mjcf if is_mjcf(read_text(path)) else cls.from_urdf)(path, **options)
+
+    @classmethod
+    def with_loops(
+        cls,
+        text: str,
+        source: str,
+        folder: Path | None,
+        *,
+        gravity: Vector | None = None,
+        armature: Vector | Mapping[str, float | int] | None = None,
+        locked: Mapping[str, float | int] | None = None,
+        inertias: InertiaChoice = "strict",
+        base: BaseChoice | None = None,
+        strict: bool = False,
+        loops: bool = False,
+    ) -> "tuple[Robot, tuple[LoopDescription, ...]]":
+        """The robot of MJCF text and its closed loops, which are noted as left out unless ``loops``."""
+        given = {"locked": locked, "inertias": inertias, "base": base}
+        problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
+        found = translate(text, folder, inertias == "nearest", loops, problems)
+        problems.given["locked"] = found.locked | dict(locked or {})
+        gravity = found.gravity if gravity is None else gravity
+        return cls._made(found.urdf, problems, gravity, armature, found.armature), found.loops
+
+    @classmethod
+    def _made(
+        cls,
+        text: str,
+        found: Problems,
+        gravity: Vector,
+        armature: Vector | Mapping[str, float | int] | None,
+        beside: Mapping[str, float] | None = None,
+        *,
+        quiet: bool = False,
+    ) -> "Robot":
+        """The robot of URDF text; `found` has the arguments and what is wrong already, `beside` what a file adds."""
+        base, inertias = found.given["base"], found.given["inertias"]
+        check_choice(base)
+        locked = locked_positions(found.given["locked"] or {})
+        named = found.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
+        named = {name: value for name, value in named.items() if value}
+        numbers = finite_vector("gravity", gravity, 3), armature, beside or {}, locked, inertias
 
         def read(held: BaseChoice | None) -> tuple[Robot | None, Problems]:
-            problems = Problems(source, named, strict=bool(strict))
+            problems = Problems(found.source, named, strict=found.strict, reader=found.reader)
+            problems.errors, problems.notes = [*found.errors], {what: [*where] for what, where in found.notes.items()}
             return cls._read(text, problems, held, *numbers), problems
 
         robot, problems = read(base)
@@ -131,8 +204,8 @@ class Robot(RobotStructure):
             problems.errors = [*others.errors, *asked]
         problems.raise_all()
         assert robot is not None, "a problem was collected otherwise"
-        if strict is not None:
-            problems.warn(stacklevel=4)
+        if not quiet:
+            problems.warn(stacklevel=5)
         return robot
 
     @classmethod
@@ -143,6 +216,7 @@ class Robot(RobotStructure):
         base: BaseChoice | None,
         gravity: np.ndarray,
         armature: Vector | Mapping[str, float | int] | None,
+        beside: Mapping[str, float],
         locked: Mapping[str, float],
         inertias: InertiaChoice,
     ) -> "Robot | None":
@@ -154,6 +228,8 @@ class Robot(RobotStructure):
             layout = lay_out(description, locked, base, problems)
             text, description = with_chosen_inertias(inertias, text, description, layout, problems)
             names = tuple(joint.name for joint in layout.joints)
+            if armature is None:  # a file may have those of joints that are locked here
+                armature = {name: value for name, value in beside.items() if name in names}
             rotor_inertias = armature_values(armature, names, description.name)
             tree = compile_tree(description, layout, gravity, rotor_inertias)
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
