@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,9 +20,11 @@ from forcegp.mechanics.known_forces import (
     RigidBodyBias,
     known_force_to_dict,
 )
+from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
 
 FORMAT_VERSION = 1
@@ -60,18 +63,51 @@ class MechanicalSystem(Summary):
             raise InvalidInput("known_forces lists Actuation twice; u acts once: put both into one matrix.")
         for contact in self.contacts:
             body, _ = self.robot.frame(contact.frame)
-            if body < 0:
+            if isinstance(contact, LoopClosure):
+                if body == self.robot.frame(contact.second_frame)[0]:
+                    raise ContactError(
+                        f"frames {contact.frame!r} and {contact.second_frame!r} of {self.robot.name} do not move "
+                        "against each other, so they close no loop; name frames of two bodies."
+                    )
+            elif body < 0:
                 raise ContactError(
                     f"frame {contact.frame!r} of {self.robot.name} is fixed in the world, so a contact there "
                     "constrains nothing; name a frame that moves."
                 )
 
+    @classmethod
+    def from_mjcf(
+        cls,
+        path: str | Path,
+        known_forces: tuple[KnownForce, ...] = (Actuation(), RigidBodyBias()),
+        baumgarte: Baumgarte | None = None,
+        **options: Any,
+    ) -> "MechanicalSystem":
+        """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
+
+        `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
+        enter as known forces only where listed.
+        """
+        robot, found = Robot.with_loops(read_text(path), str(path), Path(path).parent, loops=True, **options)
+        contacts = [
+            contact
+            for loop in found
+            for contact in (
+                loop_frame(*loop.frames)
+                if loop.turning
+                else loop_point(loop.frames[0], loop.points[0], loop.frames[1], loop.points[1])
+            )
+        ]
+        return cls(robot, tuple(contacts), known_forces, baumgarte)
+
     @override
     def facts(self) -> dict[str, object]:
-        """Robot, contacts and known forces."""
+        """Robot, contacts, closed loops and known forces."""
+        ends = dict.fromkeys(f"{loop.frame} and {loop.second_frame}" for loop in self.loops)
         return {
             "robot": f"{self.robot.name!r}, {self.robot.nv} joints",
-            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.contacts),
+            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.touching),
+            **({"closed loops": listed(ends)} if ends else {}),
             "known forces": listed(type(force).__name__ for force in self.known_forces),
             "baumgarte": self.baumgarte or "none",
         }
@@ -87,6 +123,16 @@ class MechanicalSystem(Summary):
         """Names of the columns of u: the actuators, then the switches of contacts (1 where they act, else 0)."""
         switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)
         return (*self.actuation.names, *switches)
+
+    @property
+    def loops(self) -> tuple[LoopClosure, ...]:
+        """The contacts that hold frames of the robot together."""
+        return tuple(contact for contact in self.contacts if isinstance(contact, LoopClosure))
+
+    @property
+    def touching(self) -> tuple[Contact, ...]:
+        """The other contacts: those with surfaces in the world."""
+        return tuple(contact for contact in self.contacts if not isinstance(contact, LoopClosure))
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -146,6 +192,8 @@ class MechanicalSystem(Summary):
         A, b, _ = self._constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         for index, contact in enumerate(self.contacts):
+            if isinstance(contact, LoopClosure):  # in a plane some of its rows constrain nothing
+                size[..., index] = 1.0 + 0.0 * size[..., index]
             if contact.switch is not None:  # where it does not act it needs no direction
                 size[..., index] += 1.0 - (u[..., self.inputs.index(contact.switch)] > 0.5).to(size.dtype)
         bad = torch.nonzero(~(size > 1e-12))
@@ -223,6 +271,7 @@ class MechanicalSystem(Summary):
                     **{"frame": contact.frame, "point": list(contact.point)},
                     **({} if contact.switch is None else {"switch": contact.switch}),
                     "surface": surface_to_dict(contact.surface),
+                    **(contact.second() if isinstance(contact, LoopClosure) else {}),
                 }
                 for contact in self.contacts
             ],
@@ -251,11 +300,12 @@ class MechanicalSystem(Summary):
             robot = Robot.from_stored(stored)
             if contacts is None:
                 contacts = [
-                    Contact(
+                    (LoopClosure if "second_frame" in entry else Contact)(
                         entry["frame"],
                         tuple(entry["point"]),
                         object_from_dict("surface", SURFACES, entry["surface"]),
                         entry.get("switch"),
+                        **{name: entry[name] for name in SECOND if name in entry},
                     )
                     for entry in stored["contacts"]
                 ]
