@@ -67,10 +67,10 @@ def test_accelerations_and_forces_are_those_of_pinocchio(name, tmp_path):
         settings = pin.ProximalSettings(1e-14, 1e-12, 100)
         numbers = (x[k].numpy()[order] for x in (q, v, u))
         expected = pin.constraintDynamics(model, data, *numbers, models, datas, settings)
-        np.testing.assert_allclose(a[k].numpy()[order], expected, rtol=1e-8, atol=1e-8 * abs(expected).max())
+        np.testing.assert_allclose(a[k].numpy()[order], expected, rtol=1e-9, atol=1e-9 * abs(expected).max())
         if name == "connect":  # three independent rows: the force is unique
             world = data.oMi[ends[0]].rotation @ ends[1].rotation @ datas[0].contact_force.linear
-            np.testing.assert_allclose(force[k], world, rtol=1e-7, atol=1e-7 * abs(world).max())
+            np.testing.assert_allclose(force[k], world, rtol=1e-9, atol=1e-9 * abs(world).max())
 
 
 @pytest.mark.parametrize("name", CLOSED)
