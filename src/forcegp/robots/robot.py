@@ -1,6 +1,7 @@
 """`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, UnstatedBase, usable_arguments
+from forcegp.errors import InvalidInput, RobotFileWarning, UnstatedBase, usable_arguments
 from forcegp.robots.arguments import (
     Inertials,
     JointValues,
@@ -28,12 +29,20 @@ from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import free_base, lay_out
 from forcegp.robots.mjcf import is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription
+from forcegp.robots.mjcf_writer import MjcfWriter
 from forcegp.robots.problems import Problems
 from forcegp.robots.robot_file import before_the_end, read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.tree import bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import InertiaChoice, read_text, replace_inertial, with_chosen_inertias, with_root
+from forcegp.robots.urdf_file import (
+    InertiaChoice,
+    read_text,
+    replace_inertial,
+    with_chosen_inertias,
+    with_root,
+    write_text,
+)
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -314,6 +323,27 @@ class Robot(RobotStructure):
         text = with_comment(self.urdf_text, armature, source=str(path or self.source), stacklevel=3)
         if path is not None:
             write_robot_file(Path(path), text, armature)
+        return text
+
+    @usable_arguments("Robot.to_mjcf")
+    def to_mjcf(self, path: str | Path | None = None) -> str:
+        """MJCF text, for MuJoCo, with rotor inertias, damping and dry friction; written to ``path`` if given.
+
+        Every link is a body without shape, and every joint of one degree of freedom has a motor. A planar base becomes
+        two slides and a hinge; MuJoCo has no limits of velocity. A RobotFileWarning names frames that move without
+        mass, which are left out.
+
+        Raises :class:`~forcegp.errors.RobotModelError` for what MuJoCo cannot hold, such as a last link without mass.
+        """
+        writer = MjcfWriter(self)
+        text = writer.text()
+        if writer.left_out:
+            left_out = (
+                f"{self.source}: MJCF has no frames that move without mass; left out: {', '.join(writer.left_out)}."
+            )
+            warnings.warn(left_out, RobotFileWarning, stacklevel=3)
+        if path is not None:
+            write_text(text, Path(path))
         return text
 
     def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:
