@@ -72,7 +72,9 @@ class Evaluate(Command):
         dataset = forcegp.Dataset.load(self.data).rows(slice(None, None, self.every))
         posterior = carried_over(terminal, posterior, dataset, self.system)
         if self.contact:
-            posterior = posterior.with_system(posterior.system.with_contacts(parse_contacts(self.contact)))
+            posterior = posterior.with_system(
+                posterior.system.with_contacts([*parse_contacts(self.contact), *posterior.system.loops])
+            )
         evaluation = evaluate_with_progress(terminal, posterior, dataset)
         forces = forcegp.evaluation.force_scores(posterior, dataset)
         rests_on_prior = forcegp.evaluation.normal_force_rests_on_prior(posterior)

@@ -24,6 +24,8 @@ from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.robots.mjcf import is_mjcf
+from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
 
@@ -99,6 +101,20 @@ class MechanicalSystem(Summary):
             )
         ]
         return cls(robot, tuple(contacts), known_forces, baumgarte)
+
+    def to_mjcf(self, path: str | Path | None = None) -> str:
+        """`Robot.to_mjcf` with its closed loops as equalities, which MuJoCo holds softly; contacts are left out."""
+        ends: dict[Any, bool] = {}
+        for loop in self.loops:
+            key = (loop.frame, loop.second_frame), (loop.point, loop.second_point)
+            ends[key] = ends.get(key, False) or loop.turning
+        named = enumerate(ends.items(), 1)
+        return self.robot.to_mjcf(path, [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named])
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> "MechanicalSystem":
+        """The robot of a file with its closed loops, if it is MJCF; `options` are those of `Robot.from_file`."""
+        return cls.from_mjcf(path, **options) if is_mjcf(read_text(path)) else cls(Robot.from_urdf(path, **options))
 
     @override
     def facts(self) -> dict[str, object]:

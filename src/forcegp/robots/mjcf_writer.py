@@ -16,6 +16,7 @@ from forcegp.robots.inertia import inverse, rotation_about, transform
 from forcegp.robots.layout import BASE, OUTSIDE
 from forcegp.robots.manifold import MOTIONS
 from forcegp.robots.mimic import followed
+from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.problems import Problems
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import JointDescription, free_joint
@@ -36,7 +37,7 @@ class _Axis(NamedTuple):
 class MjcfWriter:
     """The text of one robot; `left_out` are frames that it lacks."""
 
-    def __init__(self, robot: RobotStructure) -> None:
+    def __init__(self, robot: RobotStructure, loops: Sequence[LoopDescription] = ()) -> None:
         self.robot, description = robot, robot.description
         self.held, _ = followed(description, robot.locked, Problems(robot.source))
         self.groups = {group.name: group for group in robot.layout.groups}
@@ -47,6 +48,15 @@ class MjcfWriter:
         self.rotors = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
         self.lines: list[str] = []
         self.left_out: list[str] = []
+        self.sites: dict[str, list[str]] = {}
+        self.equalities = self._couplings()
+        for loop in loops:  # sites: the anchors of bodies would be taken from the posture at q = 0
+            for end, link, point in zip("12", loop.frames, loop.points, strict=True):
+                name = quoteattr(f"{loop.name}_{end}")
+                self.sites.setdefault(link, []).append(f'<site name={name} pos="{_numbers(point)}"/>')
+            ends = " ".join(f"site{end}={quoteattr(f'{loop.name}_{end}')}" for end in "12")
+            tag = "weld" if loop.turning else "connect"
+            self.equalities.append(f"    <{tag} name={quoteattr(loop.name)} {ends}/>")
 
     def text(self) -> str:
         """The whole file."""
@@ -54,6 +64,7 @@ class MjcfWriter:
         if BASE in self.groups and self.groups[BASE].kind == robot.base and BASE not in self._names():
             self._chain(free_joint(BASE, robot.base, OUTSIDE, root), np.eye(4), 2)
         elif root == "world" and not self._mass(root):
+            self.lines += [f"    {site}" for site in self.sites.get(root, ())]
             self._below(root, 2)
         else:
             self._body(root, np.eye(4), [], 2)
@@ -66,7 +77,7 @@ class MjcfWriter:
                 "  <worldbody>",
                 *self.lines,
                 "  </worldbody>",
-                *_block("equality", self._couplings()),
+                *_block("equality", self.equalities),
                 *_block("actuator", motors),
                 "</mujoco>\n",
             ]
@@ -89,6 +100,7 @@ class MjcfWriter:
         inertial = self.robot.description.links[link]
         if inertial is not None and inertial.mass > 0.0:
             self.lines.append(f"{space}  {_inertial(inertial.mass, inertial.center_of_mass, inertial.inertia)}")
+        self.lines += [f"{space}  {site}" for site in self.sites.get(link, ())]
         self._below(link, depth + 1)
         self.lines.append(f"{space}</body>")
 

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -326,16 +326,16 @@ class Robot(RobotStructure):
         return text
 
     @usable_arguments("Robot.to_mjcf")
-    def to_mjcf(self, path: str | Path | None = None) -> str:
+    def to_mjcf(self, path: str | Path | None = None, loops: Sequence[LoopDescription] = ()) -> str:
         """MJCF text, for MuJoCo, with rotor inertias, damping and dry friction; written to ``path`` if given.
 
         Every link is a body without shape, and every joint of one degree of freedom has a motor. A planar base becomes
-        two slides and a hinge; MuJoCo has no limits of velocity. A RobotFileWarning names frames that move without
-        mass, which are left out.
+        two slides and a hinge; MuJoCo has no limits of velocity. ``loops`` are closed by equalities. A RobotFileWarning
+        names frames that move without mass, which are left out.
 
         Raises :class:`~forcegp.errors.RobotModelError` for what MuJoCo cannot hold, such as a last link without mass.
         """
-        writer = MjcfWriter(self)
+        writer = MjcfWriter(self, loops)
         text = writer.text()
         if writer.left_out:
             left_out = (
