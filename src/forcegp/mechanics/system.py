@@ -90,7 +90,7 @@ class MechanicalSystem(Summary):
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
         enter as known forces only where listed.
         """
-        robot, found = Robot.with_loops(read_text(path), str(path), Path(path).parent, loops=True, **options)
+        robot, found = Robot.with_loops(read_text(path), str(path), Path(path), loops=True, **options)
         contacts = [
             contact
             for loop in found

@@ -11,6 +11,7 @@ What changes accelerations and has no place in a robot (springs, tendons, gains 
 
 import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +35,14 @@ def is_mjcf(text: str) -> bool:
     return re.sub(r"<!--.*?-->|<\?.*?\?>|\ufeff", "", text, flags=re.DOTALL).lstrip().startswith("<mujoco")
 
 
-def translate(text: str, folder: Path | None, nearest: bool, loops: bool, problems: Problems) -> Translation:
-    """The robot of MJCF text; ``folder`` is where its files lie.
+def translate(text: str, path: Path | None, nearest: bool, loops: bool, problems: Problems) -> Translation:
+    """The robot of MJCF text; ``path`` is its file, if there is one: others lie beside it.
 
     ``problems`` collects impossible inertias, replaced where ``nearest`` is asked for, and what is left out; closed
     loops are, unless ``loops``. Raises MalformedMjcf, MissingExtra, and the errors of XML text.
     """
     included: dict[str, bytes] = {}
-    _require_bounded(text, folder, problems.source, included)
+    _require_bounded(text, [] if path is None else [path.parent], problems.source, included)
     try:
         import mujoco
     except ImportError:
@@ -49,8 +50,11 @@ def translate(text: str, folder: Path | None, nearest: bool, loops: bool, proble
     made: Any = mujoco
     needed: list[str] = []
     try:
-        spec = made.MjSpec.from_string(text, include=included)
-        spec.modelfiledir = "" if folder is None else str(folder)
+        if path is not None and path.suffix == ".xml":  # no other suffix is taken
+            spec = made.MjSpec.from_file(str(path))
+        else:
+            spec = made.MjSpec.from_string(text, include=included)
+            spec.modelfiledir = "" if path is None else str(path.parent)
         needed = _without_appearance(made, spec)
         _repair(spec, nearest, problems)
         with warnings.catch_warnings(record=True) as warned:
@@ -59,14 +63,14 @@ def translate(text: str, folder: Path | None, nearest: bool, loops: bool, proble
     except (ValueError, TypeError, RuntimeError, IndexError, made.FatalError) as error:
         reason = " ".join(str(error).removeprefix("Error: ").split())
         missing = needed and any(word in reason for word in ("file", "mesh", "resource"))
-        advice = f"; the mass of {', '.join(needed)} comes from meshes: give an <inertial>" if missing else ""
+        advice = f"; the mass of {', '.join(needed[:4])} comes from meshes: give an <inertial>" if missing else ""
         raise MalformedMjcf(f"{problems.source}: MuJoCo refuses it ({reason}){advice}; correct that place.") from None
     for warning in warned:
         problems.note("MuJoCo warns", str(warning.message))
     return CompiledModel(made, model, spec.modelname or "robot", loops, problems).translation()
 
 
-def _require_bounded(text: str, folder: Path | None, source: str, included: dict[str, bytes]) -> None:
+def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:
     """Refuse files that exhaust memory or stack of MuJoCo's reader; ``included`` receives the files that they name."""
     root = parse_xml(text, source)
     count, deepest = 0, 0
@@ -85,11 +89,12 @@ def _require_bounded(text: str, folder: Path | None, source: str, included: dict
     for name in (element.get("file", "") for element in root.iter("include")):
         if name in included:
             continue
-        if folder is None or not (folder / name).is_file():
+        found = next((folder / name for folder in folders if (folder / name).is_file()), None)
+        if found is None:
             raise UnreadableRobotFile(f"{source}: includes {name!r}, which is not there; give the file beside it.")
-        inner = read_text(folder / name)
+        inner = read_text(found)
         included[name] = inner.encode()
-        _require_bounded(inner, folder, str(folder / name), included)
+        _require_bounded(inner, [*folders, found.parent], str(found), included)
 
 
 def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
@@ -109,7 +114,7 @@ def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
             geom.size, geom.mass = [0.01, 0.0, 0.0], 0.0
         elif geom.meshname:
             meshes.add(geom.meshname)
-            bodies.append(geom.parent.name)
+            bodies.append(geom.parent.name or "a body without name")
     unused = [mesh for mesh in spec.meshes if mesh.name not in meshes] if not len(spec.flexes) else []
     for element in (*unused, *spec.materials, *spec.textures, *spec.hfields):
         spec.delete(element)

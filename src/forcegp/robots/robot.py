@@ -146,7 +146,7 @@ class Robot(RobotStructure):
         Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
         :class:`~forcegp.errors.MissingExtra` without the package mujoco.
         """
-        return cls.with_loops(read_text(path), str(path), Path(path).parent, **options)[0]
+        return cls.with_loops(read_text(path), str(path), Path(path), **options)[0]
 
     @classmethod
     @usable_arguments("Robot.from_mjcf_text")
@@ -164,7 +164,7 @@ class Robot(RobotStructure):
         cls,
         text: str,
         source: str,
-        folder: Path | None,
+        path: Path | None,
         *,
         gravity: Vector | None = None,
         armature: Vector | Mapping[str, float | int] | None = None,
@@ -177,7 +177,7 @@ class Robot(RobotStructure):
         """The robot of MJCF text and its closed loops, which are noted as left out unless ``loops``."""
         given = {"locked": locked, "inertias": inertias, "base": base}
         problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
-        found = translate(text, folder, inertias == "nearest", loops, problems)
+        found = translate(text, path, inertias == "nearest", loops, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
         return cls._made(found.urdf, problems, gravity, armature, found.armature), found.loops
