@@ -152,6 +152,12 @@ BAD = {
     "no XML": ("<mujoco", MalformedUrdf, "not well-formed"),
     "entities": ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco/>', UnsafeXml, "DTD"),
     "copies": (f"<mujoco><worldbody>{BOMB}</worldbody></mujoco>", MalformedMjcf, "copies included"),
+    "points": (
+        '<mujoco><asset><mesh name="m" builtin="supersphere" params="2e4 1 1"/></asset></mujoco>',
+        MalformedMjcf,
+        "points",
+    ),
+    "field": ('<mujoco><asset><hfield name="h" nrow="60000" ncol="60000"/></asset></mujoco>', MalformedMjcf, "points"),
     "depth": (
         f"<mujoco><worldbody>{'<body>' * 9000}{'</body>' * 9000}</worldbody></mujoco>",
         MalformedMjcf,

@@ -11,9 +11,10 @@ What changes accelerations and has no place in a robot (springs, tendons, gains 
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -26,8 +27,10 @@ from forcegp.robots.xml_text import MOST_TAGS, parse_xml
 
 DEEPEST = 300
 """Levels of elements: MuJoCo's reader calls itself for each."""
-COPIED = ("replicate", "composite", "flexcomp")
-"""Elements of which `count` copies are made."""
+COPIED = {"replicate": ("count",), "composite": ("count",), "flexcomp": ("count",)}
+SIZED = {"hfield": ("nrow", "ncol"), "mesh": ("params", "params")}
+MOST_POINTS = 100_000_000
+"""MuJoCo's reader makes copies and points at once, and hangs at the next file after it ran out of memory."""
 
 
 def is_mjcf(text: str) -> bool:
@@ -49,6 +52,8 @@ def translate(text: str, path: Path | None, nearest: bool, loops: bool, problems
         raise MissingExtra(f"{problems.source}: MJCF needs MuJoCo: pip install 'forcegp[mujoco]'.") from None
     made: Any = mujoco
     needed: list[str] = []
+    before, noted = made.get_mju_user_warning(), []
+    made.set_mju_user_warning(noted.append)  # otherwise they go into a file in the current folder
     try:
         if path is not None and path.suffix == ".xml":  # no other suffix is taken
             spec = made.MjSpec.from_file(str(path))
@@ -65,25 +70,27 @@ def translate(text: str, path: Path | None, nearest: bool, loops: bool, problems
         missing = needed and any(word in reason for word in ("file", "mesh", "resource"))
         advice = f"; the mass of {', '.join(needed[:4])} comes from meshes: give an <inertial>" if missing else ""
         raise MalformedMjcf(f"{problems.source}: MuJoCo refuses it ({reason}){advice}; correct that place.") from None
-    for warning in warned:
-        problems.note("MuJoCo warns", str(warning.message))
+    finally:
+        made.set_mju_user_warning(before)
+    for warning in dict.fromkeys((*noted, *(str(each.message) for each in warned))):
+        problems.note("MuJoCo warns", warning)
     return CompiledModel(made, model, spec.modelname or "robot", loops, problems).translation()
 
 
 def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:
     """Refuse files that exhaust memory or stack of MuJoCo's reader; ``included`` receives the files that they name."""
     root = parse_xml(text, source)
-    count, deepest = 0, 0
-    stack = [(root, 1, 1)]
+    count, deepest = 0.0, 0
+    stack = [(root, 1, 1.0)]
     while stack:
         element, depth, times = stack.pop()
         count, deepest = count + times, max(deepest, depth)
-        for copies in element.get("count", "1").split() if element.tag in COPIED else ():
-            times *= max(1, int(copies)) if copies.isdecimal() and len(copies) < 10 else MOST_TAGS
-        if count + times > MOST_TAGS or deepest > DEEPEST:
+        points = _product(element, SIZED)
+        times *= _product(element, COPIED)
+        if count + times > MOST_TAGS or points > MOST_POINTS or deepest > DEEPEST:
             raise MalformedMjcf(
-                f"{source}: holds more than {MOST_TAGS} elements, copies included, or more than {DEEPEST} levels; give "
-                "the file of one robot."
+                f"{source}: holds more than {MOST_TAGS} elements, copies included, {MOST_POINTS} points of a shape or "
+                f"{DEEPEST} levels; give the file of one robot."
             )
         stack += [(child, depth + 1, times) for child in element]
     for name in (element.get("file", "") for element in root.iter("include")):
@@ -97,6 +104,17 @@ def _require_bounded(text: str, folders: Sequence[Path], source: str, included: 
         _require_bounded(inner, [*folders, found.parent], str(found), included)
 
 
+def _product(element: Element, names: Mapping[str, Sequence[str]]) -> float:
+    """Of the numbers above 1 in attributes of these names."""
+    product = 1.0
+    for word in " ".join(element.get(name, "") for name in names.get(element.tag, ())).split():
+        try:
+            product *= max(1.0, float(word))
+        except ValueError:  # the kind of a mesh
+            continue
+    return product
+
+
 def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
     """Remove what changes no motion, so that no file of it is needed; the bodies whose mass comes from meshes."""
     for name in ("keys", "sensors", "skins", "cameras", "lights", "numerics", "texts", "tuples"):
@@ -106,7 +124,7 @@ def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
         owner.material = ""
     for name in (name for name in dir(spec) if name.startswith("nuser_")):
         setattr(spec, name, -1)
-    spec.compiler.fusestatic = False
+    spec.memory, spec.nuserdata, spec.compiler.fusestatic = -1, 0, False
     meshes, bodies = set(), []
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD or (geom.meshname and not _has_mass(mujoco, spec, geom)):
