@@ -110,6 +110,8 @@ def test_mjcf_is_taken_with_its_loops_and_written_by_extension(forcegp, tmp_path
     assert (again["loops"], again["written"]) == ([["coupler", "rocker"]], str(tmp_path / "same.urdf"))
     assert Robot.from_file(tmp_path / "same.urdf").nv == 3
     log = tmp_path / "log.csv"
+    refused = forcegp("robot", tmp_path / "loop.xml", "--root", "world")
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)
     header = ",".join(["t", *(f"{x}{k}" for x in "qvu" for k in "123")])
     log.write_text("\n".join([header, *(f"{0.01 * row}" + ",0" * 9 for row in range(9))]))
     columns = [word for x in "qvu" for word in (f"--{x}", x + "{1..3}")]

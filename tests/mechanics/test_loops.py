@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from tests.robots.mjcf_models import BAR, FOUR_BAR
+from tests.robots.mjcf_models import BAR, FOUR_BAR, QUADROTOR
 from tests.robots.mujoco_oracle import MujocoOracle
 
 from forcegp.errors import ContactError, InvalidInput
@@ -187,3 +187,19 @@ def test_states_that_do_not_fit_and_frames_of_one_body_are_refused(tmp_path):
         LoopClosure("crank", (0.0, 0.0, 0.0), Held((0, 0, 1)), None, "rocker", (0, 0))  # type: ignore[arg-type]
     assert system.touching == ()
     assert len(system.with_contacts([*system.contacts, Contact("crank", (0, 0, 1), Plane((0, 0, 1), 0))]).loops) == 3
+
+
+def test_motors_at_sites_of_a_free_body_are_inputs(tmp_path):
+    """A quadrotor whose second rotor sits on an arm of its own, tilted."""
+    tilted = '<body pos="-.1 .1 0" euler="20 5 0"><site name="r2"/></body>'
+    text = QUADROTOR.replace('<site name="r2" pos="-.1 .1 0"/>', tilted)
+    system, model = system_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
+    robot, oracle = system.robot, MujocoOracle(model)
+    assert (system.inputs, robot.nv) == (("1", "2", "3", "4"), 6)
+    generator = torch.Generator().manual_seed(0)
+    q, v = robot.random(generator, 1), torch.randn(1, 6, dtype=torch.float64, generator=generator)
+    u = torch.tensor([[1.0, 3.0, -2.0, 0.5]], dtype=torch.float64)
+    oracle.data.ctrl[:] = u[0].numpy()
+    oracle.at(q[0].numpy(), v[0].numpy())
+    np.testing.assert_allclose(system.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
+    assert MechanicalSystem.from_json(system.to_json()).inputs == system.inputs

@@ -111,14 +111,14 @@ class RobotOptions(RobotFileOptions):
     def with_loops(
         self, robot: forcegp.Robot, system: forcegp.MechanicalSystem | None = None
     ) -> forcegp.MechanicalSystem:
-        """The robot with the contacts and forces of a system, if there is one, and with closed loops of the file."""
-        system = forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        """The robot with contacts and forces of a system, or of its own file, and with closed loops of the file."""
         if self.robot is None:
-            return system
+            return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RobotFileWarning)  # they were given when the robot was read
-            loops = self._in_file(self._changes()).loops
-        return system.with_contacts((*system.touching, *loops)) if loops else system
+            own = self._in_file(self._changes())
+        system = (own if system is None else system).with_robot(robot)
+        return system.with_contacts((*system.touching, *own.loops)) if own.loops else system
 
     def _in_file(self, changes: dict[str, Any]) -> forcegp.MechanicalSystem:
         assert self.robot is not None, "checked by the caller"

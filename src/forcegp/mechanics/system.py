@@ -78,28 +78,36 @@ class MechanicalSystem(Summary):
                 )
 
     @classmethod
+    @usable_arguments("MechanicalSystem.from_mjcf")
     def from_mjcf(
         cls,
         path: str | Path,
-        known_forces: tuple[KnownForce, ...] = (Actuation(), RigidBodyBias()),
+        known_forces: tuple[KnownForce, ...] | None = None,
         baumgarte: Baumgarte | None = None,
         **options: Any,
     ) -> "MechanicalSystem":
         """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
-        enter as known forces only where listed.
+        enter as known forces only where listed. By default u are joint forces; where motors act at sites of a free
+        body, such as rotors, u are the inputs of all motors.
         """
-        robot, found = Robot.with_loops(read_text(path), str(path), Path(path), loops=True, **options)
+        robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
         contacts = [
             contact
-            for loop in found
+            for loop in found.loops
             for contact in (
                 loop_frame(*loop.frames)
                 if loop.turning
                 else loop_point(loop.frames[0], loop.points[0], loop.frames[1], loop.points[1])
             )
         ]
+        if known_forces is None:
+            known_forces = (Actuation(), RigidBodyBias())
+            if found.thrusters and robot.base != "fixed":
+                names, columns = zip(*found.thrusters, strict=True)
+                matrix = [[column.get(joint, 0.0) for column in columns] for joint in robot.joint_names]
+                known_forces = (Actuation(matrix, names), RigidBodyBias())
         return cls(robot, tuple(contacts), known_forces, baumgarte)
 
     def to_mjcf(self, path: str | Path | None = None) -> str:

@@ -38,11 +38,11 @@ def is_mjcf(text: str) -> bool:
     return re.sub(r"<!--.*?-->|<\?.*?\?>|\ufeff", "", text, flags=re.DOTALL).lstrip().startswith("<mujoco")
 
 
-def translate(text: str, path: Path | None, nearest: bool, loops: bool, problems: Problems) -> Translation:
+def translate(text: str, path: Path | None, nearest: bool, for_system: bool, problems: Problems) -> Translation:
     """The robot of MJCF text; ``path`` is its file, if there is one: others lie beside it.
 
     ``problems`` collects impossible inertias, replaced where ``nearest`` is asked for, and what is left out; closed
-    loops are, unless ``loops``. Raises MalformedMjcf, MissingExtra, and the errors of XML text.
+    loops are, unless ``for_system``. Raises MalformedMjcf, MissingExtra, and the errors of XML text.
     """
     included: dict[str, bytes] = {}
     _require_bounded(text, [] if path is None else [path.parent], problems.source, included)
@@ -74,7 +74,7 @@ def translate(text: str, path: Path | None, nearest: bool, loops: bool, problems
         made.set_mju_user_warning(before)
     for warning in dict.fromkeys((*noted, *(str(each.message) for each in warned))):
         problems.note("MuJoCo warns", warning)
-    return CompiledModel(made, model, spec.modelname or "robot", loops, problems).translation()
+    return CompiledModel(made, model, spec.modelname or "robot", for_system, problems).translation()
 
 
 def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:

@@ -35,13 +35,15 @@ class Translation:
     armature: dict[str, float]
     locked: dict[str, float]
     loops: tuple[LoopDescription, ...] = ()
+    thrusters: tuple[tuple[str, dict[str, float]], ...] = ()
+    """The motors, if some of them act on a free body: name, and joint forces per unit of input by joint name."""
 
 
 class CompiledModel:
     """A compiled model, and the URDF elements that are made of it."""
 
-    def __init__(self, mujoco: Any, model: Any, name: str, loops: bool, problems: Problems) -> None:
-        self.mujoco, self.model, self.with_loops, self.problems = mujoco, model, loops, problems
+    def __init__(self, mujoco: Any, model: Any, name: str, for_system: bool, problems: Problems) -> None:
+        self.mujoco, self.model, self.for_system, self.problems = mujoco, model, for_system, problems
         self.name = name
         self.elements: list[str] = []
         self.links: set[str] = set()
@@ -68,12 +70,13 @@ class CompiledModel:
                 frame = self._named(name, self.links)
                 self._fixed(body, frame, self._pose(self.model.site_pos[site], self.model.site_quat[site]))
         loops = tuple(self._loops())
-        self._note_losses()
+        thrusters = self._thrusters() if self.for_system else ()
+        self._note_losses(bool(thrusters))
         disabled = self.model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_GRAVITY)
         gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)
         text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
         locked = {self.joints[joint]: value for joint, value in self.locked.items()}
-        return Translation(text, gravity, self._rotor_inertias(), locked, loops)
+        return Translation(text, gravity, self._rotor_inertias(), locked, loops, thrusters)
 
     def _body_of(self, joint: int) -> str:
         return self.bodies[self.model.jnt_bodyid[joint]]
@@ -193,6 +196,34 @@ class CompiledModel:
         kinds = (model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator])
         return not any(kinds)
 
+    def _thrusters(self) -> tuple[tuple[str, dict[str, float]], ...]:
+        """Motors whose joint forces no posture changes, where some act at sites of a free body; else none."""
+        model, found, taken, at_sites = self.model, [], set[str](), False
+        for k in range(model.nu):
+            gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])
+            joints = [joint for joint in range(model.njnt) if k in self._actuators_of(joint)]
+            if not self._is_motor(k):
+                return ()
+            if joints and model.jnt_type[joints[0]] >= 2 and joints[0] not in {*self.couplings, *self.locked}:
+                column = {self.joints[joints[0]]: gain * float(gear[0])}
+            elif model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_SITE and model.actuator_trnid[k][1] < 0:
+                site = model.actuator_trnid[k][0]
+                body, pose = model.site_bodyid[site], self._pose(model.site_pos[site], model.site_quat[site])
+                while body and not model.body_jntnum[body]:
+                    pose = self._pose(model.body_pos[body], model.body_quat[body]) @ pose
+                    body = model.body_parentid[body]
+                first = model.body_jntadr[body]
+                if not body or model.jnt_type[first] != 0:
+                    return ()
+                force = pose[:3, :3] @ gear[:3]
+                wrench = [*force, *(pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force))]
+                names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
+                column, at_sites = dict(zip(names, (gain * float(x) for x in wrench), strict=True)), True
+            else:
+                return ()
+            found.append((self._named(model.actuator(k).name or f"actuator_{k + 1}", taken), column))
+        return tuple(found) if at_sites else ()
+
     def _couple(self) -> None:
         """Linear couplings of two joints, and joints that one holds."""
         model, kinds = self.model, self.mujoco.mjtEq
@@ -222,7 +253,7 @@ class CompiledModel:
             if not (weld or model.eq_type[k] == kinds.mjEQ_CONNECT) or not model.eq_active0[k]:
                 continue
             name, data = self._equality(k), model.eq_data[k]
-            if not self.with_loops:
+            if not self.for_system:
                 self._lose("closed loops (MechanicalSystem.from_mjcf has them)", name)
                 continue
             ends = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
@@ -282,7 +313,7 @@ class CompiledModel:
     def _lose(self, what: str, where: str) -> None:
         self.problems.ignore(f"left out: {what}", where, what)
 
-    def _note_losses(self) -> None:
+    def _note_losses(self, thrusters: bool) -> None:
         """Note what acts on the joints in MuJoCo and not here."""
         model = self.model
 
@@ -305,7 +336,7 @@ class CompiledModel:
         for k in range(model.nu):
             if not self._is_motor(k):
                 self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
-            elif not any(k in self._actuators_of(joint) for joint in range(model.njnt)):
+            elif not thrusters and not any(k in self._actuators_of(joint) for joint in range(model.njnt)):
                 self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")
         if model.nflex:
             self._lose("forces of deformable bodies", f"{model.nflex} <flex>")

@@ -28,7 +28,7 @@ from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import free_base, lay_out
 from forcegp.robots.mjcf import is_mjcf, translate
-from forcegp.robots.mjcf_model import LoopDescription
+from forcegp.robots.mjcf_model import LoopDescription, Translation
 from forcegp.robots.mjcf_writer import MjcfWriter
 from forcegp.robots.problems import Problems
 from forcegp.robots.robot_file import before_the_end, read_armature, read_robot_file, with_comment, write_robot_file
@@ -146,13 +146,13 @@ class Robot(RobotStructure):
         Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
         :class:`~forcegp.errors.MissingExtra` without the package mujoco.
         """
-        return cls.with_loops(read_text(path), str(path), Path(path), **options)[0]
+        return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
 
     @classmethod
     @usable_arguments("Robot.from_mjcf_text")
     def from_mjcf_text(cls, text: str, *, source: str = "<text>", **options: Any) -> "Robot":
         """As :meth:`from_mjcf`, from text that names no other files; ``source`` is what error messages call it."""
-        return cls.with_loops(text, source, None, **options)[0]
+        return cls.read_mjcf(text, source, None, **options)[0]
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> "Robot":
@@ -160,7 +160,7 @@ class Robot(RobotStructure):
         return (cls.from_mjcf if is_mjcf(read_text(path)) else cls.from_urdf)(path, **options)
 
     @classmethod
-    def with_loops(
+    def read_mjcf(
         cls,
         text: str,
         source: str,
@@ -172,15 +172,15 @@ class Robot(RobotStructure):
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
         strict: bool = False,
-        loops: bool = False,
-    ) -> "tuple[Robot, tuple[LoopDescription, ...]]":
-        """The robot of MJCF text and its closed loops, which are noted as left out unless ``loops``."""
+        for_system: bool = False,
+    ) -> "tuple[Robot, Translation]":
+        """The robot of MJCF text, and what a system takes from it, which is noted as left out unless ``for_system``."""
         given = {"locked": locked, "inertias": inertias, "base": base}
         problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
-        found = translate(text, path, inertias == "nearest", loops, problems)
+        found = translate(text, path, inertias == "nearest", for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
-        return cls._made(found.urdf, problems, gravity, armature, found.armature), found.loops
+        return cls._made(found.urdf, problems, gravity, armature, found.armature), found
 
     @classmethod
     def _made(
