@@ -23,7 +23,7 @@ class UnknownRow(InvalidInput, IndexError):
 class RobotModelError(ForceGPError):
     """The robot description cannot be used; subclasses say why.
 
-    `remedy` holds the arguments of `Robot.from_urdf` under which this file is taken, by name; empty where the file must
+    `remedy` holds the arguments of `Robot.from_file` under which this file is taken, by name; empty where the file must
     be corrected first. `problems` are all that were found.
     """
 
@@ -35,6 +35,10 @@ class RobotModelError(ForceGPError):
 
 class MalformedUrdf(RobotModelError):
     """Not well-formed XML, or XML that is not a URDF."""
+
+
+class MalformedMjcf(RobotModelError):
+    """A file that MuJoCo cannot read or compile, or that is larger than that of a robot."""
 
 
 class MissingElement(MalformedUrdf):

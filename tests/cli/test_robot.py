@@ -4,12 +4,13 @@ import json
 
 import pytest
 from PIL import Image
+from tests.robots.mjcf_models import FOUR_BAR
 from tests.robots.robot_models import CHAIN
 from tests.robots.test_base import LOOSE
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_remedies import MANY
 
-from forcegp import Robot
+from forcegp import Dataset, Robot
 from forcegp.cli.main import parse_arguments
 
 
@@ -97,3 +98,25 @@ def test_an_undefined_root_is_named(tmp_path, forcegp):
     path.write_text(CHAIN.replace('<link name="rail"/>', ""))
     assert "--root rail" in forcegp("robot", path).stderr
     assert forcegp("robot", path, "--root", "rail").returncode == 0
+
+
+def test_mjcf_is_taken_with_its_loops_and_written_by_extension(forcegp, tmp_path):
+    (tmp_path / "loop.xml").write_text(FOUR_BAR)
+    shown = forcegp("robot", tmp_path / "loop.xml", "--out", tmp_path / "same.mjcf")
+    assert (shown.returncode, "warning" in shown.stderr) == (0, False)
+    assert "closed loop: coupler and rocker are held together" in shown.stdout
+    again = json.loads(forcegp("robot", tmp_path / "same.mjcf", "--out", tmp_path / "same.urdf", "--json").stdout)
+    assert [joint["name"] for joint in again["joints"]] == ["crank", "coupler", "rocker"]
+    assert (again["loops"], again["written"]) == ([["coupler", "rocker"]], str(tmp_path / "same.urdf"))
+    assert Robot.from_file(tmp_path / "same.urdf").nv == 3
+    log = tmp_path / "log.csv"
+    refused = forcegp("robot", tmp_path / "loop.xml", "--root", "world")
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)
+    header = ",".join(["t", *(f"{x}{k}" for x in "qvu" for k in "123")])
+    log.write_text("\n".join([header, *(f"{0.01 * row}" + ",0" * 9 for row in range(9))]))
+    columns = [word for x in "qvu" for word in (f"--{x}", x + "{1..3}")]
+    made = forcegp(
+        "import", log, "--time", "t", *columns, "--robot", tmp_path / "loop.xml", "--out", tmp_path / "log.h5"
+    )
+    assert made.returncode == 0, made.stderr
+    assert len(Dataset.load(tmp_path / "log.h5").system.loops) == 3

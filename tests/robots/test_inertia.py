@@ -9,6 +9,7 @@ from torch.autograd import gradcheck
 
 from forcegp.errors import InvalidInput
 from forcegp.robots import parameters_from_physical, physical_from_parameters, pseudo_inertia_from_parameters
+from forcegp.robots.inertia import rotation_from_rpy, rpy_from_rotation
 
 values = st.floats(-3, 3)
 parameters = st.lists(values, min_size=10, max_size=10).map(lambda x: torch.tensor(x, dtype=torch.float64))
@@ -66,3 +67,10 @@ def test_flat_and_impossible_bodies_have_no_parameters(moments):
         parameters_from_physical(torch.ones((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64), inertia)
     with pytest.raises(InvalidInput, match="positive mass"):
         parameters_from_physical(-torch.ones((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64), inertia)
+
+
+@pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 2.5])
+def test_angles_of_a_rotation_give_it_back(pitch):
+    for roll, yaw in ((0.0, 0.0), (1.0, -2.0), (-3.0, 0.4)):
+        rotation = rotation_from_rpy((roll, pitch, yaw))
+        np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(rotation)), rotation, atol=1e-15)

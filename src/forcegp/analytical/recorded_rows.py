@@ -144,6 +144,8 @@ class RecordedRows:
 
 def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce, ...]:
     """Known forces not estimated, less the bias. Raises InvalidInput for systems without it, or in contact."""
+    if system.loops:
+        raise InvalidInput("forces inside closed loops are not measured; identify the robot by StructuredGP.identify.")
     if system.contacts:
         frames = ", ".join(contact.frame for contact in system.contacts)
         raise InvalidInput(

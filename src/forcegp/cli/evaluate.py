@@ -74,7 +74,9 @@ class Evaluate(Command):
         posterior, dataset = with_observed_wind(terminal, posterior, dataset)
         dataset = dataset.rows(slice(None, None, self.every))
         if self.contact:
-            posterior = posterior.with_system(posterior.system.with_contacts(parse_contacts(self.contact)))
+            posterior = posterior.with_system(
+                posterior.system.with_contacts([*parse_contacts(self.contact), *posterior.system.loops])
+            )
         evaluation = evaluate_with_progress(terminal, posterior, dataset)
         forces = forcegp.evaluation.force_scores(posterior, dataset)
         rests_on_prior = forcegp.evaluation.normal_force_rests_on_prior(posterior)

@@ -73,7 +73,7 @@ class Excite(RobotOptions):
         given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
         with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
             chosen = forcegp.excitation(
-                robot or forcegp.load_posterior(str(self.run_folder)),
+                self.with_loops(robot) if robot else forcegp.load_posterior(str(self.run_folder)),
                 **given,
                 margin=self.limit_share,
                 motions=self.tries,

@@ -133,7 +133,7 @@ class Import(PreparationOptions, RobotOptions):
         if found is not None:
             return found
         robot = self.chosen_robot()
-        return None if robot is None else forcegp.MechanicalSystem(robot)
+        return None if robot is None else self.with_loops(robot)
 
     def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ import forcegp.models
 from forcegp.atomic_files import require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import FileFormatError, InvalidInput, RobotFileWarning
 
 ROBOT_OPTIONS = ("robot", "inertias", "base", "root", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
@@ -46,7 +47,7 @@ class RobotFileOptions(Command):
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
 
     def _changes(self) -> dict[str, Any]:
-        """Arguments of `Robot.from_urdf` by name."""
+        """Arguments of `Robot.from_file` by name."""
         changes: dict[str, Any] = {name: value for name in ("base", "root") if (value := getattr(self, name))}
         if self.gravity is not None:
             words = self.gravity.split(",")
@@ -65,7 +66,7 @@ class RobotOptions(RobotFileOptions):
     """What every command asks that needs a robot."""
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
-    """Use this robot instead of the dataset's."""
+    """Use this robot (URDF or MJCF) instead of the dataset's."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
     """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
 
@@ -73,7 +74,7 @@ class RobotOptions(RobotFileOptions):
         """The robot that the options ask for, else `recorded`; what no URDF holds is as recorded.
 
         None where there is neither. Raises InvalidInput for options that contradict each other or make no sense, and
-        what `Robot.from_urdf` raises.
+        what `Robot.from_file` raises.
         """
         if self.identified is not None:
             system = self._identified_system()
@@ -105,15 +106,31 @@ class RobotOptions(RobotFileOptions):
             )
         if found is not None:
             return found
-        return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        return self.with_loops(robot, system)
+
+    def with_loops(
+        self, robot: forcegp.Robot, system: forcegp.MechanicalSystem | None = None
+    ) -> forcegp.MechanicalSystem:
+        """The robot with contacts and forces of a system, or of its own file, and with closed loops of the file."""
+        if self.robot is None:
+            return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RobotFileWarning)  # they were given when the robot was read
+            own = self._in_file(self._changes())
+        system = (own if system is None else system).with_robot(robot)
+        return system.with_contacts((*system.touching, *own.loops)) if own.loops else system
+
+    def _in_file(self, changes: dict[str, Any]) -> forcegp.MechanicalSystem:
+        assert self.robot is not None, "checked by the caller"
+        return forcegp.MechanicalSystem.from_file(self.robot, inertias=self.inertias, **changes)
 
     def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
-        """A robot from a URDF file, or from the recorded one's text, with what the options change."""
+        """A robot from its file, or from the recorded one's text, with what the options change."""
         if recorded is not None:
             kept = {"gravity": recorded.gravity.tolist(), "locked": recorded.locked, "base": recorded.base}
             changes = kept | changes
         if self.robot is not None:
-            robot = forcegp.Robot.from_urdf(self.robot, inertias=self.inertias, **changes)
+            robot = self._in_file(changes).robot
         else:
             assert recorded is not None, "checked by the caller"
             robot = forcegp.Robot.from_urdf_text(

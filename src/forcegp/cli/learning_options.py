@@ -209,7 +209,7 @@ class LearningOptions(BackendOptions, RobotOptions):
         contacts = parse_contacts(self.contact)
         system = self.chosen_system(dataset, self.data)
         if self.contact:
-            system = system.with_contacts(contacts)
+            system = system.with_contacts((*contacts, *system.loops))
         if self.known_force:
             for name in self.known_force:
                 require_known("force", name, "--known-force", KNOWN)

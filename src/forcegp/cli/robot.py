@@ -27,14 +27,15 @@ NONE = (math.inf, -math.inf)
 class Robot(RobotFileOptions):
     """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
-    Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, or a xacro
-    file where the package xacro is installed; meshes are not needed.
+    Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, MJCF where
+    the package mujoco is installed, or xacro where xacro is; meshes are not needed where masses are given.
 
     For example:
       forcegp robot arm.urdf
       forcegp robot dog.urdf --base floating
       forcegp robot arm.urdf --inertias nearest --lock finger=0 --out arm.png
       forcegp robot arm.urdf --browser
+      forcegp robot identified/identified.urdf --out arm.xml
     """
 
     interrupted = "the page is closed"
@@ -43,37 +44,53 @@ class Robot(RobotFileOptions):
     """The robot file."""
     strict: bool = False
     """Refuse what is ignored otherwise: a negative limit, a second axis, a missing name."""
-    out: Annotated[Path | None, unless_given("FILE.png", "no picture")] = None
-    """Draw the robot into this file."""
+    out: Annotated[Path | None, unless_given("FILE.png|xml|urdf", "no file")] = None
+    """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
     browser: bool = False
     """Show the robot in the browser, until Ctrl-C."""
     overwrite: bool = False
-    """Replace the picture."""
+    """Replace that file."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
         if self.out is not None:
-            png = lambda path: path.read_bytes().startswith(b"\x89PNG")  # noqa: E731
-            require_free_file(self.out, overwrite=self.overwrite, own=png, what="a PNG")
+            require_free_file(self.out, overwrite=self.overwrite, own=_own, what="a PNG or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
-            robot = forcegp.Robot.from_urdf(self.file, inertias=self.inertias, strict=self.strict, **self._changes())
+            options = {"inertias": self.inertias, "strict": self.strict, **self._changes()}
+            system = forcegp.MechanicalSystem.from_file(self.file, **options)
+            robot = system.robot
         repaired = [str(warning.message) for warning in caught]
         for text in repaired:
             terminal.warn(text)
         content = _content(robot) | {"file": str(self.file), "repaired": repaired}
+        content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in system.loops))
         terminal.show(*_shown(robot, content))
-        if self.out is not None or self.browser:
+        drawn = self.out
+        writers = {".xml": system.to_mjcf, ".mjcf": system.to_mjcf, ".urdf": robot.to_urdf}
+        if self.out is not None and self.out.suffix in writers:
+            writers[self.out.suffix](self.out)
+            content["written"], drawn = str(self.out), None
+            terminal.note(f"wrote {self.out}")
+            if system.loops and self.out.suffix == ".urdf":
+                terminal.warn("URDF has no closed loops: the file holds the open chain.")
+        if drawn is not None or self.browser:
             scene = forcegp.report.still_scene(robot, self.file)
             if scene.doubts:
                 terminal.note(f"{len(scene.doubts)} meshes are drawn as capsules, for example: {scene.doubts[0]}")
-            if self.out is not None:
-                forcegp.evaluation.save_figure(forcegp.report.robot_figure(scene), self.out)
-                content["picture"] = str(self.out)
-                terminal.note(f"picture: {self.out}")
+            if drawn is not None:
+                forcegp.evaluation.save_figure(forcegp.report.robot_figure(scene), drawn)
+                content["picture"] = str(drawn)
+                terminal.note(f"picture: {drawn}")
             if self.browser:
                 forcegp.report.serve(scene, ready=lambda url: terminal.note(f"open {url}; Ctrl-C ends it"))
         return content
+
+
+def _own(path: Path) -> bool:
+    """Whether it is a picture or a robot file."""
+    data = path.read_bytes()
+    return data.startswith(b"\x89PNG") or b"<mujoco" in data or b"<robot" in data
 
 
 def _content(robot: forcegp.Robot) -> dict[str, Any]:
@@ -116,4 +133,5 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     header |= {name: name for name in ("damping", "friction", "armature")}
     rows = [[each["name"], *(shown(each[key]) for key in header.values())] for each in content["joints"]]
     title = f"{robot.name}: {robot.nv} joints, {content['moving_mass']:.4g} kg that move; in rad or m, s, Nm or N"
-    return [tree, columns(title, ["joint", *header], rows, long_names=True)]
+    loops = [f"closed loop: {first} and {second} are held together" for first, second in content["loops"]]
+    return [tree, *loops, columns(title, ["joint", *header], rows, long_names=True)]

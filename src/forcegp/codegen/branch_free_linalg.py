@@ -23,9 +23,12 @@ class StraightLineAlgebra(TorchFunctionMode):
             return cholesky(*args)
         if func is torch.linalg.solve_triangular and not kwargs.get("upper", False) and kwargs.get("left", True):
             return solve_lower(*args)
-        if func is torch.linalg.pinv and args[0].shape[-2] <= args[0].shape[-1]:
-            default = max(args[0].shape[-2:]) * torch.finfo(args[0].dtype).eps  # that of torch.linalg.pinv
-            return pseudo_inverse(args[0], kwargs.get("rtol", default))
+        if func is torch.linalg.pinv:
+            rows, columns = args[0].shape[-2:]
+            tolerance = kwargs.get("rtol", max(rows, columns) * torch.finfo(args[0].dtype).eps)  # torch's own default
+            if rows > columns:
+                return pseudo_inverse(args[0].mT, tolerance).mT
+            return pseudo_inverse(args[0], tolerance)
         return func(*args, **kwargs)
 
 

@@ -29,9 +29,9 @@ class HybridForce(TrackingController):
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         self.system = predictor.posterior.system
-        if not self.system.contacts:
+        if not self.system.touching or self.system.loops:
             raise InvalidInput(
-                "HybridForce wants a force against a contact, and this model has none; name it in "
+                "HybridForce wants a force against a contact, and this model has none, or a closed loop; name it in "
                 "posterior.with_contacts([...]), or use ComputedTorque."
             )
         require_actuated(predictor.posterior)

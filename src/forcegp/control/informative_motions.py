@@ -314,6 +314,8 @@ def excitation(
     rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
     learned = model if isinstance(model, StructuredPosterior) and model.latent_names else None
     teaches = BaseParameters(system, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
+    if system.loops:
+        raise InvalidInput("motions are planned joint by joint, which would break the closed loops of this robot.")
     surfaces = (system if surfaces is None else system.with_contacts(surfaces)).contacts
     draft = Excitation(robot, start, bounds, seconds, teaches.torques, surfaces, clearance, Motion(*[start] * 5))
     best, least, size = draft.kept(0.0 * draft.random(rng)), np.inf, 0.3  # refuses the start

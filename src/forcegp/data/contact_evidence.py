@@ -42,7 +42,7 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
        rows that pass 1 and 2 than 1 mm or 20 robust standard deviations of them, whichever is more.
 
     Rows of an impact break 2 and do not count. A point at rest, or gliding along just above its surface, cannot be
-    distinguished from one in contact.
+    distinguished from one in contact. A closed loop acts in every row.
 
     Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
@@ -57,6 +57,9 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
         motions = _point_motions(dataset, system)
     columns = []
     for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
+        if isinstance(contact, forcegp.mechanics.LoopClosure):
+            columns.append(np.ones(len(dataset), dtype=bool))
+            continue
         columns.append(_acting(motion, recovery))
         if not columns[-1].any():
             raise ContactError(
@@ -172,10 +175,10 @@ def contact_doubts(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem 
     """What the rows of `dataset` contradict about the contacts of `system` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
-    say nothing. Not for contacts that hold several points of one body.
+    say nothing. Not for contacts that hold several points of one body, nor for robots with closed loops.
     """
     system = dataset.system if system is None else system
-    if system is None or len(dataset) < FEWEST_ROWS or not dataset.u.any():
+    if system is None or system.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
         return []
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
     with torch.no_grad():

@@ -32,7 +32,7 @@ RESIDUALS_OF_FORCES = 1000  # rows that show where the noise of forces begins
 
 def usual_prior(system: MechanicalSystem) -> str:
     """The prior that is taken without a look: friction of the joints, in contact forces at the tool."""
-    return (IN_CONTACT if system.contacts else FREE_MOTION)[0]
+    return (IN_CONTACT if system.touching else FREE_MOTION)[0]
 
 
 def choose_prior(
@@ -46,8 +46,8 @@ def choose_prior(
     functions of positions and torques only fit what filters leave. Where nothing can be compared (too few rows), the
     first one is taken as well, and the reason says so.
     """
-    names = IN_CONTACT if system.contacts else FREE_MOTION
-    where = "in contact" if system.contacts else "in free motion"
+    names = IN_CONTACT if system.touching else FREE_MOTION
+    where = "in contact" if system.touching else "in free motion"
     if any(isinstance(force, FRICTION) for force in system.known_forces):
         return names[0], f"{names[0]} {where}, beside the friction laws that the system lists"
     priors = {name: named_prior(name, system) for name in names}

@@ -119,11 +119,9 @@ class ConstraintManifold:
             return empty, kinematics.twists.new_zeros(*batch, 0, nv), empty
         values, rows, slopes = [], [], []
         for contact in contacts:
-            p = contact.position(kinematics)
-            gradient = contact.surface.gradient(p)
-            J = kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
-            values.append(contact.surface.value(p))
-            rows.append((gradient[..., None, :] @ J)[..., 0, :])
+            value, A, gradient, _ = contact.row(kinematics)
+            values.append(value)
+            rows.append(A)
             slopes.append(torch.linalg.vector_norm(gradient, dim=-1))
         return torch.stack(values, dim=-1), torch.stack(rows, dim=-2), torch.stack(slopes, dim=-1)
 

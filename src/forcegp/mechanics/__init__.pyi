@@ -2,6 +2,7 @@ from .gauss_principle import (
     AffineMap as AffineMap, Baumgarte as Baumgarte, ConstrainedDynamics as ConstrainedDynamics, Contact as Contact,
     State as State, fixed_frame as fixed_frame, fixed_point as fixed_point,
 )
+from .loops import LoopClosure as LoopClosure, loop_frame as loop_frame, loop_point as loop_point
 from .known_forces import (
     KNOWN_FORCES as KNOWN_FORCES, Actuation as Actuation, Armature as Armature, ConstantJointForce as
     ConstantJointForce, CoulombJointFriction as CoulombJointFriction, DirectionalJointFriction as

@@ -36,6 +36,15 @@ class Baumgarte:
                 raise InvalidInput(f"Baumgarte {name} is {value!r}; it must be a finite number >= 0 (and < 1e15).")
 
 
+class Row(NamedTuple):
+    """One constraint c(q) = 0 at a batch of states: c (...), A (..., nv), s_p (..., 3) and A' v (...) or None."""
+
+    value: Tensor
+    A: Tensor
+    gradient: Tensor
+    drift: Tensor | None
+
+
 @dataclass(frozen=True)
 class Contact:
     """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
@@ -72,26 +81,33 @@ class Contact:
         """c(q) = s(p(q)): 0 where the constraint holds."""
         return self.surface.value(self.position(kinematics))
 
+    def row(self, kinematics: Kinematics, v: Float[Tensor, "*batch nv"] | None = None) -> "Row":
+        """c(q), A = s_p J_p and s_p; with velocities also A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v)."""
+        p = self.position(kinematics)
+        J = kinematics.frame_jacobian(self.frame, self.point)[..., :3, :]
+        gradient = self.surface.gradient(p)
+        A = (gradient[..., None, :] @ J)[..., 0, :]
+        drift = None
+        if v is not None:
+            bias_acceleration = kinematics.frame_bias_acceleration(self.frame, self.point)[..., :3]
+            velocity = (J @ v[..., None])[..., 0]
+            curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
+            drift = (gradient * bias_acceleration).sum(-1) + curvature
+        return Row(self.surface.value(p), A, gradient, drift)
+
     def constraint(
         self, state: "State", baumgarte: Baumgarte | None
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
-        A = s_p J_p and b = -(s_p Jdot_p v + (J_p v)^T s_pp (J_p v)) - 2 zeta omega A v - omega^2 s: the second time
-        derivative of s(p(q)) = 0 (Rath et al. 2021, section 2).
+        b = -A' v - 2 zeta omega A v - omega^2 c: the second time derivative of s(p(q)) = 0 (Rath et al. 2021,
+        section 2).
         """
-        kinematics = state.kinematics
-        p = self.position(kinematics)
-        J = kinematics.frame_jacobian(self.frame, self.point)[..., :3, :]
-        bias_acceleration = kinematics.frame_bias_acceleration(self.frame, self.point)[..., :3]
-        gradient = self.surface.gradient(p)
-        A = (gradient[..., None, :] @ J)[..., 0, :]
-        velocity = (J @ state.v[..., None])[..., 0]
-        curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
-        b = -((gradient * bias_acceleration).sum(-1) + curvature)
+        c, A, gradient, drift = self.row(state.kinematics, state.v)
+        assert drift is not None, "velocities are given"
+        b = -drift
         if baumgarte is not None:
-            rate = (gradient * velocity).sum(-1)
-            b = b - 2.0 * baumgarte.zeta * baumgarte.omega * rate - baumgarte.omega**2 * self.surface.value(p)
+            b = b - 2.0 * baumgarte.zeta * baumgarte.omega * (A * state.v).sum(-1) - baumgarte.omega**2 * c
         if self.switch is None:
             return A, b, gradient
         acts = (state.u[..., state.inputs.index(self.switch)] > 0.5).to(b.dtype)

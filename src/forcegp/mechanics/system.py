@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,10 +20,14 @@ from forcegp.mechanics.known_forces import (
     RigidBodyBias,
     known_force_to_dict,
 )
+from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import ObservedWrench, Thrusters
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.robots.mjcf import is_mjcf
+from forcegp.robots.mjcf_model import LoopDescription
+from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
 
 FORMAT_VERSION = 1
@@ -63,18 +68,73 @@ class MechanicalSystem(Summary):
             raise InvalidInput(f"columns of u are called {', '.join(self.inputs)}; give each input its own name.")
         for contact in self.contacts:
             body, _ = self.robot.frame(contact.frame)
-            if body < 0:
+            if isinstance(contact, LoopClosure):
+                if body == self.robot.frame(contact.second_frame)[0]:
+                    raise ContactError(
+                        f"frames {contact.frame!r} and {contact.second_frame!r} of {self.robot.name} do not move "
+                        "against each other, so they close no loop; name frames of two bodies."
+                    )
+            elif body < 0:
                 raise ContactError(
                     f"frame {contact.frame!r} of {self.robot.name} is fixed in the world, so a contact there "
                     "constrains nothing; name a frame that moves."
                 )
 
+    @classmethod
+    @usable_arguments("MechanicalSystem.from_mjcf")
+    def from_mjcf(
+        cls,
+        path: str | Path,
+        known_forces: tuple[KnownForce, ...] | None = None,
+        baumgarte: Baumgarte | None = None,
+        **options: Any,
+    ) -> "MechanicalSystem":
+        """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
+
+        `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
+        enter as known forces only where listed. By default u are joint forces; where motors act at sites of a free
+        body, such as rotors, u are the inputs of all motors.
+        """
+        robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
+        contacts = [
+            contact
+            for loop in found.loops
+            for contact in (
+                loop_frame(*loop.frames)
+                if loop.turning
+                else loop_point(loop.frames[0], loop.points[0], loop.frames[1], loop.points[1])
+            )
+        ]
+        if known_forces is None:
+            known_forces = (Actuation(), RigidBodyBias())
+            if found.thrusters and robot.base != "fixed":
+                names, columns = zip(*found.thrusters, strict=True)
+                matrix = [[column.get(joint, 0.0) for column in columns] for joint in robot.joint_names]
+                known_forces = (Actuation(matrix, names), RigidBodyBias())
+        return cls(robot, tuple(contacts), known_forces, baumgarte)
+
+    def to_mjcf(self, path: str | Path | None = None) -> str:
+        """`Robot.to_mjcf` with its closed loops as equalities, which MuJoCo holds softly; contacts are left out."""
+        ends: dict[Any, bool] = {}
+        for loop in self.loops:
+            key = (loop.frame, loop.second_frame), (loop.point, loop.second_point)
+            ends[key] = ends.get(key, False) or loop.turning
+        named = enumerate(ends.items(), 1)
+        return self.robot.to_mjcf(path, [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named])
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> "MechanicalSystem":
+        """The robot of a file with its closed loops, if it is MJCF; `options` are those of `Robot.from_file`."""
+        return cls.from_mjcf(path, **options) if is_mjcf(read_text(path)) else cls(Robot.from_urdf(path, **options))
+
     @override
     def facts(self) -> dict[str, object]:
-        """Robot, contacts and known forces."""
+        """Robot, contacts, closed loops and known forces."""
+        ends = dict.fromkeys(f"{loop.frame} and {loop.second_frame}" for loop in self.loops)
         return {
             "robot": f"{self.robot.name!r}, {self.robot.nv} joints",
-            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.contacts),
+            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.touching),
+            **({"closed loops": listed(ends)} if ends else {}),
             "known forces": listed(type(force).__name__ for force in self.known_forces),
             "baumgarte": self.baumgarte or "none",
         }
@@ -96,6 +156,16 @@ class MechanicalSystem(Summary):
         """Columns of u that are observed, not commanded: predicted motions keep those of their start."""
         held = {name for force in self.known_forces if isinstance(force, ObservedWrench) for name in force.names}
         return tuple(index for index, name in enumerate(self.inputs) if name in held)
+
+    @property
+    def loops(self) -> tuple[LoopClosure, ...]:
+        """The contacts that hold frames of the robot together."""
+        return tuple(contact for contact in self.contacts if isinstance(contact, LoopClosure))
+
+    @property
+    def touching(self) -> tuple[Contact, ...]:
+        """The other contacts: those with surfaces in the world."""
+        return tuple(contact for contact in self.contacts if not isinstance(contact, LoopClosure))
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -156,6 +226,8 @@ class MechanicalSystem(Summary):
         A, b, _ = self._constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         for index, contact in enumerate(self.contacts):
+            if isinstance(contact, LoopClosure):  # in a plane some of its rows constrain nothing
+                size[..., index] = 1.0 + 0.0 * size[..., index]
             if contact.switch is not None:  # where it does not act it needs no direction
                 size[..., index] += 1.0 - (u[..., self.inputs.index(contact.switch)] > 0.5).to(size.dtype)
         bad = torch.nonzero(~(size > 1e-12))
@@ -233,6 +305,7 @@ class MechanicalSystem(Summary):
                     **{"frame": contact.frame, "point": list(contact.point)},
                     **({} if contact.switch is None else {"switch": contact.switch}),
                     "surface": surface_to_dict(contact.surface),
+                    **(contact.second() if isinstance(contact, LoopClosure) else {}),
                 }
                 for contact in self.contacts
             ],
@@ -261,11 +334,12 @@ class MechanicalSystem(Summary):
             robot = Robot.from_stored(stored)
             if contacts is None:
                 contacts = [
-                    Contact(
+                    (LoopClosure if "second_frame" in entry else Contact)(
                         entry["frame"],
                         tuple(entry["point"]),
                         object_from_dict("surface", SURFACES, entry["surface"]),
                         entry.get("switch"),
+                        **{name: entry[name] for name in SECOND if name in entry},
                     )
                     for entry in stored["contacts"]
                 ]

@@ -74,9 +74,9 @@ def is_contact_number(value: object) -> bool:
 
 def require_contact(prior: str, contact: int, system: MechanicalSystem) -> None:
     """Raise InvalidInput if the system has no such contact."""
-    if contact >= len(system.contacts):
-        numbers = ", ".join(map(str, range(len(system.contacts))))
-        have = f"only contact {numbers}" if system.contacts else "no contact"
+    numbers = ", ".join(str(index) for index, each in enumerate(system.contacts) if each in system.touching)
+    if str(contact) not in numbers.split(", "):
+        have = f"only contact {numbers}" if numbers else "no contact with a surface"
         raise InvalidInput(
             f"{prior} acts at contact {contact}, but the system has {have}; give the contact (`contacts`), or use a "
             "prior that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."

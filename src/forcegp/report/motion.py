@@ -158,6 +158,8 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
         map_ = dynamics.contact_force_map(known)
         force = latents.through(map_.matrix @ B, map_.offset)
         for index, contact in enumerate(dynamics.contacts):
+            if getattr(contact, "turning", False):
+                continue  # a torque
             which = slice(3 * index, 3 * index + 3)
             covariance = None if force.covariance is None else force.covariance[..., which, which]
             place = contact.position(dynamics.state.kinematics)

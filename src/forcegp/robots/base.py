@@ -50,7 +50,7 @@ def check_base(description: RobotDescription, standing: Sequence[str], problems:
     if asked or not mass > 0.0:
         return
     holding = {joint.type for joint in description.joints if joint.parent == root}
-    if root.lower() in WORLDS and description.links[root] is None and holding == {"fixed"}:
+    if root.lower() in WORLDS and description.links[root] is None and "fixed" in holding:
         return
     names = {LIMB: list(description.links), BODY: [description.name, *description.links]}
     turning = [joint for joint in description.joints if joint.type != "fixed" and joint.parent in still]

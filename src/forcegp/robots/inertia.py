@@ -40,6 +40,13 @@ def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
     )
 
 
+def rpy_from_rotation(rotation: Array) -> Array:
+    """Angles roll, pitch, yaw (3,) in rad of :func:`rotation_from_rpy`, exact also where pitch is a right angle."""
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    rest = rotation_from_rpy((0.0, 0.0, -yaw)) @ rotation  # Ry(pitch) Rx(roll)
+    return np.array([math.atan2(-rest[1, 2], rest[1, 1]), math.atan2(-rest[2, 0], rest[0, 0]), yaw])
+
+
 def rotation_about(axis: Sequence[float] | Array, angle: float) -> Array:
     """Rotation by ``angle`` rad about a unit ``axis`` (Rodrigues' formula), shape (3, 3)."""
     cross = skew(axis)

@@ -41,6 +41,8 @@ from forcegp.robots.urdf import FREE, MOVABLE, JointDescription, RobotDescriptio
 WORLD = -1
 BASE = "base"
 """Name of the joint between the world and a base that moves."""
+BASES = ("floating", "planar")
+"""Joints by which a file itself holds its base."""
 OUTSIDE = "(world)"
 """What carries such a base; no link of the robot."""
 MOST_BODIES = 1000
@@ -129,7 +131,11 @@ def lay_out(
     groups: list[Group] = []
     links = {root: Placement(WORLD, np.eye(4))}
     stack = list(reversed(children[root]))
-    if base not in (None, "fixed") and not any(joint.type in FREE for joint in children[root]):
+    still = [root]
+    for link in still:
+        still += [joint.child for joint in children[link] if joint.type == "fixed" or joint.name in held]
+    own = any(joint.type in BASES for link in still for joint in children[link])
+    if base not in (None, "fixed") and not own:
         links = {OUTSIDE: Placement(WORLD, np.eye(4))}
         stack = [free_joint(BASE, str(base), OUTSIDE, root)]
     while stack:
@@ -137,7 +143,7 @@ def lay_out(
         above = links[joint.parent]
         offset = above.offset @ joint.origin
         free = joint.type in MOTIONS
-        bolted = free and base == "fixed" and above.body == WORLD
+        bolted = joint.type in BASES and base == "fixed" and above.body == WORLD
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else _joint_motion(joint, held.get(joint.name, 0.0))
             links[joint.child] = Placement(above.body, offset @ still)
@@ -180,8 +186,8 @@ def lay_out(
 
 def free_base(layout: Layout) -> BaseChoice:
     """How the root is held where nobody said it: by a joint of the file, or bolted."""
-    first = next((group for group in layout.groups if layout.parents[group.body] == WORLD), None)
-    return "fixed" if first is None else first.kind  # type: ignore[return-value]  # kinds of groups are choices
+    kinds = [group.kind for group in layout.groups if layout.parents[group.body] == WORLD]
+    return next((kind for kind in kinds if kind in BASES), "fixed")  # type: ignore[return-value]  # a choice
 
 
 def _rows_of(joint: JointDescription) -> list[JointDescription]:

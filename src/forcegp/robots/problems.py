@@ -16,11 +16,18 @@ class Problems:
     """What is wrong with a file, and what was repaired.
 
     Parameters: ``source``, which every message begins with; ``given``, arguments of ``Robot.from_urdf`` that the
-    remedy keeps; ``strict``, whether what could be ignored is an error.
+    remedy keeps; ``strict``, whether what could be ignored is an error; ``reader``, the function that reads the file.
     """
 
-    def __init__(self, source: str, given: Mapping[str, Any] | None = None, *, strict: bool = False) -> None:
-        self.source, self.given, self.strict = source, dict(given or {}), strict
+    def __init__(
+        self,
+        source: str,
+        given: Mapping[str, Any] | None = None,
+        *,
+        strict: bool = False,
+        reader: str = "Robot.from_urdf",
+    ) -> None:
+        self.source, self.given, self.strict, self.reader = source, dict(given or {}), strict, reader
         self.errors: list[RobotModelError] = []
         self.broken: set[str] = set()
         """Links of which something is reported, so that nothing else need be."""
@@ -70,7 +77,7 @@ class Problems:
         text = f"{self.source}: {f'{len(self.errors)} problems: ' if many else ''}{' '.join(self._texts())}"
         if remedy:
             which = "the others, when the file is corrected" if by_hand else "all" if many else "it"
-            text += f" The remedy for {which}: {remedy_text(remedy)}"
+            text += f" The remedy for {which}: {remedy_text(remedy, self.reader)}"
         found = (kinds.pop() if len(kinds) == 1 else RobotModelError)(text, "", {} if by_hand else remedy)
         found.problems = tuple(str(error) for error in self.errors)
         raise found from None
@@ -97,11 +104,11 @@ class Problems:
         ]
 
 
-def remedy_text(remedy: Mapping[str, Any]) -> str:
+def remedy_text(remedy: Mapping[str, Any], reader: str) -> str:
     """The arguments in Python, and the options of the command line that they are."""
     words = []
     for name, value in remedy.items():
         listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
         words.append(f"--{'lock' if name == 'locked' else name} {shlex.quote(listed)}")
     python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
-    return f"Robot.from_urdf(path, {python}), or {' '.join(words)}."
+    return f"{reader}(path, {python}), or {' '.join(words)}."

@@ -1,7 +1,8 @@
 """`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
 
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, UnstatedBase, usable_arguments
+from forcegp.errors import InvalidInput, RobotFileWarning, UnstatedBase, usable_arguments
 from forcegp.robots.arguments import (
     Inertials,
     JointValues,
@@ -26,12 +27,22 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import free_base, lay_out
+from forcegp.robots.mjcf import is_mjcf, translate
+from forcegp.robots.mjcf_model import LoopDescription, Translation
+from forcegp.robots.mjcf_writer import MjcfWriter
 from forcegp.robots.problems import Problems
 from forcegp.robots.robot_file import before_the_end, read_armature, read_robot_file, with_comment, write_robot_file
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.tree import bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import InertiaChoice, replace_inertial, with_chosen_inertias, with_root
+from forcegp.robots.urdf_file import (
+    InertiaChoice,
+    read_text,
+    replace_inertial,
+    with_chosen_inertias,
+    with_root,
+    write_text,
+)
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -113,15 +124,86 @@ class Robot(RobotStructure):
 
         ``strict`` of None warns of nothing: for text that was warned of before.
         """
-        check_choice(base)
-        locked = locked_positions(locked or {})
-        given = {"locked": locked, "inertias": inertias if inertias != "strict" else None, "base": base, "root": root}
-        named = {name: value for name, value in given.items() if value}
         text = text.lstrip() if root is None else with_root(text.lstrip(), root)
-        numbers = finite_vector("gravity", gravity, 3), armature, locked, inertias
+        given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
+        return cls._made(text, Problems(source, given, strict=bool(strict)), gravity, armature, quiet=strict is None)
+
+    @classmethod
+    @usable_arguments("Robot.from_mjcf")
+    def from_mjcf(cls, path: str | Path, **options: Any) -> "Robot":
+        """Read an MJCF file by MuJoCo's own compiler: masses may follow from shapes, and files may include others.
+
+        Every body is a link of that name, whose frame is the body's; joints follow in MuJoCo's order, with armature,
+        damping, dry friction and limits, and named sites are links without mass. An equality of two joints that is
+        linear is a mimic joint. Meshes are needed only where a mass follows from them. q is MuJoCo's `qpos`, but
+        quaternions are x, y, z, w, and the linear velocity of a free body has the axes of the body.
+
+        Parameters are those of :meth:`from_urdf`, without ``root``: ``gravity`` (default: the file's), ``armature``
+        (default: the file's), ``locked``, ``inertias``, ``base`` (default: as in the file) and ``strict``. A
+        RobotFileWarning names what acts in MuJoCo and not here: springs, tendons, gains of actuators, closed loops
+        (which :meth:`MechanicalSystem.from_mjcf <forcegp.mechanics.MechanicalSystem.from_mjcf>` has) and others.
+
+        Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
+        :class:`~forcegp.errors.MissingExtra` without the package mujoco.
+        """
+        return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
+
+    @classmethod
+    @usable_arguments("Robot.from_mjcf_text")
+    def from_mjcf_text(cls, text: str, *, source: str = "<text>", **options: Any) -> "Robot":
+        """As :meth:`from_mjcf`, from text that names no other files; ``source`` is what error messages call it."""
+        return cls.read_mjcf(text, source, None, **options)[0]
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> "Robot":
+        """:meth:`from_mjcf` where the root element is <mujoco>, else :meth:`from_urdf`; ``options`` are theirs."""
+        return (cls.from_mjcf if is_mjcf(read_text(path)) else cls.from_urdf)(path, **options)
+
+    @classmethod
+    def read_mjcf(
+        cls,
+        text: str,
+        source: str,
+        path: Path | None,
+        *,
+        gravity: Vector | None = None,
+        armature: Vector | Mapping[str, float | int] | None = None,
+        locked: Mapping[str, float | int] | None = None,
+        inertias: InertiaChoice = "strict",
+        base: BaseChoice | None = None,
+        strict: bool = False,
+        for_system: bool = False,
+    ) -> "tuple[Robot, Translation]":
+        """The robot of MJCF text, and what a system takes from it, which is noted as left out unless ``for_system``."""
+        given = {"locked": locked, "inertias": inertias, "base": base}
+        problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
+        found = translate(text, path, inertias == "nearest", for_system, problems)
+        problems.given["locked"] = found.locked | dict(locked or {})
+        gravity = found.gravity if gravity is None else gravity
+        return cls._made(found.urdf, problems, gravity, armature, found.armature), found
+
+    @classmethod
+    def _made(
+        cls,
+        text: str,
+        found: Problems,
+        gravity: Vector,
+        armature: Vector | Mapping[str, float | int] | None,
+        beside: Mapping[str, float] | None = None,
+        *,
+        quiet: bool = False,
+    ) -> "Robot":
+        """The robot of URDF text; `found` has the arguments and what is wrong already, `beside` what a file adds."""
+        base, inertias = found.given["base"], found.given["inertias"]
+        check_choice(base)
+        locked = locked_positions(found.given["locked"] or {})
+        named = found.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
+        named = {name: value for name, value in named.items() if value}
+        numbers = finite_vector("gravity", gravity, 3), armature, beside or {}, locked, inertias
 
         def read(held: BaseChoice | None) -> tuple[Robot | None, Problems]:
-            problems = Problems(source, named, strict=bool(strict))
+            problems = Problems(found.source, named, strict=found.strict, reader=found.reader)
+            problems.errors, problems.notes = [*found.errors], {what: [*where] for what, where in found.notes.items()}
             return cls._read(text, problems, held, *numbers), problems
 
         robot, problems = read(base)
@@ -131,8 +213,8 @@ class Robot(RobotStructure):
             problems.errors = [*others.errors, *asked]
         problems.raise_all()
         assert robot is not None, "a problem was collected otherwise"
-        if strict is not None:
-            problems.warn(stacklevel=4)
+        if not quiet:
+            problems.warn(stacklevel=5)
         return robot
 
     @classmethod
@@ -143,6 +225,7 @@ class Robot(RobotStructure):
         base: BaseChoice | None,
         gravity: np.ndarray,
         armature: Vector | Mapping[str, float | int] | None,
+        beside: Mapping[str, float],
         locked: Mapping[str, float],
         inertias: InertiaChoice,
     ) -> "Robot | None":
@@ -154,6 +237,8 @@ class Robot(RobotStructure):
             layout = lay_out(description, locked, base, problems)
             text, description = with_chosen_inertias(inertias, text, description, layout, problems)
             names = tuple(joint.name for joint in layout.joints)
+            if armature is None:  # a file may have those of joints that are locked here
+                armature = {name: value for name, value in beside.items() if name in names}
             rotor_inertias = armature_values(armature, names, description.name)
             tree = compile_tree(description, layout, gravity, rotor_inertias)
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
@@ -238,6 +323,27 @@ class Robot(RobotStructure):
         text = with_comment(self.urdf_text, armature, source=str(path or self.source), stacklevel=3)
         if path is not None:
             write_robot_file(Path(path), text, armature)
+        return text
+
+    @usable_arguments("Robot.to_mjcf")
+    def to_mjcf(self, path: str | Path | None = None, loops: Sequence[LoopDescription] = ()) -> str:
+        """MJCF text, for MuJoCo, with rotor inertias, damping and dry friction; written to ``path`` if given.
+
+        Every link is a body without shape, and every joint of one degree of freedom has a motor. A planar base becomes
+        two slides and a hinge; MuJoCo has no limits of velocity. ``loops`` are closed by equalities. A RobotFileWarning
+        names frames that move without mass, which are left out.
+
+        Raises :class:`~forcegp.errors.RobotModelError` for what MuJoCo cannot hold, such as a last link without mass.
+        """
+        writer = MjcfWriter(self, loops)
+        text = writer.text()
+        if writer.left_out:
+            left_out = (
+                f"{self.source}: MJCF has no frames that move without mass; left out: {', '.join(writer.left_out)}."
+            )
+            warnings.warn(left_out, RobotFileWarning, stacklevel=3)
+        if path is not None:
+            write_text(text, Path(path))
         return text
 
     def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:

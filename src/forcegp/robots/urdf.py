@@ -27,8 +27,8 @@ from forcegp.robots.xml_text import parse_xml, refuse_xacro
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
 MOVABLE = ("revolute", "continuous", "prismatic")
-FREE = ("floating", "planar")
-"""Joints of several degrees of freedom."""
+FREE = ("floating", "planar", "spherical")
+"""Joints of several degrees of freedom; the format has no spherical ones, which MJCF calls ball."""
 ENDS = ("parent", "child")
 
 
@@ -97,7 +97,8 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     """Parse URDF text. ``problems`` collects what is wrong with links and joints, which are then left out."""
     source, element = problems.source, parse_xml(text, problems.source)
     if element.tag != "robot":
-        raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; give a URDF file.")
+        other = "Robot.from_mjcf reads this file" if element.tag == "mujoco" else "give a URDF file"
+        raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; {other}.")
     refuse_xacro(element, source)
     name = (element.get("name") or "").strip() or "robot"
     if "name" not in element.attrib:

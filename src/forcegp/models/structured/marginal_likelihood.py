@@ -281,9 +281,9 @@ class StructuredModel(Model):
         return MarginalLikelihood(self.system, self.prior, self.mean, training)
 
     def problem_size(self, rows: int) -> ProblemSize:
-        """Of the posterior of so many rows, without computing anything; contacts count as independent."""
+        """Of the posterior of so many rows, computing nothing; contacts count as independent and leave some motion."""
         nv, latents = self.system.robot.nv, len(self.prior.latent_names(self.system.robot))
-        return ProblemSize(rows, nv, min(latents, nv - len(self.system.contacts)), latents, 0)
+        return ProblemSize(rows, nv, min(latents, max(1, nv - len(self.system.contacts))), latents, 0)
 
     @property
     def known_noise(self) -> Noise:

@@ -1,0 +1,364 @@
+"""A model that MuJoCo compiled, as URDF elements, rotor inertias and closed loops (:mod:`forcegp.robots.mjcf`)."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
+from forcegp.robots.manifold import MOTIONS
+from forcegp.robots.problems import Problems
+
+KINDS = {0: "floating", 1: "spherical", 2: "prismatic", 3: "revolute"}
+"""Of MuJoCo's joints (mjtJoint) in URDF."""
+WORLD = "world"
+
+
+@dataclass(frozen=True)
+class LoopDescription:
+    """Two points, in m in the frames of two links, that are one; with ``turning`` the frames also turn together."""
+
+    name: str
+    frames: tuple[str, str]
+    points: tuple[tuple[float, float, float], tuple[float, float, float]]
+    turning: bool
+
+
+@dataclass(frozen=True)
+class Translation:
+    """A compiled MJCF file as what a :class:`~forcegp.robots.Robot` is made of."""
+
+    urdf: str
+    gravity: np.ndarray
+    armature: dict[str, float]
+    locked: dict[str, float]
+    loops: tuple[LoopDescription, ...] = ()
+    thrusters: tuple[tuple[str, dict[str, float]], ...] = ()
+    """The motors, if some of them act on a free body: name, and joint forces per unit of input by joint name."""
+
+
+class CompiledModel:
+    """A compiled model, and the URDF elements that are made of it."""
+
+    def __init__(self, mujoco: Any, model: Any, name: str, for_system: bool, problems: Problems) -> None:
+        self.mujoco, self.model, self.for_system, self.problems = mujoco, model, for_system, problems
+        self.name = name
+        self.elements: list[str] = []
+        self.links: set[str] = set()
+        self.armature: dict[str, float] = {}
+        self.couplings: dict[int, tuple[int, float, float]] = {}
+        self.locked: dict[int, float] = {}
+        self.bodies = [self._named(model.body(k).name or f"body_{k}", self.links) for k in range(model.nbody)]
+        taken: set[str] = set()
+        self.joints = []
+        for k in range(model.njnt):
+            kind = ("free", "ball", "slide", "hinge")[model.jnt_type[k]]
+            self.joints.append(self._named(model.joint(k).name or f"{self._body_of(k)}_{kind}", taken))
+        self.taken_joints = taken
+
+    def translation(self) -> Translation:
+        """Links, joints and loops; notes of what is left out."""
+        self._couple()
+        self._link(WORLD)
+        for body in range(1, self.model.nbody):
+            self._body(body)
+        for site in range(self.model.nsite):
+            if name := self.model.site(site).name:
+                body = self.bodies[self.model.site_bodyid[site]]
+                frame = self._named(name, self.links)
+                self._fixed(body, frame, self._pose(self.model.site_pos[site], self.model.site_quat[site]))
+        loops = tuple(self._loops())
+        thrusters = self._thrusters() if self.for_system else ()
+        self._note_losses(bool(thrusters))
+        disabled = self.model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+        gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)
+        text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
+        locked = {self.joints[joint]: value for joint, value in self.locked.items()}
+        return Translation(text, gravity, self._rotor_inertias(), locked, loops, thrusters)
+
+    def _body_of(self, joint: int) -> str:
+        return self.bodies[self.model.jnt_bodyid[joint]]
+
+    @staticmethod
+    def _named(name: str, taken: set[str]) -> str:
+        """The name, or one with a number where it is taken."""
+        found, number = name, 1
+        while found in taken:
+            number += 1
+            found = f"{name}_{number}"
+        taken.add(found)
+        return found
+
+    def _pose(self, position: Any, quaternion: Any) -> np.ndarray:
+        rotation = np.zeros(9)
+        self.mujoco.mju_quat2Mat(rotation, np.array(quaternion, dtype=np.float64))
+        return transform(rotation.reshape(3, 3), position)
+
+    def _link(self, name: str, inside: str = "") -> None:
+        self.elements.append(f"  <link name={quoteattr(name)}{f'>{inside}</link>' if inside else '/>'}")
+
+    def _fixed(self, parent: str, child: str, pose: np.ndarray, inside: str = "") -> None:
+        self._link(child, inside)
+        self._joint(self._named(f"{child}_fixed", self.taken_joints), "fixed", parent, child, pose, "")
+
+    def _joint(self, name: str, kind: str, parent: str, child: str, origin: np.ndarray, more: str) -> None:
+        xyz, rpy = _numbers(origin[:3, 3]), _numbers(rpy_from_rotation(origin[:3, :3]))
+        self.elements.append(
+            f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
+            f'<child link={quoteattr(child)}/><origin xyz="{xyz}" rpy="{rpy}"/>{more}</joint>'
+        )
+
+    def _body(self, body: int) -> None:
+        """The chain of joints of one body, and its link."""
+        model, name = self.model, self.bodies[body]
+        upper = self.bodies[model.body_parentid[body]]
+        at = self._pose(model.body_pos[body], model.body_quat[body])
+        inside, first = self._inertial(body), model.body_jntadr[body]
+        for joint in range(first, first + model.body_jntnum[body]):
+            kind, anchor = KINDS[model.jnt_type[joint]], np.array(model.jnt_pos[joint])
+            axis, start = np.array(model.jnt_axis[joint]), model.qpos0[model.jnt_qposadr[joint]]
+            if kind == "floating":  # its position is that in the world
+                at, anchor = np.eye(4), np.zeros(3)
+            at = at @ transform(np.eye(3), anchor)
+            if kind == "revolute":
+                at = at @ transform(rotation_about(axis, -start), np.zeros(3))
+            elif kind == "prismatic":
+                at = at @ transform(np.eye(3), -start * axis)
+            last = joint + 1 == first + model.body_jntnum[body] and not anchor.any()
+            child = name if last else self._named(f"{self.joints[joint]}_link", self.links)
+            self._link(child, inside if last else "")
+            self._joint(self.joints[joint], *self._kind(joint, kind), upper, child, at, self._parts(joint, kind))
+            upper, at = child, transform(np.eye(3), -anchor)
+        if upper != name:
+            self._fixed(upper, name, at, inside)
+
+    def _kind(self, joint: int, kind: str) -> tuple[str]:
+        return ("continuous" if kind == "revolute" and not self.model.jnt_limited[joint] else kind,)
+
+    def _inertial(self, body: int) -> str:
+        model = self.model
+        if not model.body_mass[body] > 0.0:
+            return ""
+        pose = self._pose(model.body_ipos[body], model.body_iquat[body])
+        inertia = pose[:3, :3] @ np.diag(model.body_inertia[body]) @ pose[:3, :3].T
+        entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+        moments = " ".join(f'{key}="{float(inertia[place])!r}"' for key, place in entries.items())
+        mass = f'<mass value="{float(model.body_mass[body])!r}"/>'
+        return f'<inertial><origin xyz="{_numbers(pose[:3, 3])}" rpy="0 0 0"/>{mass}<inertia {moments}/></inertial>'
+
+    def _parts(self, joint: int, kind: str) -> str:
+        """Axis, limits, damping, friction and coupling of one joint."""
+        model, dof = self.model, self.model.jnt_dofadr[joint]
+        parts = []
+        if kind in ("revolute", "prismatic"):
+            parts.append(f'<axis xyz="{_numbers(model.jnt_axis[joint])}"/>')
+            lower, upper = model.jnt_range[joint]
+            limits = {"lower": lower, "upper": upper} if model.jnt_limited[joint] else {}
+            limits |= {"effort": effort} if np.isfinite(effort := self._effort(joint)) else {}
+            parts.append(_element("limit", limits))
+        losses = {"damping": model.dof_damping[dof], "friction": model.dof_frictionloss[dof]}
+        parts.append(_element("dynamics", {name: value for name, value in losses.items() if value}))
+        if joint in self.couplings:
+            driver, multiplier, offset = self.couplings[joint]
+            numbers = _element("mimic", {"multiplier": multiplier, "offset": offset})
+            parts.append(numbers.replace("<mimic", f"<mimic joint={quoteattr(self.joints[driver])}"))
+        return "".join(parts)
+
+    def _actuators_of(self, joint: int) -> list[int]:
+        """Those that act on one joint by a constant ratio."""
+        kinds = self.mujoco.mjtTrn
+        direct = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
+        model = self.model
+        return [
+            k for k in range(model.nu) if model.actuator_trntype[k] in direct and model.actuator_trnid[k][0] == joint
+        ]
+
+    def _effort(self, joint: int) -> float:
+        """The largest force of the actuators in Nm or N; infinite where one has no limit, or there is none."""
+        model = self.model
+        if model.jnt_actfrclimited[joint]:
+            return float(np.abs(model.jnt_actfrcrange[joint]).max())
+        total, actuators = 0.0, self._actuators_of(joint)
+        for k in actuators:
+            force = np.inf
+            if model.actuator_forcelimited[k]:
+                force = np.abs(model.actuator_forcerange[k]).max()
+            elif model.actuator_ctrllimited[k] and self._is_motor(k):
+                force = np.abs(model.actuator_ctrlrange[k]).max() * abs(model.actuator_gainprm[k][0])
+            total += force * abs(model.actuator_gear[k][0])
+        return float(total) if actuators else np.inf
+
+    def _is_motor(self, actuator: int) -> bool:
+        """Whether its force is its input times a constant."""
+        model = self.model
+        kinds = (model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator])
+        return not any(kinds)
+
+    def _thrusters(self) -> tuple[tuple[str, dict[str, float]], ...]:
+        """Motors whose joint forces no posture changes, where some act at sites of a free body; else none."""
+        model, found, taken, at_sites = self.model, [], set[str](), False
+        for k in range(model.nu):
+            gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])
+            joints = [joint for joint in range(model.njnt) if k in self._actuators_of(joint)]
+            if not self._is_motor(k):
+                return ()
+            if joints and model.jnt_type[joints[0]] >= 2 and joints[0] not in {*self.couplings, *self.locked}:
+                column = {self.joints[joints[0]]: gain * float(gear[0])}
+            elif model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_SITE and model.actuator_trnid[k][1] < 0:
+                site = model.actuator_trnid[k][0]
+                body, pose = model.site_bodyid[site], self._pose(model.site_pos[site], model.site_quat[site])
+                while body and not model.body_jntnum[body]:
+                    pose = self._pose(model.body_pos[body], model.body_quat[body]) @ pose
+                    body = model.body_parentid[body]
+                first = model.body_jntadr[body]
+                if not body or model.jnt_type[first] != 0:
+                    return ()
+                force = pose[:3, :3] @ gear[:3]
+                wrench = [*force, *(pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force))]
+                names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
+                column, at_sites = dict(zip(names, (gain * float(x) for x in wrench), strict=True)), True
+            else:
+                return ()
+            found.append((self._named(model.actuator(k).name or f"actuator_{k + 1}", taken), column))
+        return tuple(found) if at_sites else ()
+
+    def _couple(self) -> None:
+        """Linear couplings of two joints, and joints that one holds."""
+        model, kinds = self.model, self.mujoco.mjtEq
+        for k in range(model.neq):
+            if model.eq_type[k] != kinds.mjEQ_JOINT or not model.eq_active0[k]:
+                continue
+            joint, other, numbers = model.eq_obj1id[k], model.eq_obj2id[k], model.eq_data[k][:5]
+            name, start = self._equality(k), model.qpos0[model.jnt_qposadr[joint]]
+            if other >= 0 and numbers[2:].any():
+                self._lose("couplings of joints that are not linear", name)
+            elif joint in self.couplings or joint in self.locked:
+                self._lose("second couplings of a joint", name)
+            elif other < 0:
+                self.locked[joint] = float(start + numbers[0])
+            else:
+                offset = start + numbers[0] - numbers[1] * model.qpos0[model.jnt_qposadr[other]]
+                self.couplings[joint] = int(other), float(numbers[1]), float(offset)
+
+    def _equality(self, k: int) -> str:
+        return self.model.equality(k).name or f"equality {k}"
+
+    def _loops(self) -> Iterator[LoopDescription]:
+        """Equalities of type connect and weld; what they need of frames becomes links."""
+        model, kinds = self.model, self.mujoco.mjtEq
+        for k in range(model.neq):
+            weld = model.eq_type[k] == kinds.mjEQ_WELD
+            if not (weld or model.eq_type[k] == kinds.mjEQ_CONNECT) or not model.eq_active0[k]:
+                continue
+            name, data = self._equality(k), model.eq_data[k]
+            if not self.for_system:
+                self._lose("closed loops (MechanicalSystem.from_mjcf has them)", name)
+                continue
+            ends = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
+            if model.eq_objtype[k] == int(self.mujoco.mjtObj.mjOBJ_SITE):
+                bodies = [int(model.site_bodyid[end]) for end in ends]
+                poses = [self._pose(model.site_pos[end], model.site_quat[end]) for end in ends]
+            elif weld:  # a frame of the first body, which is to be that of the second one
+                bodies, held = ends, self._pose(data[3:6], data[6:10])
+                poses = [held @ transform(np.eye(3), -data[:3]), np.eye(4)]
+            else:
+                bodies, poses = ends, [transform(np.eye(3), data[:3]), transform(np.eye(3), data[3:6])]
+            if weld:
+                frames = [
+                    self._frame(f"{name}_{side}", body, pose)
+                    for side, body, pose in zip("ab", bodies, poses, strict=True)
+                ]
+                points = [(0.0, 0.0, 0.0)] * 2
+            else:
+                frames = [self.bodies[body] for body in bodies]
+                points = [tuple(pose[:3, 3].tolist()) for pose in poses]
+            yield LoopDescription(name, tuple(frames), tuple(points), weld)  # type: ignore[arg-type]  # two of each
+
+    def _frame(self, name: str, body: int, pose: np.ndarray) -> str:
+        if np.array_equal(pose, np.eye(4)):
+            return self.bodies[body]
+        frame = self._named(name, self.links)
+        self._fixed(self.bodies[body], frame, pose)
+        return frame
+
+    def _rotor_inertias(self) -> dict[str, float]:
+        """Of the joints with a coordinate, by name, with those of the joints that follow them."""
+        model = self.model
+        found = model.dof_armature.tolist()
+        for joint in range(model.njnt):
+            for k in self._actuators_of(joint):
+                if KINDS[model.jnt_type[joint]] in ("revolute", "prismatic"):
+                    found[model.jnt_dofadr[joint]] += float(model.actuator_armature[k] * model.actuator_gear[k][0] ** 2)
+        for joint in self.couplings:
+            ratio, at, passed = 1.0, joint, {joint}
+            while at in self.couplings:
+                at, factor, _ = self.couplings[at]
+                ratio *= factor
+                if at in passed:
+                    break
+                passed.add(at)
+            found[model.jnt_dofadr[at]] += ratio**2 * found[model.jnt_dofadr[joint]] if at != joint else 0.0
+        out = {}
+        for joint in range(model.njnt):
+            kind, dof = KINDS[model.jnt_type[joint]], model.jnt_dofadr[joint]
+            names = [f"{self.joints[joint]}.{each}" for each in MOTIONS[kind].velocities] if kind in MOTIONS else [""]
+            for step, name in enumerate(names):
+                out[name or self.joints[joint]] = found[dof + step]
+            if kind == "floating" and found[dof]:
+                self._lose("that rotor inertia of a free body moves along axes of the world", self.joints[joint])
+        return {name: value for name, value in out.items() if value}
+
+    def _lose(self, what: str, where: str) -> None:
+        self.problems.ignore(f"left out: {what}", where, what)
+
+    def _note_losses(self, thrusters: bool) -> None:
+        """Note what acts on the joints in MuJoCo and not here."""
+        model = self.model
+
+        def names(of: str, places: Iterable[Any]) -> None:
+            for what, place in places:
+                self._lose(what, getattr(model, of)(place).name or f"{of} {place}")
+
+        for joint in range(model.njnt):
+            dof = model.jnt_dofadr[joint]
+            where = self.joints[joint]
+            if model.jnt_stiffness[joint] or _any(model, "jnt_stiffnesspoly", joint):
+                self._lose("springs", where)
+            if _any(model, "dof_dampingpoly", dof):
+                self._lose("damping that is not linear", where)
+            if model.jnt_limited[joint] and KINDS[model.jnt_type[joint]] == "spherical":
+                self._lose("ranges of ball joints", where)
+        names("body", (("compensation of gravity", k) for k in np.flatnonzero(model.body_gravcomp)))
+        names("body", (("motions from outside (mocap)", k) for k in np.flatnonzero(model.body_mocapid >= 0)))
+        names("tendon", (("tendons", k) for k in range(model.ntendon)))
+        for k in range(model.nu):
+            if not self._is_motor(k):
+                self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
+            elif not thrusters and not any(k in self._actuators_of(joint) for joint in range(model.njnt)):
+                self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")
+        if model.nflex:
+            self._lose("forces of deformable bodies", f"{model.nflex} <flex>")
+        if model.nplugin:
+            self._lose("forces of plugins", f"{model.nplugin} <plugin>")
+        if model.opt.density or model.opt.viscosity:
+            self._lose("forces of a medium", "<option density, viscosity>")
+        kinds = self.mujoco.mjtEq
+        known = [int(kind) for kind in (kinds.mjEQ_JOINT, kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)]
+        for k in range(model.neq):
+            if model.eq_active0[k] and model.eq_type[k] not in known:
+                self._lose("constraints of other kinds than joint, connect and weld", self._equality(k))
+
+
+def _any(model: Any, name: str, row: int) -> bool:
+    return bool(np.any(getattr(model, name, np.zeros((row + 1, 1)))[row]))
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _element(tag: str, numbers: dict[str, float]) -> str:
+    inside = "".join(f' {name}="{float(value)!r}"' for name, value in numbers.items())
+    return f"<{tag}{inside}/>" if numbers else ""

@@ -1,0 +1,222 @@
+"""MJCF files against MuJoCo: the same mass matrix, forces and frames at the same states, and what is left out."""
+
+import warnings
+from importlib.util import find_spec
+from pathlib import Path
+
+import mujoco as untyped
+import numpy as np
+import pytest
+import torch
+from tests.robots.mjcf_models import ALL, ARM, CHAIN, FOUR_BAR, GRIPPER, QUADRUPED
+from tests.robots.mujoco_oracle import MujocoOracle, compiled, states
+
+from forcegp import Robot
+from forcegp.errors import (
+    MalformedMjcf,
+    MalformedUrdf,
+    NonPhysicalInertia,
+    RobotFileWarning,
+    RobotModelError,
+    UnreadableRobotFile,
+    UnsafeXml,
+)
+
+mujoco = untyped
+FOLLOWERS = {"gripper": {"right": ("left", -1.5, np.radians(10) + 0.02)}}
+
+
+def read(text, **options):
+    """The robot, without its warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RobotFileWarning)
+        return Robot.from_mjcf_text(text, **options)
+
+
+def same_dynamics(robot, oracle, rtol=1e-9):
+    for q, v, a in zip(*states(robot), strict=True):
+        oracle.at(q.numpy(), v.numpy())
+        M, tau = oracle.mass_matrix(), oracle.inverse_dynamics(a.numpy())
+        np.testing.assert_allclose(robot.mass_matrix(q), M, rtol=rtol, atol=rtol * abs(M).max())
+        np.testing.assert_allclose(robot.inverse_dynamics(q, v, a), tau, rtol=rtol, atol=rtol * abs(tau).max())
+        for body in range(1, oracle.model.nbody):
+            pose, name = robot.frame_pose(q, oracle.model.body(body).name or f"body_{body}"), body
+            np.testing.assert_allclose(pose[:3, 3], oracle.data.xpos[name], atol=1e-12)
+            np.testing.assert_allclose(pose[:3, :3].flatten(), oracle.data.xmat[name], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_masses_forces_and_frames_are_those_of_mujoco(name):
+    same_dynamics(read(ALL[name]), MujocoOracle(compiled(ALL[name]), FOLLOWERS.get(name)))
+
+
+ASSETS = Path(find_spec("gymnasium").submodule_search_locations[0]) / "envs" / "mujoco" / "assets"
+
+
+@pytest.mark.parametrize("path", sorted(ASSETS.glob("*.xml")), ids=lambda path: path.stem)
+def test_published_files_are_those_of_mujoco(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is left out, and an attribute that MuJoCo is about to drop
+        robot, model = Robot.from_mjcf(path), mujoco.MjSpec.from_file(str(path)).compile()
+    model.opt.density = model.opt.viscosity = 0.0
+    same_dynamics(robot, MujocoOracle(model))
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_stored_robots_and_urdf_files_are_the_same_robot(name, tmp_path):
+    robot = read(ALL[name])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RobotFileWarning)
+        robot.to_urdf(tmp_path / "same.urdf")
+    q, v, a = states(robot)
+    options = {"gravity": robot.gravity}
+    for other in (Robot.from_stored(robot.to_stored()), Robot.from_urdf(tmp_path / "same.urdf", **options)):
+        assert (other.joint_names, other.base) == (robot.joint_names, robot.base)
+        torch.testing.assert_close(other.inverse_dynamics(q, v, a), robot.inverse_dynamics(q, v, a), rtol=0.0, atol=0.0)
+
+
+def test_limits_names_and_losses():
+    with pytest.warns(RobotFileWarning) as caught:
+        chain = Robot.from_mjcf_text(FOUR_BAR)
+    assert "left out: closed loops (MechanicalSystem.from_mjcf has them) (pin)" in str(caught[0].message)
+    assert chain.joint_names == ("crank", "coupler", "rocker")
+    arm = Robot.from_mjcf_text(ARM)
+    assert arm.joint_names == ("shoulder", "roll", "elbow", "body_4_slide")
+    assert [joint.effort_limit for joint in arm.joints] == [50.0, 8.0, 20.0, np.inf]
+    assert [joint.friction for joint in arm.joints] == [0.0, 0.3, 0.3, 0.0]
+    assert arm.armature.tolist() == [0.1, 0.02, 0.02, 0.1]
+    assert arm.gravity.tolist() == [0.0, 0.5, -9.7]
+    assert (arm.joints[0].lower, arm.joints[0].upper) == pytest.approx((-np.pi / 2, np.radians(80.0)))
+    assert arm.joint("roll").type == "continuous"
+    assert "elbow site" in arm.frame_names
+    assert arm.base == "fixed"
+    assert Robot.from_mjcf_text(CHAIN).base == "fixed"
+    dog = Robot.from_mjcf_text(QUADRUPED)
+    assert (dog.base, dog.position_names[:3]) == ("floating", ("trunk_free.x", "trunk_free.y", "trunk_free.z"))
+
+
+def test_sites_are_frames():
+    robot, model = read(QUADRUPED), compiled(QUADRUPED)
+    oracle, (q, v, _) = MujocoOracle(model), states(robot)
+    oracle.at(q[0].numpy(), v[0].numpy())
+    for site in range(model.nsite):
+        pose = robot.frame_pose(q[0], model.site(site).name)
+        np.testing.assert_allclose(pose[:3, 3], oracle.data.site_xpos[site], atol=1e-12)
+        np.testing.assert_allclose(pose[:3, :3].flatten(), oracle.data.site_xmat[site], atol=1e-12)
+
+
+HINGE = '<mujoco><worldbody><body name="a"><joint name="j" {0}/>{1}</body></worldbody>{2}</mujoco>'
+BALL = '<geom size=".1"/>'
+LOSSES = {
+    "springs (j)": ('stiffness="2"', BALL, ""),
+    "tendons (t)": ("", BALL, '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
+    "laws of actuators (u holds joint forces) (servo)": (
+        "",
+        BALL,
+        '<actuator><position name="servo" joint="j" kp="3"/></actuator>',
+    ),
+    "forces of a medium": ("", BALL, '<option viscosity="1"/>'),
+    "compensation of gravity (b)": ("", BALL + '<body name="b" gravcomp="1"><geom size=".1"/></body>', ""),
+    "ranges of ball joints (j)": ('type="ball" limited="true" range="0 1"', BALL, ""),
+    "couplings of joints that are not linear (equality 0)": (
+        "",
+        BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>',
+        '<equality><joint joint1="j" joint2="k" polycoef="0 1 1 0 0"/></equality>',
+    ),
+}
+
+
+@pytest.mark.parametrize("what", LOSSES)
+def test_what_acts_in_mujoco_alone_is_named(what):
+    text = HINGE.format(*LOSSES[what])
+    with pytest.warns(RobotFileWarning) as caught:
+        Robot.from_mjcf_text(text)
+    assert f"left out: {what}" in str(caught[0].message)
+    with pytest.raises(RobotModelError, match="leave strict out"):
+        Robot.from_mjcf_text(text, strict=True)
+
+
+def test_a_joint_that_an_equality_holds_is_locked():
+    text = HINGE.format('ref="0.2"', BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>', "")
+    text = text.replace("</mujoco>", '<equality><joint joint1="j" polycoef="0.3 0 0 0 0"/></equality></mujoco>')
+    robot = Robot.from_mjcf_text(text.replace('ref="0.2"', 'ref="0.2" armature="5"'))
+    assert robot.locked == pytest.approx({"j": 0.2 * np.pi / 180.0 + 0.3})
+    assert robot.joint_names == ("k",)
+
+
+def test_rotor_inertias_of_actuators_count():
+    text = HINGE.format('armature=".3"', BALL, '<actuator><motor joint="j" gear="3" armature=".2"/></actuator>')
+    assert Robot.from_mjcf_text(text).armature.item() == pytest.approx(0.3 + 9 * 0.2)
+    same_dynamics(Robot.from_mjcf_text(text), MujocoOracle(compiled(text)))
+
+
+def test_an_inertia_that_no_body_has_is_refused_or_mended():
+    text = HINGE.format("", '<inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/>', "")
+    with pytest.raises(NonPhysicalInertia, match="triangle") as caught:
+        Robot.from_mjcf_text(text, source="arm.xml")
+    assert caught.value.remedy == {"inertias": "nearest"}
+    assert "Robot.from_mjcf(path, inertias='nearest')" in str(caught.value)
+    with pytest.warns(RobotFileWarning, match="nearest"):
+        robot = Robot.from_mjcf_text(text, inertias="nearest")
+    assert robot.link("a").inertia[2][2] == pytest.approx(8 / 3, rel=1e-2)
+
+
+BOMB = '<replicate count="9999" offset="1 0 0">' * 3 + BALL + "</replicate>" * 3
+BAD = {
+    "no XML": ("<mujoco", MalformedUrdf, "not well-formed"),
+    "entities": ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco/>', UnsafeXml, "DTD"),
+    "copies": (f"<mujoco><worldbody>{BOMB}</worldbody></mujoco>", MalformedMjcf, "copies included"),
+    "points": (
+        '<mujoco><asset><mesh name="m" builtin="supersphere" params="2e4 1 1"/></asset></mujoco>',
+        MalformedMjcf,
+        "points",
+    ),
+    "field": ('<mujoco><asset><hfield name="h" nrow="60000" ncol="60000"/></asset></mujoco>', MalformedMjcf, "points"),
+    "depth": (
+        f"<mujoco><worldbody>{'<body>' * 9000}{'</body>' * 9000}</worldbody></mujoco>",
+        MalformedMjcf,
+        "levels",
+    ),
+    "schema": ('<mujoco><worldbody><joint what="1"/></worldbody></mujoco>', MalformedMjcf, "MuJoCo refuses it"),
+    "no mass": (HINGE.format("", "", ""), MalformedMjcf, "mass and inertia"),
+    "no file": ('<mujoco><include file="other.xml"/></mujoco>', UnreadableRobotFile, "other.xml"),
+    "mesh": (
+        HINGE.format("", '<geom type="mesh" mesh="m"/>', '<asset><mesh name="m" file="m.stl"/></asset>'),
+        MalformedMjcf,
+        "the mass of a comes from meshes",
+    ),
+    "still": (f"<mujoco><worldbody>{BALL}</worldbody></mujoco>", RobotModelError, "no movable joint"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_files_that_cannot_be_taken_are_refused_in_one_line(case, tmp_path):
+    text, kind, message = BAD[case]
+    (tmp_path / "bad.xml").write_text(text)
+    with pytest.raises(kind, match=message) as caught:
+        Robot.from_mjcf(tmp_path / "bad.xml")
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "bad.xml") in str(caught.value)
+
+
+def test_files_include_others_and_are_found_by_their_root_element(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "arm.mjcf").write_text(
+        '<?xml version="1.0"?><!-- <robot> --><mujoco><include file="parts/one.xml"/></mujoco>'
+    )
+    (tmp_path / "parts" / "one.xml").write_text(GRIPPER)
+    robot = Robot.from_file(tmp_path / "arm.mjcf")
+    torch.testing.assert_close(robot.mass_matrix(robot.neutral()), read(GRIPPER).mass_matrix(robot.neutral()))
+    (tmp_path / "arm.xml").write_text(read(CHAIN).urdf_text)
+    assert Robot.from_file(tmp_path / "arm.xml").nv == 7
+    with pytest.raises(MalformedUrdf, match="from_mjcf reads"):
+        Robot.from_urdf(tmp_path / "arm.mjcf")
+
+
+def test_a_warning_of_mujoco_becomes_a_note_and_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = HINGE.format("", BALL, '<compiler settotalmass="3"/>')
+    with pytest.warns(RobotFileWarning, match="MuJoCo warns"):
+        robot = Robot.from_mjcf_text(text)
+    assert robot.link("a").mass == pytest.approx(3.0)
+    assert not list(tmp_path.iterdir())
