@@ -48,13 +48,13 @@ class TestJointFrictionOfTwoJoints(PriorConformance):
 
 
 class TestBaseWrench(PriorConformance):
-    prior = BaseWrench("fore", ("velocity", "angular-velocity", "height", "attitude"))
-    acts_at = ("fore", (0.0, 0.0, 0.0))
+    prior = BaseWrench("hand", ("velocity", "angular-velocity", "height", "attitude"))
+    acts_at = ("hand", (0.0, 0.0, 0.0))
 
 
 class TestAerodynamicForce(PriorConformance):
-    prior = AerodynamicForce("fore", kernel="linear")
-    acts_at = ("fore", (0.0, 0.0, 0.0))
+    prior = AerodynamicForce("hand", kernel="linear")
+    acts_at = ("hand", (0.0, 0.0, 0.0))
 
 
 class TestToolForces(PriorConformance):
