@@ -119,7 +119,7 @@ def test_neither_signs_nor_the_frame_of_the_world_matter(how):
     np.testing.assert_allclose(a.dataset.v, b.dataset.v, atol=1e-9)
     np.testing.assert_allclose(a.dataset.a, b.dataset.a, atol=1e-8)
     np.testing.assert_allclose(a.dataset.u, b.dataset.u)
-    turned = world.apply(a.dataset.q[:, :3].copy()) + (1.0, -2.0, 0.5)
+    turned = world.apply(a.dataset.q[:, :3].copy()) + np.array([1.0, -2.0, 0.5])
     np.testing.assert_allclose(turned, b.dataset.q[:, :3], atol=1e-12)
     np.testing.assert_allclose(*(motion_spectrum(x).density for x in (one, other)), rtol=1e-6, atol=1e-18)
 
@@ -165,5 +165,5 @@ def test_what_no_filter_can_follow_is_refused():
     with pytest.raises(InvalidInput, match="delay has 4 numbers; the dataset has 3 actuators"):
         Preparation(delay=(0.0,) * 4).apply(log)
     loose = replace(log, system=MechanicalSystem(log.system.robot), u=log.u[:, :3])
-    with pytest.raises(InvalidInput, match="a base that moves.* give the delay in s"):
+    with pytest.raises(InvalidInput, match=r"a base that moves.* give the delay in s"):
         Preparation(delay="auto").apply(loose)

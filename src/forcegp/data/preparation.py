@@ -35,8 +35,8 @@ class Preparation:
     delay: how much later than it acts u was logged [s], one number or one per actuator: `u(t) := u_logged(t + delay)`;
         "auto" estimates one for all joints, "each" one for each (`estimate_delay`), used where it is sure and explains
         something.
-    lag: time constant of the actuators [s], one or one per actuator: `u` becomes what an actuator of first order makes of
-        it, T u_a' + u_a = u; "auto" and "each" as for the delay. Delay and lag look alike: estimate one of them.
+    lag: time constant of the actuators [s], one or one per actuator: `u` becomes what an actuator of first order makes
+        of it, T u_a' + u_a = u; "auto" and "each" as for the delay. Delay and lag look alike: estimate one of them.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
