@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import Preparation, check, identify_analytical
+from forcegp import check, identify_analytical
 from forcegp.checks import quick_check
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -73,6 +73,4 @@ def test_check_reports_the_base(log):
 
 def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
-        Preparation(cutoff=10.0).apply(log)
-    with pytest.raises(InvalidInput, match="need a base that is fixed"):
         identify_analytical(log)

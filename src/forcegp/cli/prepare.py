@@ -86,12 +86,17 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
         return tables
 
     noise, removed = report["acceleration_noise"], report["power_removed"]
+    own = dataset.joint_names
+    inputs = own if dataset.system is None else dataset.system.actuation.names
+    forces = dict(zip(inputs, removed["u"], strict=False))
     header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
     rows = [
         [name, shown(noise["before"][joint]), shown(noise["after"][joint])]
-        + [shown(removed[signal][joint], "{:.2g} %", 100.0) for signal in ("q", "v", "a", "u")]
-        for joint, name in enumerate(dataset.joint_names)
+        + [shown(removed[signal][joint], "{:.2g} %", 100.0) for signal in ("q", "v", "a")]
+        + [shown(forces.get(name), "{:.2g} %", 100.0)]
+        for joint, name in enumerate(own)
     ]
+    rows += [[name, *5 * [shown(None)], shown(forces[name], "{:.2g} %", 100.0)] for name in forces if name not in own]
     unit = dataset.units["a"]
     title = f"What it costs; noise in {unit if isinstance(unit, str) else 'the units of each joint'}, shares of power"
     tables.append(columns(title.replace("^2", "²"), header, rows))

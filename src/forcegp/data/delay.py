@@ -215,7 +215,7 @@ def lagged(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"],
 
 
 def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
-    """The dataset with each joint's torque taken so many seconds later, after a lag [s] where one is given."""
+    """The dataset with each actuator's force taken so many seconds later, after a lag [s] where one is given."""
     u = dataset.u.copy()
     for number, rows, _ in episodes_in_order(dataset):
         for joint, shift in enumerate(seconds):
@@ -317,4 +317,15 @@ def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robo
         assert system is not None
         robot = system.robot
     require_rows("dataset", dataset, robot.joint_names, robot.name)
+    if not torques_of_joints(dataset):
+        raise InvalidInput(
+            "a delay is found from the torque of every joint, which u does not hold for a base that moves or actuators "
+            "of another kind; give the delay in s."
+        )
     return robot
+
+
+def torques_of_joints(dataset: Dataset) -> bool:
+    """Whether u has one torque per degree of freedom."""
+    system = dataset.system
+    return system is None or (system.robot.space.is_vector_space and system.actuation.matrix is None)

@@ -5,11 +5,14 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
+from forcegp.data.configurations import actuators, continuous, rates, space_of, through
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.robots.manifold import ConfigurationSpace
 
 JITTER = 0.01
 """Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
@@ -59,15 +62,20 @@ def low_pass_gain(
         return 1.0 / (1.0 + np.abs(warped) ** (2 * order))
 
 
-def differentiate(values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"]) -> np.ndarray:
+def differentiate(
+    values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"], space: ConfigurationSpace | None = None
+) -> np.ndarray:
     """Central differences, second order also at both ends and for unequal steps (three-point Lagrange formulas).
 
-    Units: those of `values` per second. Raises DatasetError for fewer than three rows or time that does not increase.
+    Units: those of `values` per second. Positions of a `space` in which they do not add up give velocities (rows, nv)
+    in body axes. Raises DatasetError for fewer than three rows or time that does not increase.
     """
     if len(values) < 3:
         raise DatasetError(f"{len(values)} rows are too few to differentiate; at least 3 are needed.")
     if len(time) != len(values) or not (np.diff(time) > 0).all():
         raise DatasetError(f"time must have {len(values)} entries that increase strictly.")
+    if space is not None and not space.is_vector_space:
+        return rates(space, values, time)
     return np.gradient(values, time, axis=0, edge_order=2)
 
 
@@ -92,17 +100,24 @@ def low_pass(
     """The Dataset with the named signals low-pass filtered (`zero_phase_low_pass`) within each episode.
 
     Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Filtering q,
-    v or u drops `truth`: with it, the equation of motion would no longer hold in the changed rows. Raises as
-    `zero_phase_low_pass` and `uniform_step`, naming the episode; DatasetError for rows that are not in order of time
-    and for positions that jump by a turn.
+    v or u drops `truth`: with it, the equation of motion would no longer hold in the changed rows. Switches of contacts
+    stay as they are. Raises as `zero_phase_low_pass` and `uniform_step`, naming the episode; DatasetError for rows that
+    are not in order of time, for positions that jump by a turn, and for a base that turns faster than the filter
+    passes.
     """
     if not signals or not set(signals) <= {"q", "v", "u", "a"}:
         raise InvalidInput(f"signals are {tuple(signals)!r}; allowed: one or more of q, v, u, a.")
 
     def filtered(name: str, rows: Dataset, label: str) -> np.ndarray:
+        def smooth(values: np.ndarray) -> np.ndarray:
+            return zero_phase_low_pass(values, 1.0 / uniform_step(rows.time, label), cutoff, order)
+
         if name == "q":
             require_no_turns(rows, label)
-        return zero_phase_low_pass(getattr(rows, name), 1.0 / uniform_step(rows.time, label), cutoff, order)
+            return through(space_of(rows), rows.q, smooth)
+        values = getattr(rows, name)
+        forces = actuators(rows) if name == "u" else rows.nv
+        return np.concatenate([smooth(values[:, :forces]), values[:, forces:]], axis=1)
 
     changed = _by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
     noise_std = None if "a" in signals else dataset.noise_std
@@ -123,7 +138,7 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
         if source == "v":
             return {"a": differentiate(rows.v, rows.time)}
         require_no_turns(rows, label)
-        velocity = differentiate(rows.q, rows.time)
+        velocity = differentiate(rows.q, rows.time, space_of(rows))
         return {"v": velocity, "a": differentiate(velocity, rows.time)}
 
     truth = dataset.truth if source == "v" else {}
@@ -133,6 +148,7 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
 def resample(dataset: Dataset, step: float) -> Dataset:
     """The Dataset at uniform times, `step` [s] apart, by a cubic spline through each signal of each episode.
 
+    Switches of contacts are those of the row before.
     Filter first (`low_pass`) when going to a longer step: a spline does not remove what the new rate cannot carry.
     `truth` and `noise_std` are dropped, since interpolation makes neither. Raises InvalidInput for a step <= 0 or
     longer than an episode, DatasetError for rows that are not in order of time or positions that jump by a turn.
@@ -147,7 +163,14 @@ def resample(dataset: Dataset, step: float) -> Dataset:
         if count < 2:
             raise InvalidInput(f"step is {step} s, longer than {label} ({duration:.6g} s).")
         time = np.minimum(rows.time[0] + step * np.arange(count), rows.time[-1])
-        signals = {name: CubicSpline(rows.time, getattr(rows, name), axis=0)(time) for name in ("q", "v", "u", "a")}
+
+        def spline(values: np.ndarray, own: np.ndarray = rows.time, time: np.ndarray = time) -> np.ndarray:
+            return CubicSpline(own, values, axis=0)(time)
+
+        signals = {name: spline(getattr(rows, name)) for name in ("v", "u", "a")}
+        signals["q"] = through(space_of(rows), rows.q, spline)
+        before = np.searchsorted(rows.time, time * (1 + 1e-12), side="right") - 1
+        signals["u"][:, actuators(rows) :] = rows.u[before, actuators(rows) :]
         parts.append({**signals, "time": time, "episode": np.full(count, number)})
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return replace(dataset, **joined, truth={}, noise_std=None)
@@ -178,12 +201,15 @@ def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.
 
 def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
-    units = rows.units["q"]
-    angular = [k for k in range(rows.nv) if (units if isinstance(units, str) else units[k]) == "rad"]
-    jumps = np.abs(np.diff(rows.q[:, angular], axis=0)) > np.pi
+    space, units = space_of(rows), rows.units["q"]
+    continuous(space, rows.q)
+    grouped = {row for group in space.groups for row in range(*group.rows.indices(rows.nv))}
+    single = [k for k in range(rows.nv) if k not in grouped]
+    angular = [(units if isinstance(units, str) else units[k]) == "rad" for k in single]
+    jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi
     if jumps.any():
         row, column = np.argwhere(jumps)[0]
-        joint = rows.joint_names[angular[column]]
+        joint = rows.joint_names[np.asarray(single)[angular][column]]
         raise DatasetError(
             f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
             "Unwrap it first (np.unwrap(q, axis=0))."

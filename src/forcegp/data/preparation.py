@@ -7,11 +7,12 @@ from typing import Any, ClassVar, Literal
 from warnings import warn
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
+from forcegp.data.configurations import actuators, as_vectors, space_of
 from forcegp.data.dataset import Dataset
-from forcegp.data.dataset_arguments import require_vectors
-from forcegp.data.delay import estimate_delay, shifted
+from forcegp.data.delay import estimate_delay, shifted, torques_of_joints
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
 from forcegp.data.held_out_cutoff import held_out_cutoff
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
@@ -31,11 +32,11 @@ class Preparation:
         which v and a are computed anew; "auto" reads it from the spectrum (`motion_spectrum`), None leaves q, v, a
         and u as they are.
     order: of the filter; it runs forwards and backwards.
-    delay: how much later than it acts u was logged [s], one number or one per joint: `u(t) := u_logged(t + delay)`;
+    delay: how much later than it acts u was logged [s], one number or one per actuator: `u(t) := u_logged(t + delay)`;
         "auto" estimates one for all joints, "each" one for each (`estimate_delay`), used where it is sure and explains
         something.
-    lag: time constant of the actuators [s], one or one per joint: `u` becomes what an actuator of first order makes of
-        it, T u_a' + u_a = u; "auto" and "each" as for the delay. Delay and lag look alike: estimate one of them.
+    lag: time constant of the actuators [s], one or one per actuator: `u` becomes what an actuator of first order makes
+        of it, T u_a' + u_a = u; "auto" and "each" as for the delay. Delay and lag look alike: estimate one of them.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -95,7 +96,6 @@ class Preparation:
 
     def rows(self, dataset: Dataset) -> Dataset:
         """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
-        require_vectors(dataset, "filters")
         chosen = self.resolved(dataset)
         return _filtered(chosen, dataset).rows(_kept(chosen, dataset))
 
@@ -105,7 +105,6 @@ class Preparation:
         `truth` and `noise_std` are dropped as `low_pass` and `differentiated` drop them. Raises DatasetError for rows
         that are out of order, sampled unevenly or too few, and InvalidInput for a cut-off above half the sample rate.
         """
-        require_vectors(dataset, "filters")
         chosen, reasons = _resolve(self, dataset)
         filtered = _filtered(chosen, dataset)
         kept = _kept(chosen, dataset)
@@ -157,8 +156,9 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
     reasons: dict[str, Any] = {}
     for name in LATE:
         value = getattr(given, name)
-        if isinstance(value, tuple) and len(value) != dataset.nv:
-            raise InvalidInput(f"{name} has {len(value)} numbers; the dataset has {dataset.nv} joints.")
+        if isinstance(value, tuple) and len(value) != (count := actuators(dataset)):
+            of = "joints" if torques_of_joints(dataset) else "actuators"
+            raise InvalidInput(f"{name} has {len(value)} numbers; the dataset has {count} {of}.")
     chosen = given
     if given.cutoff == "auto":
         spectrum = motion_spectrum(dataset, given.differentiate)
@@ -167,7 +167,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         cutoff = float(f"{each[known].max():.3g}") if known.any() else None
         reasons["cutoff"] = _why(cutoff, spectrum, dataset)
         system = dataset.system
-        if cutoff is not None and system is not None and not system.contacts:
+        if cutoff is not None and system is not None and not system.contacts and torques_of_joints(dataset):
             with contextlib.suppress(DatasetError):  # too short, or sampled too slowly: the spectrum has to do
                 best, tried = held_out_cutoff(dataset, system.robot, cutoff, given.differentiate, given.order)
                 shares = ", ".join(f"{100.0 * share:.2g} % at {frequency:g} Hz" for frequency, share in tried.items())
@@ -204,7 +204,7 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
         signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
         dataset = low_pass(dataset, float(chosen.cutoff), order=chosen.order, signals=signals)
         dataset = differentiated(dataset, chosen.differentiate)
-    shifts, lags = (_per_joint(given, dataset.nv) for given in (chosen.delay, chosen.lag))
+    shifts, lags = (_per_actuator(given, dataset) for given in (chosen.delay, chosen.lag))
     if not any((*shifts, *lags)):
         return dataset
     return shifted(dataset, shifts, lags)
@@ -215,9 +215,9 @@ def seconds_of(given: float | tuple[float, ...] | str) -> tuple[float, ...]:
     return given if isinstance(given, tuple) else (given,)  # type: ignore[return-value]  # text is refused before
 
 
-def _per_joint(given: float | tuple[float, ...] | str, joints: int) -> list[float]:
-    each = seconds_of(given)
-    return [float(value) for value in (each if len(each) == joints else each * joints)]
+def _per_actuator(given: float | tuple[float, ...] | str, dataset: Dataset) -> list[float]:
+    each, count = seconds_of(given), actuators(dataset)
+    return [float(value) for value in (each if len(each) == count else each * count)]
 
 
 def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
@@ -252,7 +252,7 @@ def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
 def _report(
     chosen: Preparation, reasons: dict[str, Any], raw: Dataset, filtered: Dataset, prepared: Dataset
 ) -> dict[str, Any]:
-    per_joint = {name: _per_joint(getattr(chosen, name), raw.nv) for name in LATE}
+    per_joint = {name: _per_actuator(getattr(chosen, name), raw) for name in LATE}
     report: dict[str, Any] = {
         "cutoff": chosen.cutoff,
         "order": chosen.order,
@@ -283,8 +283,11 @@ def _report(
 def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | None]:
     """Share of the variance of each column that is gone: the variance of the difference over that before."""
     old, new = getattr(before, name), getattr(after, name)
+    change, space = old - new, space_of(before)
+    if name == "q" and not space.is_vector_space:
+        old, change = as_vectors(before), space.difference(*(torch.tensor(x) for x in (new, old))).numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _plain(np.minimum(np.var(old - new, axis=0) / np.var(old, axis=0), 1.0))
+        return _plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
 
 
 def _plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.filtering import episodes_in_order, uniform_step
 from forcegp.errors import DatasetError
@@ -87,7 +88,8 @@ def motion_spectrum(dataset: Dataset, source: Literal["q", "v"] = "q") -> Motion
 
     Raises DatasetError for fewer than 64 rows in the longest episode, rows out of order or sampled unevenly.
     """
-    frequency, density, segments, step = power_density(dataset, getattr(dataset, source), _derivatives(source))
+    values = as_vectors(dataset) if source == "q" else dataset.v
+    frequency, density, segments, step = power_density(dataset, values, _derivatives(source))
     found = [_knee_and_floor(frequency, column, segments, _derivatives(source)) for column in density.T]
     knee, floor, cutoff = (np.array(values) for values in zip(*found, strict=True))
     spectrum = MotionSpectrum(

@@ -33,6 +33,7 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
     axes: Any = figure.subplots(dataset.nv, 2, sharex=True, squeeze=False)
     names = style.short_joint_names(dataset.joint_names)
     units = {name: style.joint_units(dataset, name) for name in ("a", "u")}
+    inputs = dataset.joint_names if dataset.system is None else dataset.system.inputs
     for joint in range(dataset.nv):
         panel = axes[joint, 0]
         _draw_filtered(panel, spectrum.frequency, spectrum.acceleration_density[:, joint], spectrum.step, preparation)
@@ -43,7 +44,9 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
             style.draw_line(panel, spectrum.frequency, floor, style.KNOWN_PHYSICS, 1.0, **below)
         style.quiet(panel, y=f"{names[joint]}\n({units['a'][joint]})² / Hz")
         panel = axes[joint, 1]
-        _draw_filtered(panel, frequency, torque[:, joint], step, preparation)
+        if dataset.joint_names[joint] in inputs:  # a base has no torque
+            own = torque[:, inputs.index(dataset.joint_names[joint])]
+            _draw_filtered(panel, frequency, own, step, preparation)
         style.quiet(panel, y=f"({units['u'][joint]})² / Hz")
     for column, title in enumerate(("Acceleration (positions differentiated)", "Torque")):
         axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")

@@ -1,0 +1,100 @@
+"""Positions of robots whose base moves, as signals: filtered, differentiated and written as vectors.
+
+Quaternions are filtered entry by entry, after their signs were made continuous, and then divided by their length. A
+turn of the world multiplies all of them by one orthogonal matrix, with which linear filters commute: so the result
+depends neither on the frame of the world nor on the signs. A constant turn passes exactly below the cut-off, where all
+entries have the same gain.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.data.dataset import Dataset
+from forcegp.errors import DatasetError
+from forcegp.robots.manifold import ConfigurationSpace
+
+LEAST_LENGTH = 0.7
+"""Of a filtered quaternion: below it the turn is faster than what the filter passes."""
+LARGEST_TURN = 0.5 * np.pi
+"""Between two rows: beyond it the log does not show which way a body has turned."""
+
+Positions = Float[np.ndarray, "rows nq"]
+
+
+def space_of(dataset: Dataset) -> ConfigurationSpace:
+    """What positions the recorded robot can have; without a robot, vectors."""
+    return ConfigurationSpace(dataset.nv) if dataset.system is None else dataset.system.robot.space
+
+
+def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
+    """The same positions with quaternions that change sign nowhere.
+
+    Raises DatasetError where a body turns by more than a quarter of a turn between two rows.
+    """
+    for group in space.groups:
+        turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
+        cosine = (q[1:, turn] * q[:-1, turn]).sum(axis=1)
+        half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
+        jumps = np.flatnonzero((np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1)))
+        if len(jumps):
+            raise DatasetError(
+                f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row {jumps[0]}; check "
+                "the order of the quaternion's columns, or leave these rows out."
+            )
+        if half and (cosine < 0.0).any():
+            q = q.copy()
+            q[1:, turn] *= np.cumprod(np.sign(cosine))[:, None]
+    return q
+
+
+def through(space: ConfigurationSpace, q: Positions, change: Callable[[np.ndarray], np.ndarray]) -> Positions:
+    """Positions behind a linear filter or interpolation `change` (rows, nq) -> (any rows, nq).
+
+    Raises DatasetError for turns faster than the filter passes.
+    """
+    if space.is_vector_space:
+        return change(q)
+    changed = change(continuous(space, q))
+    for group in space.groups:
+        length = np.linalg.norm(changed[:, group.places][:, group.motion.turn], axis=1)
+        if float(np.median(length)) < LEAST_LENGTH:
+            raise DatasetError(f"{group.name!r} turns faster than the filter passes; use a higher cut-off.")
+    return space.normalized(torch.from_numpy(np.ascontiguousarray(changed))).numpy()
+
+
+def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows nv"]:
+    """Velocities by differences of second order, as :func:`~forcegp.data.differentiate` has them for vectors.
+
+    At every row, its neighbours are the velocities that lead to them in one second (`Robot.difference`). The chart that
+    these are has the derivative 1 there, so the derivative of the parabola through them is the velocity in body axes.
+    Constant velocities come out exactly.
+    """
+    rows = np.arange(len(q))
+    near = np.clip(rows, 1, len(q) - 2)[:, None] + np.array([-1, 0, 1])
+    steps = time[near] - time[:, None]
+    weights = np.empty_like(steps)
+    for k in range(3):
+        one, other = steps[:, (k + 1) % 3], steps[:, (k + 2) % 3]
+        weights[:, k] = -(one + other) / ((steps[:, k] - one) * (steps[:, k] - other))
+    positions = torch.tensor(q)
+    moved = space.difference(positions[:, None], positions[near]).numpy()
+    return np.einsum("nk,nkj->nj", weights, moved)
+
+
+def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
+    """Positions as vectors that change from row to row as the robot moves, in body axes; q itself on a fixed base."""
+    space = space_of(dataset)
+    if space.is_vector_space:
+        return dataset.q
+    q = torch.tensor(dataset.q)
+    steps = space.difference(q[:-1], q[1:]).numpy()
+    steps[np.diff(dataset.episode) != 0] = 0.0
+    return np.concatenate([np.zeros((1, dataset.nv)), np.cumsum(steps, axis=0)])
+
+
+def actuators(dataset: Dataset) -> int:
+    """How many columns of u are forces; those behind them are switches of contacts, which no filter may touch."""
+    return dataset.u.shape[1] if dataset.system is None else len(dataset.system.actuation.names)

@@ -1,0 +1,169 @@
+"""Filters and derivatives of positions that are points of a manifold, against a body that tumbles in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tests.robots.test_moving_bases import LIMBS
+
+from forcegp import Preparation
+from forcegp.data import Dataset, differentiate, differentiated, low_pass, motion_spectrum, resample
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.mechanics import MechanicalSystem, fixed_point
+from forcegp.robots import Robot
+
+RATE, SECONDS = 240.0, 4.0
+INNER = slice(120, -120)
+
+
+def euler(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Yaw that grows through whole turns, pitch and roll; omega and its rate in body axes, by the usual formulas."""
+    yaw, dyaw, ddyaw = 2.1 * t, np.full_like(t, 2.1), np.zeros_like(t)
+    pitch, dpitch, ddpitch = 0.6 * np.sin(3 * t), 1.8 * np.cos(3 * t), -5.4 * np.sin(3 * t)
+    roll, droll, ddroll = 1.0 * np.sin(2 * t), 2.0 * np.cos(2 * t), -4.0 * np.sin(2 * t)
+    sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+    turned = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], 1))
+    omega = np.stack([droll - dyaw * sp, dpitch * cr + dyaw * sr * cp, -dpitch * sr + dyaw * cr * cp], 1)
+    rate = np.stack(
+        [
+            ddroll - ddyaw * sp - dyaw * cp * dpitch,
+            ddpitch * cr - dpitch * sr * droll + ddyaw * sr * cp + dyaw * (cr * droll * cp - sr * sp * dpitch),
+            -ddpitch * sr - dpitch * cr * droll + ddyaw * cr * cp - dyaw * (sr * droll * cp + cr * sp * dpitch),
+        ],
+        1,
+    )
+    return turned, omega, rate
+
+
+def tumbling(
+    base: str = "floating", rate: float = RATE, world: Rotation | None = None, shift=(0.0, 0.0, 0.0)
+) -> Dataset:
+    """A crab whose trunk tumbles along a curve, exactly; `world` turns, `shift` moves everything."""
+    t = np.arange(round(SECONDS * rate)) / rate
+    turned, omega, omega_rate = euler(t)
+    p = np.stack([np.sin(2 * t), 0.5 * np.cos(3 * t), 0.2 * t * t], 1)
+    dp = np.stack([2 * np.cos(2 * t), -1.5 * np.sin(3 * t), 0.4 * t], 1)
+    ddp = np.stack([-4 * np.sin(2 * t), -4.5 * np.cos(3 * t), np.full_like(t, 0.4)], 1)
+    linear = turned.inv().apply(dp)
+    linear_rate = turned.inv().apply(ddp) - np.cross(omega, linear)
+    if world is not None:
+        p, turned = world.apply(p) + shift, world * turned
+    joints = [0.3 * np.sin(2 * t), 0.4 * np.cos(3 * t), 0.2 + 0.1 * np.sin(t)]
+    djoints = [0.6 * np.cos(2 * t), -1.2 * np.sin(3 * t), 0.1 * np.cos(t)]
+    ddjoints = [-1.2 * np.sin(2 * t), -3.6 * np.cos(3 * t), -0.1 * np.sin(t)]
+    q, v, a = turned.as_quat(), omega, omega_rate
+    if base == "floating":
+        q, v, a = (np.concatenate(x, 1) for x in ((p, q), (linear, v), (linear_rate, a)))
+    robot = Robot.from_urdf_text(LIMBS, base=base)
+    system = MechanicalSystem(robot, fixed_point("a_foot", (0.0, 0.0, 0.0), switch="down"))
+    u = np.stack([np.sin(5 * t), np.cos(4 * t), np.sin(3 * t), (t % 1.0 < 0.5).astype(float)], 1)
+    q, v, a = (np.column_stack([x, *more]) for x, more in ((q, joints), (v, djoints), (a, ddjoints)))
+    return Dataset(q=q, v=v, u=u, a=a, time=t, system=system)
+
+
+def jumbled(log: Dataset, base: str = "floating") -> Dataset:
+    """Random signs of the quaternions."""
+    q, turn = log.q.copy(), slice(3, 7) if base == "floating" else slice(0, 4)
+    q[:, turn] *= np.random.default_rng(0).choice([-1.0, 1.0], len(q))[:, None]
+    return replace(log, q=q)
+
+
+@pytest.mark.parametrize("base", ["floating", "spherical"])
+def test_velocities_and_accelerations_of_a_tumbling_body(base):
+    coarse, fine = tumbling(base), tumbling(base, rate=2 * RATE)
+    errors = []
+    for log in (coarse, fine):
+        found = differentiated(jumbled(log, base), "q")
+        errors.append([np.abs(found.v - log.v).max(), np.abs(found.a - log.a)[3:-3].max()])
+    assert errors[0][0] < 4e-3
+    assert errors[0][1] < 2e-2
+    np.testing.assert_array_less(np.array(errors[1]) * 3.5, errors[0])  # of second order
+
+
+def test_a_filter_far_above_the_motion_leaves_it():
+    log = tumbling()
+    found = differentiated(low_pass(jumbled(log), 30.0, signals=("q", "u")), "q")
+    robot = log.system.robot
+    assert np.abs(robot.difference(torch.tensor(log.q), torch.tensor(found.q)).numpy())[INNER].max() < 1e-6
+    assert np.abs(found.v - log.v)[INNER].max() < 4e-3
+    assert np.abs(found.a - log.a)[INNER].max() < 2e-2
+    np.testing.assert_array_equal(found.u[:, 3], log.u[:, 3])  # a switch
+
+
+def test_noise_of_a_pose_is_taken_away():
+    log, generator = tumbling(), np.random.default_rng(1)
+    noise = torch.tensor(1e-4 * generator.normal(size=log.v.shape))
+    noisy = replace(log, q=log.system.robot.integrate(torch.tensor(log.q), noise).numpy())
+    prepared = Preparation(cutoff=8.0, trim=0.5).apply(noisy)
+    raw = differentiated(noisy, "q").a
+    true = log.a[np.isin(log.time, prepared.dataset.time)]
+    assert np.abs(raw - log.a).std() > 2.0
+    assert np.sqrt(np.mean((prepared.dataset.a - true) ** 2)) < 0.05
+
+
+@pytest.mark.parametrize("how", [{}, {"differentiate": "v"}])
+def test_neither_signs_nor_the_frame_of_the_world_matter(how):
+    generator = np.random.default_rng(2)
+    world = Rotation.from_rotvec([0.4, -1.9, 0.8])
+    one, other = tumbling(), jumbled(tumbling(world=world, shift=(1.0, -2.0, 0.5)))
+    bump = torch.tensor(1e-3 * generator.normal(size=one.v.shape))
+    one, other = (
+        replace(x, q=x.system.robot.integrate(torch.tensor(x.q), bump).numpy(), v=x.v + bump.numpy())
+        for x in (one, other)
+    )
+    a, b = (
+        Preparation(cutoff=10.0, every=2, trim=0.2, delay=(0.004, 0.0, -0.002), **how).apply(x) for x in (one, other)
+    )
+    np.testing.assert_allclose(a.dataset.v, b.dataset.v, atol=1e-9)
+    np.testing.assert_allclose(a.dataset.a, b.dataset.a, atol=1e-8)
+    np.testing.assert_allclose(a.dataset.u, b.dataset.u)
+    turned = world.apply(a.dataset.q[:, :3].copy()) + np.array([1.0, -2.0, 0.5])
+    np.testing.assert_allclose(turned, b.dataset.q[:, :3], atol=1e-12)
+    np.testing.assert_allclose(*(motion_spectrum(x).density for x in (one, other)), rtol=1e-6, atol=1e-18)
+
+
+def test_a_constant_screw_comes_out_exactly():
+    robot = Robot.from_urdf_text(LIMBS, base="planar")
+    v = torch.linspace(0.5, -1.0, robot.nv, dtype=torch.float64)
+    time = np.cumsum(np.random.default_rng(3).uniform(0.01, 0.03, 50))
+    q = robot.integrate(robot.neutral(), torch.tensor(time)[:, None] * v).numpy()
+    np.testing.assert_allclose(differentiate(q, time, robot.space), np.tile(v, (50, 1)), atol=1e-10)
+
+
+def test_poses_at_other_times():
+    log, fine = tumbling(), tumbling(rate=1000.0)
+    found = resample(jumbled(log), 1e-3)
+    at = slice(0, len(found))
+    away = log.system.robot.difference(torch.tensor(found.q), torch.tensor(fine.q[at]))
+    assert float(away.abs().max()) < 1e-5
+    np.testing.assert_allclose(found.v, fine.v[at], atol=1e-4)
+    assert set(np.unique(found.u[:, 3])) == {0.0, 1.0}
+
+
+def test_the_automatic_cutoff_passes_the_motion_and_its_price_is_reported_per_joint():
+    log = tumbling()
+    noise = torch.tensor(2e-4 * np.random.default_rng(4).normal(size=log.v.shape))
+    noisy = replace(log, q=log.system.robot.integrate(torch.tensor(log.q), noise).numpy())
+    prepared = Preparation(cutoff="auto", trim=0.5).apply(noisy)
+    assert 1.0 < prepared.report["cutoff"] < 20.0
+    assert [len(prepared.report["power_removed"][name]) for name in "qvau"] == [9, 9, 9, 4]
+    assert len(prepared.report["delay"]) == 3
+
+
+def test_what_no_filter_can_follow_is_refused():
+    log = tumbling()
+    q = log.q.copy()
+    q[300:, 3:7] = (Rotation.from_quat(q[300:, 3:7]) * Rotation.from_rotvec([2.0, 0.0, 0.0])).as_quat()
+    with pytest.raises(DatasetError, match="'base' turns by more than 90 degrees after row 299"):
+        differentiated(replace(log, q=q), "q")
+    spin = torch.tensor(log.time)[:, None] * torch.tensor([0, 0, 0, 0, 0, 90.0, 0, 0, 0]).double()
+    fast = replace(log, q=log.system.robot.integrate(torch.tensor(log.q[:1]), spin).numpy())
+    with pytest.raises(DatasetError, match="episode 0: 'base' turns faster than the filter passes"):
+        low_pass(fast, 3.0)
+    with pytest.raises(InvalidInput, match="delay has 4 numbers; the dataset has 3 actuators"):
+        Preparation(delay=(0.0,) * 4).apply(log)
+    loose = replace(log, system=MechanicalSystem(log.system.robot), u=log.u[:, :3])
+    with pytest.raises(InvalidInput, match=r"a base that moves.* give the delay in s"):
+        Preparation(delay="auto").apply(loose)
