@@ -87,7 +87,7 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
 
     noise, removed = report["acceleration_noise"], report["power_removed"]
     own = dataset.joint_names
-    inputs = own if dataset.system is None else dataset.system.actuation.names
+    inputs = own if dataset.system is None else dataset.system.actuators
     forces = dict(zip(inputs, removed["u"], strict=False))
     header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
     rows = [

@@ -97,4 +97,4 @@ def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
 
 def actuators(dataset: Dataset) -> int:
     """How many columns of u are forces; those behind them are switches of contacts, which no filter may touch."""
-    return dataset.u.shape[1] if dataset.system is None else len(dataset.system.actuation.names)
+    return dataset.u.shape[1] if dataset.system is None else len(dataset.system.actuators)

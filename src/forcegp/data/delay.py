@@ -328,4 +328,4 @@ def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robo
 def torques_of_joints(dataset: Dataset) -> bool:
     """Whether u has one torque per degree of freedom."""
     system = dataset.system
-    return system is None or (system.robot.space.is_vector_space and system.actuation.matrix is None)
+    return system is None or (system.actuators == system.robot.joint_names and system.actuation.matrix is None)

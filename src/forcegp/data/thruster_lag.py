@@ -58,7 +58,7 @@ def _thrusters(dataset: Dataset) -> tuple[list[int], np.ndarray, int]:
     groups = () if system is None else system.robot.layout.groups
     if system is None or not forces or not groups or groups[0].kind != "floating":
         raise InvalidInput("this lag is that of thrusters: give a system with Thrusters and base='floating'.")
-    named = [(name, force.power) for force in forces for name in force.input_names]
+    named = [(name, force.power) for force in forces for name in force.names]
     return [system.inputs.index(name) for name, _ in named], np.array([power for _, power in named]), groups[0].row
 
 

@@ -36,11 +36,6 @@ class KnownForce(ABC):
     learned: ClassVar[str | None] = None
     """Name of the one of them that an identification estimates."""
 
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Columns of u that this reads besides those of the actuators."""
-        return ()
-
     @abstractmethod
     def force(self, state: State) -> Float[Tensor, "*#batch nv"]:
         """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""

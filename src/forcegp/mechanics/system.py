@@ -147,9 +147,16 @@ class MechanicalSystem(Summary):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the columns of u: actuators, then what known forces read, then switches of contacts (1 or 0)."""
+        """Names of the columns of u: actuators, observed wrenches, then switches of contacts (1 or 0)."""
         switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)
-        return (*self.actuation.names, *(name for force in self.known_forces for name in force.input_names), *switches)
+        observed = (force.names for force in self.known_forces if isinstance(force, ObservedWrench))
+        return (*self.actuators, *(name for names in observed for name in names), *switches)
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the first columns of u, those that are commanded: of `Actuation`, then of `Thrusters`."""
+        thrusters = (force.names for force in self.known_forces if isinstance(force, Thrusters))
+        return (*self.actuation.names, *(name for names in thrusters for name in names))
 
     @property
     def held_inputs(self) -> tuple[int, ...]:

@@ -21,11 +21,6 @@ class LinkForce(KnownForce):
     frame: str
     names: tuple[str, ...]
 
-    @property
-    @override
-    def input_names(self) -> tuple[str, ...]:
-        return self.names
-
     @abstractmethod
     def wrench(self, state: State) -> Float[Tensor, "*batch 6"]:
         """Force [N], then torque [Nm] about the origin of the link, in the link's axes."""
