@@ -35,6 +35,7 @@ NAMES = {
     "tool-forces": SURFACE_FORCES,
     "contact-friction": ContactFriction(),
     "load-friction": ContactFriction(load=True),
+    "foot-friction:contacts=0": ContactFriction(load=True),
     "friction-map": ContactFriction(viscous=True, inputs=("position",)),
     "payload:frame=hand": Payload("hand"),
     "base-wrench:frame=hand": BaseWrench("hand"),

@@ -7,6 +7,7 @@ import torch
 
 from forcegp.checks.check_input import Finding, look, ok, wrong
 from forcegp.data import Dataset
+from forcegp.errors import ContactError
 from forcegp.mechanics import MechanicalSystem
 
 RESTING, MOVING = 0.02, 0.1
@@ -16,10 +17,14 @@ FEW = 0.05
 
 
 def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """Of every switch: flags that are neither 0 nor 1, feet that move while they stand, and that rest while free.
+    """Contacts that contradict each other; of every switch: flags that are neither 0 nor 1, feet that move while they stand, and that rest while free.
 
     A foot that stands has A v = 0 in all directions that its contacts hold.
     """
+    try:
+        system.check_states(*(torch.tensor(x, device=system.robot.device) for x in (dataset.q, dataset.v, dataset.u)))
+    except ContactError as error:
+        yield wrong(subject="contacts", seen=str(error))
     names = dict.fromkeys(contact.switch for contact in system.contacts if contact.switch is not None)
     if not names:
         return

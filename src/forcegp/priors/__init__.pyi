@@ -1,5 +1,5 @@
 from .base_wrench import AerodynamicForce as AerodynamicForce, BaseWrench as BaseWrench
-from .contact_friction import ContactFriction as ContactFriction
+from .contact_friction import ContactFriction as ContactFriction, foot_friction as foot_friction
 from .force_prior import (
     ForcePrior as ForcePrior, Scaling as Scaling, SumPrior as SumPrior, has_few_inputs as has_few_inputs,
 )

@@ -344,3 +344,14 @@ def _wants_load(term: ForcePrior) -> bool:
     if not isinstance(term, ContactFriction) or not term.load or term.expected is not None:
         return False
     return term.axes == "isotropic" and term.inputs == ("velocity",) and not term.viscous
+
+
+def foot_friction(contacts: tuple[int, ...] = (0, 1, 2, 3)) -> ForcePrior:
+    """Friction under feet that slide: a `ContactFriction` in proportion to the normal force at each of the contacts.
+
+    The contacts are surfaces on which feet slide, such as `Contact(foot, point, Plane(...), switch=...)`; in rows whose
+    switch is 0 there is neither normal force nor friction. Points that are held (`fixed_point`) do not slide.
+    Raises InvalidInput for no contact.
+    """
+    feet = tuple(ContactFriction(contact=int(contact), load=True) for contact in contacts)
+    return feet[0] if len(feet) == 1 else SumPrior(feet)

@@ -11,7 +11,7 @@ from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_
 from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.surfaces import object_from_dict
 from forcegp.priors.base_wrench import AerodynamicForce, BaseWrench
-from forcegp.priors.contact_friction import ContactFriction
+from forcegp.priors.contact_friction import ContactFriction, foot_friction
 from forcegp.priors.force_prior import ForcePrior, SumPrior
 from forcegp.priors.joint_forces import JointAccelerations, JointForces, JointFriction, NoForces, PeriodicJointForces
 from forcegp.priors.kernels import KERNELS
@@ -90,6 +90,7 @@ NAMED_PRIORS: dict[str, NamedPrior] = {
     ),
     "contact-friction": NamedPrior("isotropic friction at the contact, on the sliding speed", ContactFriction),
     "load-friction": NamedPrior("the same, proportional to the normal force", ContactFriction, (("load", True),)),
+    "foot-friction": NamedPrior("the same under several feet that slide: foot-friction:contacts=0/1", foot_friction),
     "friction-map": NamedPrior(
         "viscous friction at the contact whose coefficient depends on the place",
         ContactFriction,
