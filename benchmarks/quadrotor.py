@@ -1,9 +1,9 @@
 """A drone in wind that it has not met: force priors against the best parametric model and against an independent GP.
 
 Each seed trains on one flight of 60 s in wind of 4 m/s and tests on four others in 0, 3, 8 and 12 m/s. The lag of the
-rotors is estimated from the training flight. The parametric model is least squares from all training rows on thrust,
-drag (linear and quadratic, along each axis), products of thrust and velocity, rates, height and a constant force of
-the world. `observed` adds the wrench that its residuals leave, from the past .1 s, as ours does.
+rotors is estimated from the training flight. The parametric model is linear in thrust and torques, drag (linear and
+quadratic, along each axis), rates, height and a constant force of the world, with learned variances, from 1,000 rows.
+Both observe the wind from past rows (`forcegp.models.observing`), or not: "unobserved".
 """
 
 import argparse
@@ -74,7 +74,7 @@ def seed_scores(seed: int, lag: float, points: int) -> dict[str, object]:
 
 
 def parametric(rows: Dataset) -> Posterior:
-    """Least squares from all rows: the linear kernel of the same features, with variances that do not shrink."""
+    """Linear in the same features."""
     model = StructuredGP(rows.system, AerodynamicForce(kernel="linear"))
     return model.fit(rows, points=1000, restarts=1)
 

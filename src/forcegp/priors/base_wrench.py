@@ -91,7 +91,7 @@ class BaseWrench(ExpressedKernels):
             "velocity": lambda: linear,
             "drag": lambda: (linear.square().sum(-1, keepdim=True) + 1e-12).sqrt() * linear,
             "angular-velocity": lambda: angular,
-            "thrust": lambda: state.delivered[..., _base_rows(state.robot)][..., 2:],
+            "thrust": lambda: state.delivered[..., _base_rows(state.robot)][..., _thrust(state.robot)],
             "actuation": lambda: state.delivered[..., _base_rows(state.robot)],
             "height": lambda: where.position[..., 2:],
             "attitude": lambda: where.orientation.flatten(-2),
@@ -118,7 +118,7 @@ class BaseWrench(ExpressedKernels):
             "velocity": [f"velocity of {link} along its {axis} [m/s]" for axis in AXES],
             "drag": [f"speed times velocity of {link} along its {axis} [m^2/s^2]" for axis in AXES],
             "angular-velocity": [f"angular velocity of {link} about its {axis} [rad/s]" for axis in AXES],
-            "thrust": pushes[2:],
+            "thrust": pushes[_thrust(robot)],
             "actuation": pushes,
             "height": [f"height of {link} [m]"],
             "attitude": [f"world {world} along {axis} of {link}" for world in AXES for axis in AXES],
@@ -163,6 +163,11 @@ def _halves(six: Tensor) -> tuple[Tensor, Tensor]:
 
 def _base_rows(robot: Robot) -> slice:
     return robot.layout.groups[0].rows if robot.layout.groups else slice(0, robot.nv)
+
+
+def _thrust(robot: Robot) -> slice:
+    """Which of the base rows thrusters that point up can drive; all where the base has no such rows."""
+    return slice(2, None) if robot.layout.groups else slice(None)
 
 
 def _base_parts(robot: Robot) -> tuple[str, ...]:
