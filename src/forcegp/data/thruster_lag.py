@@ -41,7 +41,7 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
         X = np.concatenate([_fast(_causes(part, columns, powers, row, float(seconds)), part.time) for part in episodes])
         X /= np.linalg.norm(X, axis=0) + 1e-300
         sums = [(X[k].T @ X[k], X[k].T @ target[k], np.square(target[k]).sum(0)) for k in blocks]
-        whole = [sum(part) for part in zip(*sums, strict=True)]
+        whole = [np.sum(part, axis=0) for part in zip(*sums, strict=True)]
         without = [[a - b for a, b in zip(whole, own, strict=True)] for own in sums]
         misfits.append([_log_residual(*parts) for parts in (whole, *without)])
     found = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])

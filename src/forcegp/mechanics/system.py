@@ -186,9 +186,12 @@ class MechanicalSystem(Summary):
         actuation, inputs = self.actuation, self.inputs
         count = len(actuation.names)
         plain = actuation.matrix is None and len(inputs) == count
-        pushing = (actuation, *(force for force in self.known_forces if isinstance(force, Thrusters)))
-        delivered_by = None if plain else lambda state: sum(force.force(state) for force in pushing)
-        return State.of(self.robot, q, v, u, inertials, inputs, delivered_by)
+        pushing = [force for force in self.known_forces if isinstance(force, Thrusters)]
+
+        def delivered(state: State) -> Tensor:
+            return sum((force.force(state) for force in pushing), actuation.force(state))
+
+        return State.of(self.robot, q, v, u, inertials, inputs, None if plain else delivered)
 
     def dynamics(
         self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None

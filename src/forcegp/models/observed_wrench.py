@@ -34,7 +34,7 @@ def observing(
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
     if seconds is None:
         chosen = posterior.settings.get("observe_seconds", USUAL)
-        seconds = 0.0 if own is None else chosen if own.observe is None else own.observe
+        seconds = 0.0 if own is None else float(chosen if own.observe is None else own.observe)
         if seconds == 0.0 or ObservedWrench in map(type, posterior.system.known_forces):
             return posterior, dataset
     if not 0.0 < seconds < 1e6:

@@ -52,7 +52,7 @@ def simulate_quadrotor(config: QuadrotorConfig, progress: Callable[[int, int], N
         if progress is not None:
             progress(episode + 1, config.episodes)
     q, v, u, a, wind = (np.concatenate(part) for part in zip(*parts, strict=True))
-    model = system.dynamics(*(torch.from_numpy(x) for x in (q, v, u)))
+    model = system.dynamics(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(u))
     Q_U = (model.M @ torch.from_numpy(a)[..., None])[..., 0] - model.Q_K
     streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
     noise = config.noise * np.concatenate([stream.standard_normal((steps, robot.nv)) for stream in streams])
