@@ -46,7 +46,7 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
         misfits.append([_log_residual(*parts) for parts in (whole, *without)])
     found = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])
     if not np.isfinite(found).all():
-        raise DatasetError("the recording shows no lag of the thrusters between 0 and .3 s; give --lag in s, or 0.")
+        raise DatasetError("the recording shows no lag of the thrusters between 0 and .3 s; give the lag in s, or 0.")
     return float(found[0]), float(np.sqrt((BLOCKS - 1) * np.var(found[1:])))
 
 

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from forcegp.data.motion_records import RecordedMotions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.rollout import Rollout
+from forcegp.robots.manifold import ConfigurationSpace
 
 INTERVAL = (0.025, 0.975)
 
@@ -17,7 +19,7 @@ INTERVAL = (0.025, 0.975)
 class RolloutErrors:
     """Errors of B rollouts against recorded motions; NaN where a rollout had diverged.
 
-    joint: (B, T+1, nv) |q - q_recorded| in rad or m.
+    joint: (B, T+1, nv) |q - q_recorded| in rad or m; of a base that moves, displacement and turn along its own axes.
     tool: (B, T+1) largest distance of a contact point from the recorded one in m; None without contacts.
     constraint: (B, T+1) largest |c(q)| of a contact in m; None without contacts. recorded_constraint: that of the
         recording.
@@ -38,26 +40,26 @@ class RolloutErrors:
 
 def rollout_errors(rollout: Rollout, recorded: RecordedMotions, system: MechanicalSystem) -> RolloutErrors:
     """Compare rollouts (B, T+1, nv) with the motions from whose first rows they began."""
-    system.robot.require_vectors("scores of rollouts")
     tool = constraint = recorded_constraint = spread = inside = None
     actual = torch.as_tensor(np.array(recorded.q), device=rollout.q.device)
     if system.contacts:
-        here, there = (system.robot.kinematics(q) for q in (rollout.q, actual))
+        lost = torch.isnan(rollout.q).any(-1)  # after a divergence
+        here, there = (system.robot.kinematics(q) for q in (torch.where(lost[..., None], actual, rollout.q), actual))
         apart = [
             torch.linalg.vector_norm(contact.position(here) - contact.position(there), dim=-1)
             for contact in system.contacts
         ]
-        tool = torch.stack(apart).amax(0).cpu().numpy()
+        tool = torch.where(lost, torch.nan, torch.stack(apart).amax(0)).cpu().numpy()
         constraint = rollout.constraint.abs().amax(-1).cpu().numpy()
         distances = [contact.distance(there).abs() for contact in system.contacts]
         recorded_constraint = torch.stack(distances).amax(0).cpu().numpy()
     if rollout.samples is not None or rollout.intervals is not None:
-        low, high = (end.cpu().numpy() for end in rollout.interval())
-        spread = 0.5 * (high - low)
-        inside = np.where(np.isnan(spread), np.nan, (low <= recorded.q) & (recorded.q <= high))
+        low, high = (end.cpu().numpy() for end in interval_about(rollout, rollout.q, system.robot.space))
+        spread, off = 0.5 * (high - low), apart_from(rollout.q, actual, system.robot.space).cpu().numpy()
+        inside = np.where(np.isnan(spread), np.nan, (low <= off) & (off <= high))
     return RolloutErrors(
         time=rollout.time.cpu().numpy(),
-        joint=(rollout.q - actual).abs().cpu().numpy(),
+        joint=apart_from(actual, rollout.q, system.robot.space).abs().cpu().numpy(),
         tool=tool,
         constraint=constraint,
         recorded_constraint=recorded_constraint,
@@ -65,3 +67,23 @@ def rollout_errors(rollout: Rollout, recorded: RecordedMotions, system: Mechanic
         inside=inside,
         diverged_at=rollout.diverged_at.cpu().numpy(),
     )
+
+
+def apart_from(q0: Tensor, q1: Tensor, space: ConfigurationSpace) -> Float[Tensor, "*batch nv"]:
+    """The way from q0 to q1: their difference, on the manifold where a base moves; NaN where one of them is."""
+    if space.is_vector_space:
+        return q1 - q0
+    lost = torch.isnan(q0).any(-1) | torch.isnan(q1).any(-1)
+    neutral = space.neutral().to(q1)
+    way = space.difference(*(torch.where(lost[..., None], neutral, q) for q in (q0, q1)))
+    return torch.where(lost[..., None], torch.nan, way)
+
+
+def interval_about(rollout: Rollout, q0: Tensor, space: ConfigurationSpace) -> tuple[Tensor, Tensor]:
+    """Ends of the 95 % interval of q as ways from q0 (..., nv)."""
+    if space.is_vector_space:
+        low, high = rollout.interval()
+        return low - q0, high - q0
+    assert rollout.samples is not None, "calibrated intervals of motions refuse bases that move"
+    low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), rollout.q.new_tensor(INTERVAL), dim=0)
+    return low, high

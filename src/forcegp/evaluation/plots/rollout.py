@@ -3,14 +3,16 @@
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
+from forcegp.data.configurations import space_of
 from forcegp.data.motion_records import RecordedMotions
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors
+from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors, apart_from, interval_about
 from forcegp.models.rollout import Rollout
 
 COLUMNS = 4
@@ -22,24 +24,28 @@ def rollout_figure(
     rollout: Rollout, recorded: RecordedMotions, errors: RolloutErrors, dataset: Dataset, title: str
 ) -> Figure:
     """The first motion joint by joint, with the 95 % interval of the samples; below, the errors of all motions."""
-    nv = rollout.q.shape[-1]
+    nv, space = len(dataset.joint_names), space_of(dataset)
+    # a base that moves is drawn by its way from where it began
+    origin = torch.zeros_like(rollout.q[0]) if space.is_vector_space else rollout.q[0, :1].expand_as(rollout.q[0])
+    mean = apart_from(origin, rollout.q[0], space).cpu().numpy()
+    actual = apart_from(origin, torch.as_tensor(np.array(recorded.q[0]), device=origin.device), space).cpu().numpy()
     grid_rows = -(-nv // COLUMNS)
     figure = style.new_figure(11.0, 1.9 * grid_rows + 3.9)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.9 * grid_rows + 0.6, 3.3))
     above, below = halves
     axes = style.joint_panels(above, nv, COLUMNS)
     names, units = style.short_joint_names(dataset.joint_names), style.joint_units(dataset, "q")
-    mean = rollout.q[0].cpu().numpy()
     band, label = None, ""
     if errors.spread is not None:
-        band = np.stack([end.cpu().numpy()[0] for end in rollout.interval()])
+        whole = torch.zeros_like(rollout.q) if space.is_vector_space else rollout.q[:, :1].expand_as(rollout.q)
+        band = np.stack([end.cpu().numpy()[0] for end in interval_about(rollout, whole, space)])
         label = "95 % interval" if rollout.samples is None else f"95 % of {len(rollout.samples.q)} samples"
         label = label if rollout.intervals is None else "95 % interval, calibrated"
     for joint, (panel, lowest) in enumerate(axes):
         if band is not None:
             low, high = band[..., joint]
             panel.fill_between(errors.time, low, high, color=style.PREDICTION, alpha=0.25, linewidth=0, label=label)
-        style.draw_line(panel, errors.time, recorded.q[0, :, joint], style.TRUTH, 1.4, "recorded")
+        style.draw_line(panel, errors.time, actual[:, joint], style.TRUTH, 1.4, "recorded")
         dashed = {"label": "rollout of the mean", "linestyle": style.DASHED}
         style.draw_line(panel, errors.time, mean[:, joint], style.PREDICTION, 1.4, **dashed)
         panel.margins(x=0)

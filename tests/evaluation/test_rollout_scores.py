@@ -1,0 +1,64 @@
+"""Errors and pictures of motions of a base that moves, on the manifold of its positions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from forcegp import JointFriction, StructuredGP
+from forcegp.data import recorded_motions
+from forcegp.evaluation import rollout_errors, rollout_figure
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate_quadruped(QuadrupedConfig(seconds=2.0, seed=4))
+
+
+@pytest.fixture(scope="module")
+def posterior(log):
+    return StructuredGP(log.system, JointFriction()).fit(log, points=20, restarts=1)
+
+
+def rolled(posterior, log, **how):
+    recorded = recorded_motions(log, [10, 200], 0.1)
+    return posterior.rollout(recorded.q[:, 0], recorded.v[:, 0], recorded.u, recorded.dt, **how), recorded
+
+
+def test_errors_are_ways_on_the_manifold(posterior, log):
+    rollout, recorded = rolled(posterior, log)
+    robot = log.system.robot
+    step = 0.05 * torch.randn(*recorded.v.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    moved = robot.integrate(torch.tensor(recorded.q), step)
+    turned = moved.clone()
+    turned[..., 3:7] *= -1.0  # the same orientation
+    for q in (moved, turned):
+        errors = rollout_errors(replace(rollout, q=q), recorded, log.system)
+        np.testing.assert_allclose(errors.joint, step.abs(), atol=1e-12)
+    lost = moved.clone()
+    lost[1, 5:] = torch.nan
+    errors = rollout_errors(replace(rollout, q=lost), recorded, log.system)
+    assert np.isnan(errors.joint[1, 5:]).all()
+    assert np.isfinite(errors.joint[1, :5]).all()
+
+
+def test_samples_give_intervals_about_the_mean(posterior, log):
+    rollout, recorded = rolled(posterior, log, samples=8)
+    errors = rollout_errors(rollout, recorded, log.system)
+    assert errors.spread.shape == errors.inside.shape == recorded.v.shape
+    ways = log.system.robot.difference(rollout.q.expand_as(rollout.samples.q), rollout.samples.q).numpy()
+    low, high = np.quantile(ways, (0.025, 0.975), axis=0)
+    np.testing.assert_allclose(errors.spread, 0.5 * (high - low), atol=1e-14)
+
+
+def test_a_base_is_drawn_by_its_way_from_the_start(posterior, log):
+    rollout, recorded = rolled(posterior, log, samples=8)
+    errors = rollout_errors(rollout, recorded, log.system)
+    figure = rollout_figure(rollout, recorded, errors, log, "title")
+    panels = figure.subfigs[0].axes
+    drawn = panels[0].lines[0].get_ydata()
+    start = torch.tensor(recorded.q[0, :1])
+    way = log.system.robot.difference(start.expand(len(drawn), -1), torch.tensor(recorded.q[0]))
+    np.testing.assert_allclose(drawn, way[:, 0], atol=1e-12)
