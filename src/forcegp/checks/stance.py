@@ -17,7 +17,7 @@ FEW = 0.05
 
 
 def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """Contacts that contradict each other; flags that are no flags; feet that move while they stand, or rest while free.
+    """Contacts that contradict each other; flags that are no flags; feet that move while standing, or rest while free.
 
     A foot that stands has A v = 0 in all directions that its contacts hold.
     """
