@@ -13,6 +13,7 @@ from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Actuation, RigidBodyBias
 from forcegp.models import observing
+from forcegp.report.motion import recorded_scene
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 
@@ -79,11 +80,13 @@ def test_a_lag_needs_thrusters(train):
 
 def test_new_wind_is_observed_from_the_past(posterior, test):
     rows = acting(test)
-    a = test.truth["a"][120:]
-    seeing, seen = observing(posterior, rows)
-    blind = a - posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy()
+    seeing, seen = observing(posterior, rows, seconds=0.05)
+    assert seen.time[0] - rows.time[0] == pytest.approx(0.05, abs=1 / 240)
+    a = np.interp(seen.time, test.time, np.arange(len(test))).round().astype(int)
+    a = test.truth["a"][a]
+    blind = a - posterior.predict(seen.q, seen.v, seen.u[:, :4], covariance=False).mean.numpy()
     left = a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.numpy()
-    assert np.all(np.square(left[24:]).mean(0) < 0.05 * np.square(blind[24:]).mean(0))
+    assert np.all(np.square(left).mean(0) < 0.05 * np.square(blind).mean(0))
     assert seen.system.held_inputs == tuple(range(4, 10))
     assert "Q_U" not in seen.truth
 
@@ -94,8 +97,9 @@ def test_an_observer_sees_the_past_only(posterior, test):
     other = rows.a.copy()
     other[200:] += 5.0
     _, changed = observing(posterior, replace(rows, a=other))
-    np.testing.assert_array_equal(changed.u[:201], seen.u[:201])
-    assert np.abs(changed.u[201] - seen.u[201]).max() > 0.0
+    here = 200 - (len(rows) - len(seen))
+    np.testing.assert_array_equal(changed.u[: here + 1], seen.u[: here + 1])
+    assert np.abs(changed.u[here + 1] - seen.u[here + 1]).max() > 0.0
 
 
 def test_predicted_motions_keep_the_wind_of_their_start(posterior, test):
@@ -118,3 +122,11 @@ def test_what_cannot_be_observed_is_refused(posterior, test):
         warnings.simplefilter("ignore")
         fitted = calm.fit(acting(test), points=30, restarts=1)
     assert observing(fitted, test) == (fitted, test)
+
+
+def test_a_report_shows_the_air_forces_at_the_body(posterior, test):
+    seeing, seen = observing(posterior, acting(test))
+    scene = recorded_scene(seen, seeing, seconds=1.0)
+    (arrows,) = [each for each in scene.arrows if each.title.startswith("aerodynamic")]
+    start = torch.tensor(arrows.start[:, 0])
+    np.testing.assert_allclose(start[0], seen.q[0, :3], atol=1e-12)

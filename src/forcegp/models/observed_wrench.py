@@ -24,8 +24,9 @@ def observing(
     Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016, section II). No row sees itself or
-    what follows. First rows of an episode hold zero. By default the prior's `AerodynamicForce` gives frame and time, or
-    the fit chose the time (`with_observer`); without one, or where its time is 0, both come back as they are.
+    what follows, and rows with a past shorter than that time are left out. By default the prior's `AerodynamicForce`
+    gives frame and time, or the fit chose the time (`with_observer`); without one, or where its time is 0, both come
+    back as they are.
 
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording whose rows are not in order of time.
@@ -39,8 +40,16 @@ def observing(
             return posterior, dataset
     if not 0.0 < seconds < 1e6:
         raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
+    frame = frame or (own or AerodynamicForce()).link(posterior.system.robot)
+    seeing, seen = _observed(posterior, dataset, seconds, frame)
+    first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
+    begun = np.array([first[number] for number in dataset.episode])
+    return seeing, seen.rows(np.flatnonzero(dataset.time - begun >= seconds))
+
+
+def _observed(posterior: AnyPosterior, dataset: Dataset, seconds: float, frame: str) -> tuple[AnyPosterior, Dataset]:
+    """Both with all rows; the first of an episode observes nothing."""
     robot = posterior.system.robot
-    frame = (own or AerodynamicForce(frame)).link(robot) if frame is None else frame
     q, v, u = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.u))
     with torch.no_grad():
         dynamics = posterior.dynamics(q, v, u)
@@ -69,7 +78,7 @@ def with_observer(posterior: AnyPosterior, dataset: Dataset) -> AnyPosterior:
         return posterior
 
     def error(seconds: float) -> float:
-        seeing, seen = observing(posterior, dataset, seconds=seconds)
+        seeing, seen = _observed(posterior, dataset, seconds, open_ones[0].link(posterior.system.robot))
         wrong = dataset.a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.cpu().numpy()
         return float(np.log(np.square(wrong).mean(0)).sum())
 

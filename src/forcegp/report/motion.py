@@ -15,13 +15,15 @@ from forcegp.mechanics import (
     Armature,
     ConstrainedDynamics,
     MechanicalSystem,
+    ObservedWrench,
     RigidBodyBias,
     RotorInertia,
+    Thrusters,
 )
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.components import term_slices
-from forcegp.priors import ForcePrior
+from forcegp.priors import BaseWrench, ForcePrior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
 
@@ -31,8 +33,8 @@ LONGEST_ARROW = 0.4
 """Of the reach of the robot, for a force that is large in its group."""
 LARGE = 98.0
 """Percentile of the largest force of each row: peaks do not make all other arrows short."""
-NOT_SHOWN = (Actuation, RigidBodyBias, Armature, RotorInertia)
-"""Known forces that are no finding: what the motors do, and inertia."""
+NOT_SHOWN = (Actuation, Thrusters, ObservedWrench, RigidBodyBias, Armature, RotorInertia)
+"""Known forces that are no finding at a joint: what motors do, wind on a base, and inertia."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,7 @@ def _laws(system: MechanicalSystem, dynamics: ConstrainedDynamics) -> torch.Tens
 
 def _place(term: ForcePrior, dynamics: ConstrainedDynamics) -> torch.Tensor:
     """World position (rows, 3) of the point at which a prior's force acts."""
-    frame = getattr(term, "frame", None)
+    frame = term.link(dynamics.state.robot) if isinstance(term, BaseWrench) else getattr(term, "frame", None)
     if frame is None:
         return dynamics.contacts[getattr(term, "contact", 0)].position(dynamics.state.kinematics)
     pose = dynamics.state.kinematics.frame_pose(frame)
