@@ -105,7 +105,7 @@ def evaluation_sentence(evaluation: Evaluation, unit: str) -> str:
     """The result of an evaluation in one sentence."""
     error, known = evaluation.mae, evaluation.known_physics_mae
     better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
-    held = 100.0 * evaluation.coverage_95
+    held, unit = 100.0 * evaluation.coverage_95, f"in {unit}" if unit.startswith("the ") else unit
     return (
         f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit}{better}; "
         f"95 % intervals contain {held:.0f} %."
