@@ -98,6 +98,11 @@ def import_recordings(
     if not out.parent.is_dir():
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot = None if system is None else system.robot
+    if robot is not None and not robot.space.is_vector_space:
+        raise InvalidInput(
+            f"logs are imported by joint, and the base of {robot.name} moves; make a Dataset of its poses in Python "
+            "(docs/how-to/moving-bases.md, a log of your own), or give base='fixed' for a robot on a stand."
+        )
     sources = _sources([Path(path) for path in paths], mapping)
     plans = [signal_plan(mapping, source, robot) for _, source in sources]
     plan = plans[0]
