@@ -9,7 +9,7 @@ from forcegp.errors import MissingExtra, SimulationError
 from forcegp.robots import Robot
 from forcegp.simulation.bullet import BulletArm
 from forcegp.simulation.kuka_motion import TOOL_LINK, kuka_urdf
-from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.scenarios import KukaSurfaceConfig
 
 pytest.importorskip("pybullet")
 

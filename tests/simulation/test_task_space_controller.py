@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from forcegp.simulation.bullet import ArmState
-from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import TaskSpaceController, rotation_vector
 
 

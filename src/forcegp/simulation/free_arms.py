@@ -1,19 +1,18 @@
 """`ur5-free` and `double-pendulum`: arms that touch nothing, with friction in every joint, by our own dynamics."""
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from forcegp import __version__
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
 from forcegp.robots import Robot
-from forcegp.simulation.kuka_surface_config import FreeArmConfig
+from forcegp.simulation.recording import RATE, recorded
+from forcegp.simulation.scenarios import FreeArmConfig
 
-RATE, FINE = 240, 4  # rows per second, and steps between two
+FINE = 4  # steps between two rows
 STIFFNESS = 100.0  # of the controller in 1/s^2, critically damped
 COULOMB, STATIC, VISCOUS = 0.02, 0.03, 0.01  # of a joint's largest torque; viscous per rad/s
 STRIBECK, SMOOTH, SIZE, RATES = 0.1, 0.02, 0.35, (0.8, 3.5)  # [rad/s]; of the sines that joints follow [rad, rad/s]
@@ -43,7 +42,7 @@ def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None
         slope = dt * size * (static / SMOOTH * (1.0 - np.tanh(v / SMOOTH) ** 2) + VISCOUS)
         return np.linalg.solve(M + np.diag(slope), u + friction(v) - h)
 
-    steps, rows, noise = max(2, round(config.seconds * RATE)), [], []
+    steps, rows = max(2, round(config.seconds * RATE)), []
     for episode in range(config.episodes):
         rng = np.random.default_rng([config.seed, episode])
         amplitude, w = SIZE * rng.uniform(0.5, 1.0, (2, robot.nv)), rng.uniform(*RATES, (2, robot.nv))
@@ -62,15 +61,7 @@ def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None
                 q = q + v / (RATE * FINE)
             if progress is not None and k % RATE == 0:
                 progress(episode * steps + k, config.episodes * steps)
-        noise.append(np.random.default_rng([config.seed, episode, 1]).standard_normal((steps, robot.nv)))
     q, v, u, a, Q_U = map(np.array, zip(*rows, strict=True))
-    return Dataset(
-        q=q, v=v, u=u, a=a + config.noise * np.concatenate(noise),
-        time=np.tile(np.arange(steps) / RATE, config.episodes),
-        episode=np.repeat(np.arange(config.episodes), steps),
-        units=units_for(robot),
-        system=MechanicalSystem(robot, known_forces=(Actuation(), RigidBodyBias())),
-        noise_std=np.full(robot.nv, config.noise) if config.noise > 0 else None,
-        truth={"a": a, "Q_U": Q_U} | ({"Q_U.joint-friction": Q_U} if size.any() else {}),
-        metadata={"scenario": config.arm, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}},
-    )  # fmt: skip
+    system = MechanicalSystem(robot, known_forces=(Actuation(), RigidBodyBias()))
+    truth = {"Q_U": Q_U} | ({"Q_U.joint-friction": Q_U} if size.any() else {})
+    return recorded(config.arm, config, system, {"q": q, "v": v, "u": u, "a": a}, truth)

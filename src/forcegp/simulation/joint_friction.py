@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.scenarios import KukaSurfaceConfig
 
 OF_VELOCITY = ("coulomb", "stribeck", "exponential", "asymmetric")
 """Laws that are a curve over the velocity."""

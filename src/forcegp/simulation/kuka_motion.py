@@ -21,7 +21,7 @@ from forcegp.simulation.contact_forces import (
     with_tool_sphere,
 )
 from forcegp.simulation.joint_friction import JointFrictionLaw
-from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
 
 TOOL_LINK = "lbr_iiwa_link_7"

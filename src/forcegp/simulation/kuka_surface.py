@@ -13,7 +13,7 @@ from forcegp.errors import SimulationError
 from forcegp.mechanics import Actuation, Baumgarte, Contact, MechanicalSystem, RigidBodyBias
 from forcegp.robots import Robot
 from forcegp.simulation.kuka_motion import TOOL_LINK, Motion, kuka_urdf, random_stream, simulate_episode
-from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import table_of
 
 Progress = Callable[[int, int], None]

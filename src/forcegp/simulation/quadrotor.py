@@ -6,7 +6,6 @@ and near the ground. Forms and sizes after Mahony, Kumar & Corke, "Multirotor ae
 Franchi & Scaramuzza, IEEE RA-L 2018 (rotor drag); Cheeseman & Bennett, ARC R&M 3021, 1955 (ground).
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -15,13 +14,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from forcegp import __version__
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, Thrusters
 from forcegp.robots import Robot
-from forcegp.simulation.kuka_surface_config import QuadrotorConfig
+from forcegp.simulation.recording import RATE, recorded
+from forcegp.simulation.scenarios import QuadrotorConfig
 
-RATE, FINE = 240, 2  # rows per second, and steps between two
+FINE = 2  # steps between two rows
 PLACES = np.array([(0.13, -0.13, 0.02), (-0.13, 0.13, 0.02), (0.13, 0.13, 0.02), (-0.13, -0.13, 0.02)])  # m
 TORQUE = 0.016 * np.array([1.0, 1.0, -1.0, -1.0])  # m, on the body about z, to the thrust of a rotor
 THRUST, DATASHEET = 1.1e-5, 1.02e-5  # N per (rad/s)^2: the true one, and the one that the model is given
@@ -54,21 +53,9 @@ def simulate_quadrotor(config: QuadrotorConfig, progress: Callable[[int, int], N
     q, v, u, a, wind = (np.concatenate(part) for part in zip(*parts, strict=True))
     model = system.dynamics(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(u))
     Q_U = (model.M @ torch.from_numpy(a)[..., None])[..., 0] - model.Q_K
-    streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
-    noise = config.noise * np.concatenate([stream.standard_normal((steps, robot.nv)) for stream in streams])
-    return Dataset(
-        q=q, v=v, u=u, a=a + noise,
-        time=np.tile(np.arange(steps) / RATE, config.episodes),
-        episode=np.repeat(np.arange(config.episodes), steps),
-        units=units_for(robot),
-        system=system,
-        noise_std=np.full(robot.nv, config.noise) if config.noise > 0 else None,
-        truth={"a": a, "Q_U": Q_U.numpy()},
-        metadata={
-            "scenario": "quadrotor", "config": dataclasses.asdict(config), "versions": {"forcegp": __version__},
-            "wind": wind.reshape(config.episodes, steps, 3).mean(1).tolist(),
-        },
-    )  # fmt: skip
+    mean = wind.reshape(config.episodes, steps, 3).mean(1).tolist()
+    motion = {"q": q, "v": v, "u": u, "a": a}
+    return recorded("quadrotor", config, system, motion, {"Q_U": Q_U.numpy()}, {"wind": mean})
 
 
 def _episode(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> tuple[np.ndarray, ...]:

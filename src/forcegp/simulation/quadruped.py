@@ -5,7 +5,6 @@ follow an arc. Joint angles, velocities and accelerations follow from it exactly
 under which the robot moves so (inverse dynamics, foot forces closest to an even share of the weight).
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -14,15 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp import __version__
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.errors import NumericalError
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, fixed_point
 from forcegp.robots import Robot, parameters_from_physical
 from forcegp.robots.inertia import pseudo_inertia
-from forcegp.simulation.kuka_surface_config import QuadrupedConfig
+from forcegp.simulation.recording import RATE, recorded
+from forcegp.simulation.scenarios import QuadrupedConfig
 
-RATE = 240
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 STANCE = (0.0, 0.75, -1.5)  # roll, hip pitch and knee in rad
 SHIFT, TURN = (0.02, 0.015, 0.025), (0.10, 0.10, 0.12)  # of the base in m and rad, sums of two sines
@@ -48,22 +46,15 @@ def simulate_quadruped(config: QuadrupedConfig, progress: Callable[[int, int], N
         if progress is not None:
             progress(episode + 1, config.episodes)
     q, v, u, a, Q_U, forces = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
-    noise = config.noise * np.concatenate([stream.standard_normal((steps, robot.nv)) for stream in streams])
     stands = np.repeat(u[:, -len(LEGS) :], 3, axis=1)
-    return Dataset(
-        q=q, v=v, u=u, a=a + noise,
-        time=np.tile(np.arange(steps) / RATE, config.episodes),
-        episode=np.repeat(np.arange(config.episodes), steps),
-        units=units_for(robot),
-        system=system,
-        noise_std=np.full(robot.nv, config.noise) if config.noise > 0 else None,
-        truth={"a": a, "lambda": forces, "in_contact": stands, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
-        metadata={
-            "scenario": "quadruped", "config": dataclasses.asdict(config), "versions": {"forcegp": __version__},
-            "payload": {"frame": "trunk", "mass": config.payload, "center": list(PLACE)},
-        },
-    )  # fmt: skip
+    return recorded(
+        "quadruped",
+        config,
+        system,
+        {"q": q, "v": v, "u": u, "a": a},
+        {"lambda": forces, "in_contact": stands, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
+        {"payload": {"frame": "trunk", "mass": config.payload, "center": list(PLACE)}},
+    )
 
 
 def _loaded(robot: Robot, payload: float) -> Robot:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 import forcegp.mechanics
 from forcegp.simulation.bullet import ArmState
-from forcegp.simulation.kuka_surface_config import KukaSurfaceConfig
+from forcegp.simulation.scenarios import KukaSurfaceConfig
 
 Heights = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]
 Aim = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
