@@ -6,8 +6,17 @@ import pytest
 import torch
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp.errors import InvalidInput
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, fixed_frame, fixed_point
+from forcegp.errors import ContactError, InvalidInput
+from forcegp.mechanics import (
+    Actuation,
+    Contact,
+    MechanicalSystem,
+    Plane,
+    RigidBodyBias,
+    Sphere,
+    fixed_frame,
+    fixed_point,
+)
 from forcegp.robots import Robot
 
 POINT = (0.05, -0.02, 0.1)
@@ -93,3 +102,27 @@ def test_matrices_that_do_not_fit_are_refused(robot):
         MechanicalSystem(robot, known_forces=(Actuation(np.eye(9)[:, :2], ("one", "one")),))
     with pytest.raises(InvalidInput, match="lists Actuation twice"):
         MechanicalSystem(robot, known_forces=(Actuation(), Actuation()))
+
+
+def test_noise_of_velocities_is_no_contradiction_of_a_flat_foot(robot):
+    """Three points of a link that turns by noise have centripetal accelerations that no motion of the link has."""
+    system = MechanicalSystem(robot, fixed_frame("a_foot"))
+    q, v, u = states(robot, 3)
+    noisy = 0.1 * v
+    dynamics = system.dynamics(q, noisy, u)
+    a = dynamics.acceleration_map().offset
+    assert float(((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs().max()) > 1e-3
+    system.check_states(q, noisy, u)
+
+
+def test_two_feet_that_hold_one_link_are_legal_and_a_sphere_through_a_held_point_is_not(robot):
+    feet = (*fixed_point("a_foot", POINT), *fixed_point("a_foot", POINT))
+    q, v, u = states(robot, 3)
+    MechanicalSystem(robot, feet).check_states(q, 0.1 * v, u)  # redundant
+    sphere = Contact("a_foot", POINT, Sphere((0.0, 0.0, -9.0), 3.0))
+    plane = Contact("a_foot", POINT, Plane((0.0, 0.0, 1.0), 0.0))
+    q[:, :3] = 0.0
+    kinematics = robot.kinematics(q)
+    q[:, :3] = torch.tensor([0.0, 0.0, 1.0]) - sphere.position(kinematics)  # above the centre: both normals are up
+    with pytest.raises(ContactError, match=r"contradict each other.*'a_foot'"):
+        MechanicalSystem(robot, (sphere, plane)).check_states(q, v, u)

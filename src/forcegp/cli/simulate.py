@@ -108,7 +108,7 @@ class Simulate(Command):
         fields = {name: value for name, value in given.items() if value is not None} | {"episodes": self.trajectories}
         if self.scenario != "kuka-surface":
             for word in self.words("tool_friction", "friction_coefficient", "patch", "surface", "contact_model"):
-                raise InvalidInput(f"{word} means nothing to {self.scenario}, whose arm touches nothing; leave it out.")
+                raise InvalidInput(f"{word} means nothing to {self.scenario}, which has no tool; leave it out.")
             if self.scenario == "quadrotor":
                 if self.joint_friction is not None:
                     raise InvalidInput(

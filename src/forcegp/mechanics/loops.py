@@ -37,6 +37,7 @@ class LoopClosure(Contact):
     about that axis instead.
     """
 
+    surface: Held
     second_frame: str = ""
     second_point: Point = (0.0, 0.0, 0.0)
     turning: bool = False
@@ -71,7 +72,7 @@ class LoopClosure(Contact):
         rows = slice(3, 6) if self.turning else slice(0, 3)
         ends = (self.frame, self.point), (self.second_frame, self.second_point)
         J_a, J_b = (kinematics.frame_jacobian(*end)[..., rows, :] for end in ends)
-        normal = J_a.new_tensor(self.surface.normal)  # type: ignore[attr-defined]  # a Held
+        normal = J_a.new_tensor(self.surface.normal)
         A = (normal[None] @ (J_a - J_b))[..., 0, :]
         drift = None
         if v is not None:
@@ -80,7 +81,7 @@ class LoopClosure(Contact):
         return Row(self.distance(kinematics), A, normal.expand(*A.shape[:-1], 3), drift)
 
     def _along(self, vector: Tensor) -> Tensor:
-        return vector @ vector.new_tensor(self.surface.normal)  # type: ignore[attr-defined]  # a Held
+        return vector @ vector.new_tensor(self.surface.normal)
 
     def _poses(self, kinematics: Kinematics) -> list[tuple[Tensor, Tensor]]:
         found = []

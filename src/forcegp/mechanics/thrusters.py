@@ -44,7 +44,7 @@ class Thrusters(LinkForce):
     s = u for `power` 1 (u is a thrust, or a share of it) and s = u |u| for `power` 2 (u is a rotor's speed). `thrust`
     in N per unit of s, `torque` in Nm per unit of s, positive for a torque on the link along the axis, so its sign is
     against the turn of the rotor. Both are one number, or one for each thruster. Columns of u are called `names`.
-    Source: Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012, eqs. 6-8. That u is a command which
+    Source: Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012. That u is a command which
     rotors follow late is no part of it: `Preparation(lag=...)` filters u.
     Raises InvalidInput for numbers that do not fit each other.
     """
@@ -90,7 +90,7 @@ class ObservedWrench(LinkForce):
     """A slow force on link `frame` that an observer estimates from the past, as wind makes it; columns of u hold it.
 
     They are called `names`: a force [N] at the origin of the link in the axes of the world, and where six are named a
-    torque [Nm]. `forcegp.data.with_observed_wrench` computes them from a recording. A prediction of motions keeps the
+    torque [Nm]. `forcegp.models.observing` computes them from a recording. A prediction of motions keeps the
     values of its start, since nobody can observe the future (`MechanicalSystem.held_inputs`).
     """
 

@@ -23,7 +23,7 @@ def observing(
 
     Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
-    et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016, section II). No row sees itself or
+    et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
     what follows, and rows with a past shorter than that time are left out. By default the prior's `AerodynamicForce`
     gives frame and time, or the fit chose the time (`with_observer`); without one, or where its time is 0, both come
     back as they are.

@@ -41,7 +41,7 @@ from forcegp.robots.urdf import FREE, MOVABLE, JointDescription, RobotDescriptio
 WORLD = -1
 BASE = "base"
 """Name of the joint between the world and a base that moves."""
-BASES = ("floating", "planar")
+BASES: tuple[BaseChoice, ...] = ("floating", "planar")
 """Joints by which a file itself holds its base."""
 OUTSIDE = "(world)"
 """What carries such a base; no link of the robot."""
@@ -187,7 +187,8 @@ def lay_out(
 def free_base(layout: Layout) -> BaseChoice:
     """How the root is held where nobody said it: by a joint of the file, or bolted."""
     kinds = [group.kind for group in layout.groups if layout.parents[group.body] == WORLD]
-    return next((kind for kind in kinds if kind in BASES), "fixed")  # type: ignore[return-value]  # a choice
+    held: list[BaseChoice] = [base for kind in kinds for base in BASES if base == kind]
+    return held[0] if held else "fixed"
 
 
 def _rows_of(joint: JointDescription) -> list[JointDescription]:

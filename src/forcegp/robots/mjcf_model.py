@@ -266,15 +266,16 @@ class CompiledModel:
             else:
                 bodies, poses = ends, [transform(np.eye(3), data[:3]), transform(np.eye(3), data[3:6])]
             if weld:
-                frames = [
-                    self._frame(f"{name}_{side}", body, pose)
+                first, second = (
+                    (self._frame(f"{name}_{side}", body, pose), (0.0, 0.0, 0.0))
                     for side, body, pose in zip("ab", bodies, poses, strict=True)
-                ]
-                points = [(0.0, 0.0, 0.0)] * 2
+                )
             else:
-                frames = [self.bodies[body] for body in bodies]
-                points = [tuple(pose[:3, 3].tolist()) for pose in poses]
-            yield LoopDescription(name, tuple(frames), tuple(points), weld)  # type: ignore[arg-type]  # two of each
+                first, second = (
+                    (self.bodies[body], (float(pose[0, 3]), float(pose[1, 3]), float(pose[2, 3])))
+                    for body, pose in zip(bodies, poses, strict=True)
+                )
+            yield LoopDescription(name, (first[0], second[0]), (first[1], second[1]), weld)
 
     def _frame(self, name: str, body: int, pose: np.ndarray) -> str:
         if np.array_equal(pose, np.eye(4)):
