@@ -71,8 +71,21 @@ def test_the_lag_of_the_rotors_is_found(lag):
     assert 0.0 < std < 0.02
 
 
+def test_the_lag_of_actuators_that_push_a_base_is_found():
+    """As MJCF has rotors: u are thrusts, and the columns of a matrix the wrenches of the base."""
+    dataset = simulate_quadrotor(QuadrotorConfig(seconds=30.0, seed=1))
+    rotors = dataset.system.known_forces[1]
+    q, v = (torch.zeros(4, size, dtype=torch.float64) for size in (7, 6))
+    q[:, 6] = 1.0
+    wrenches = rotors.force(dataset.system.state(q, v, torch.eye(4, dtype=torch.float64))) / rotors.thrust[0]
+    system = replace(dataset.system, known_forces=(Actuation(wrenches.mT, rotors.names), RigidBodyBias()))
+    thrusts = dataset.u**2 * float(rotors.thrust[0])
+    found, _ = estimate_thruster_lag(replace(dataset, system=system, u=thrusts, truth={}))
+    assert found == pytest.approx(0.06, rel=0.25)
+
+
 def test_a_lag_needs_thrusters(train):
-    joints = Actuation(torch.eye(6, dtype=torch.float64)[:, 2:], ("a", "b", "c", "d"))
+    joints = Actuation(torch.zeros(6, 4, dtype=torch.float64), ("a", "b", "c", "d"))
     system = replace(train.system, known_forces=(joints, RigidBodyBias()))
     with pytest.raises(InvalidInput, match="Thrusters"):
         estimate_thruster_lag(replace(train, system=system, truth={}))

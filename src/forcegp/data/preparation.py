@@ -16,7 +16,7 @@ from forcegp.data.delay import estimate_delay, shifted, torques_of_joints
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
 from forcegp.data.held_out_cutoff import held_out_cutoff
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
-from forcegp.data.thruster_lag import estimate_thruster_lag
+from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
@@ -180,7 +180,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         how = getattr(given, name)
         if how not in AUTOMATIC:
             continue
-        if name == "lag" and how == "auto" and _flies(dataset):
+        if name == "lag" and how == "auto" and thruster_columns(dataset.system):
             seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
             chosen, reasons[name] = replace(chosen, lag=seconds), f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
             continue
@@ -190,16 +190,6 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         reasons[f"{name}_common"], reasons[f"{name}_common_std"] = _plain(np.array([found.common, found.common_std]))
         reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = _plain(found.seconds), _plain(found.std)
     return chosen, reasons
-
-
-def _flies(dataset: Dataset) -> bool:
-    """Whether thrusters push a base that moves."""
-    system = dataset.system
-    return (
-        system is not None
-        and not system.robot.space.is_vector_space
-        and len(system.actuators) > len(system.actuation.names)
-    )
 
 
 def _why(cutoff: float | None, spectrum: MotionSpectrum, dataset: Dataset) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -11,6 +12,7 @@ from forcegp.data.dataset import Dataset
 from forcegp.data.delay import lagged, lowest
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.robots.manifold import Group
 
 FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
 TRIED = np.linspace(0.0, 0.3, 31)  # s
@@ -28,47 +30,52 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     jackknife, as in `estimate_delay`). Raises InvalidInput without `Thrusters` on a base that moves freely, and
     DatasetError where the recording is too short, or shows no lag below .3 s.
     """
-    columns, powers, row = _thrusters(dataset)
+    found = thruster_columns(dataset.system)
+    if dataset.system is None or not found:
+        raise InvalidInput("this lag is that of thrusters: give a system with Thrusters and base='floating'.")
+    columns, powers, group = list(found), np.array(list(found.values())), dataset.system.robot.layout.groups[0]
     episodes = [part for _, part, _ in episodes_in_order(dataset) if part.time[-1] - part.time[0] > 2.0 * SETTLED]
     if sum(map(len, episodes)) < 1000:
         raise DatasetError(
             "the recording is too short for the lag of thrusters; record 1,000 rows or more, or give the lag in s."
         )
-    target = np.concatenate([_fast(part.a[:, row : row + 6], part.time) for part in episodes])
+    target = np.concatenate([_fast(part.a[:, group.rows], part.time) for part in episodes])
     blocks = np.array_split(np.arange(len(target)), BLOCKS)
     misfits = []
     for seconds in TRIED:
-        X = np.concatenate([_fast(_causes(part, columns, powers, row, float(seconds)), part.time) for part in episodes])
+        causes = [_causes(part, columns, powers, group, float(seconds)) for part in episodes]
+        X = np.concatenate([_fast(own, part.time) for own, part in zip(causes, episodes, strict=True)])
         X /= np.linalg.norm(X, axis=0) + 1e-300
         sums = [(X[k].T @ X[k], X[k].T @ target[k], np.square(target[k]).sum(0)) for k in blocks]
         whole = [np.sum(part, axis=0) for part in zip(*sums, strict=True)]
         without = [[a - b for a, b in zip(whole, own, strict=True)] for own in sums]
         misfits.append([_log_residual(*parts) for parts in (whole, *without)])
-    found = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])
-    if not np.isfinite(found).all():
+    lags = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])
+    if not np.isfinite(lags).all():
         raise DatasetError("the recording shows no lag of the thrusters between 0 and .3 s; give the lag in s, or 0.")
-    return float(found[0]), float(np.sqrt((BLOCKS - 1) * np.var(found[1:])))
+    return float(lags[0]), float(np.sqrt((BLOCKS - 1) * np.var(lags[1:])))
 
 
-def _thrusters(dataset: Dataset) -> tuple[list[int], np.ndarray, int]:
-    """Columns of u of the thrusters, the powers of which they act, and the first row of the free base."""
-    system = dataset.system
-    kind = forcegp.mechanics.Thrusters
-    forces = [] if system is None else [force for force in system.known_forces if isinstance(force, kind)]
+def thruster_columns(system: forcegp.mechanics.MechanicalSystem | None) -> dict[int, int]:
+    """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
     groups = () if system is None else system.robot.layout.groups
-    if system is None or not forces or not groups or groups[0].kind != "floating":
-        raise InvalidInput("this lag is that of thrusters: give a system with Thrusters and base='floating'.")
-    named = [(name, force.power) for force in forces for name in force.names]
-    return [system.inputs.index(name) for name, _ in named], np.array([power for _, power in named]), groups[0].row
+    if system is None or not groups or groups[0].kind != "floating":
+        return {}
+    matrix = system.actuation.matrix
+    pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))
+    kind = forcegp.mechanics.Thrusters
+    thrusters = [force for force in system.known_forces if isinstance(force, kind)]
+    named = {system.inputs.index(name): force.power for force in thrusters for name in force.names}
+    return {**{int(column): 1 for column in pushes}, **named}
 
 
 def _causes(
-    part: Dataset, columns: list[int], powers: np.ndarray, row: int, seconds: float
+    part: Dataset, columns: list[int], powers: np.ndarray, group: Group, seconds: float
 ) -> Float[np.ndarray, "rows causes"]:
     late = np.stack([lagged(part.u[:, column], part.time, seconds) for column in columns], axis=1)
     thrust = np.where(powers == 2, late * np.abs(late), late)
-    v, w = part.v[:, row : row + 3], part.v[:, row + 3 : row + 6]
-    axes = Rotation.from_quat(part.q[:, row + 3 : row + 7]).as_matrix().reshape(-1, 9)
+    v, w = part.v[:, group.rows][:, :3], part.v[:, group.rows][:, 3:]
+    axes = Rotation.from_quat(part.q[:, group.places][:, group.motion.turn]).as_matrix().reshape(-1, 9)
     speed = np.linalg.norm(v, axis=1, keepdims=True)
     turning = [np.cross(w, v), w[:, [1, 2, 0]] * w[:, [2, 0, 1]]]
     return np.concatenate([thrust, thrust.sum(1, keepdims=True) * v, v, speed * v, w, *turning, axes], axis=1)

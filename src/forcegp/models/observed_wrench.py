@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import ObservedWrench
-from forcegp.models.protocol import AnyPosterior
+from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
 from forcegp.priors import AerodynamicForce, ForcePrior
 
 USUAL, TRIED = 0.1, (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
+FEWEST_ROWS, TINY = 100, 1e-300
 NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
 
@@ -41,30 +43,14 @@ def observing(
     if not 0.0 < seconds < 1e6:
         raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
     frame = frame or (own or AerodynamicForce()).link(posterior.system.robot)
-    seeing, seen = _observed(posterior, dataset, seconds, frame)
-    first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
-    begun = np.array([first[number] for number in dataset.episode])
-    return seeing, seen.rows(np.flatnonzero(dataset.time - begun >= seconds))
-
-
-def _observed(posterior: AnyPosterior, dataset: Dataset, seconds: float, frame: str) -> tuple[AnyPosterior, Dataset]:
-    """Both with all rows; the first of an episode observes nothing."""
-    robot = posterior.system.robot
-    q, v, u = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.u))
-    with torch.no_grad():
-        dynamics = posterior.dynamics(q, v, u)
-        unexplained = torch.tensor(dataset.a, device=robot.device) - posterior.predict(q, v, u, covariance=False).mean
-        effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
-        wrench = (torch.linalg.pinv(effect, rtol=1e-9) @ unexplained[..., None])[..., 0].cpu().numpy()
-    observed = np.zeros((len(dataset), 6))
-    for number, rows, _ in episodes_in_order(dataset):
-        own_rows = np.flatnonzero(dataset.episode == number)
-        observed[own_rows] = _past_mean(wrench[own_rows], rows.time, seconds)
+    unexplained, effect = _unexplained(posterior, dataset, frame)
+    observed = _observed(unexplained, effect, dataset, seconds)
     system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
-    return posterior.with_system(system), replace(
-        dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth
-    )
+    seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
+    first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
+    age = dataset.time - np.array([first[number] for number in dataset.episode])
+    return posterior.with_system(system), seen.rows(np.flatnonzero(age >= seconds))
 
 
 def with_observer(posterior: AnyPosterior, dataset: Dataset) -> AnyPosterior:
@@ -74,15 +60,43 @@ def with_observer(posterior: AnyPosterior, dataset: Dataset) -> AnyPosterior:
     """
     prior: ForcePrior = posterior.model.prior
     open_ones = [term for term in prior.summands() if isinstance(term, AerodynamicForce) and term.observe is None]
-    if not open_ones or not dataset.time_ordered or len(dataset) < 100:
+    if not open_ones or not dataset.time_ordered or len(dataset) < FEWEST_ROWS:
         return posterior
+    unexplained, effect = _unexplained(posterior, dataset, open_ones[0].link(posterior.system.robot))
 
     def error(seconds: float) -> float:
-        seeing, seen = _observed(posterior, dataset, seconds, open_ones[0].link(posterior.system.robot))
-        wrong = dataset.a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.cpu().numpy()
-        return float(np.log(np.square(wrong).mean(0)).sum())
+        left = unexplained - np.einsum("nij,nj->ni", effect, _observed(unexplained, effect, dataset, seconds))
+        return float(np.log(np.square(left).mean(0) + TINY).sum())
 
     return posterior.with_settings(observe_seconds=min(TRIED, key=error))
+
+
+def _unexplained(
+    posterior: Posterior, dataset: Dataset, frame: str
+) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv 6"]]:
+    """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
+    device, parts = posterior.system.robot.device, []
+    for start in range(0, len(dataset), ROWS_PER_BLOCK):
+        block = slice(start, start + ROWS_PER_BLOCK)
+        q, v, u, a = (torch.tensor(x[block], device=device) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
+        with torch.no_grad():
+            dynamics = posterior.dynamics(q, v, u)
+            effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
+            parts.append((a - posterior.predict(q, v, u, covariance=False).mean, effect))
+    unexplained, effects = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
+    return unexplained, effects
+
+
+def _observed(
+    unexplained: Float[np.ndarray, "rows nv"], effect: Float[np.ndarray, "rows nv 6"], dataset: Dataset, seconds: float
+) -> Float[np.ndarray, "rows 6"]:
+    """The wrench that the rows before each show; none at the first of an episode."""
+    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
+    observed = np.zeros_like(wrench)
+    for number, rows, _ in episodes_in_order(dataset):
+        own = np.flatnonzero(dataset.episode == number)
+        observed[own] = _past_mean(wrench[own], rows.time, seconds)
+    return observed
 
 
 def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:
