@@ -85,5 +85,6 @@ def interval_about(rollout: Rollout, q0: Tensor, space: ConfigurationSpace) -> t
         low, high = rollout.interval()
         return low - q0, high - q0
     assert rollout.samples is not None, "calibrated intervals of motions refuse bases that move"
-    low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), rollout.q.new_tensor(INTERVAL), dim=0)
+    levels = torch.tensor(INTERVAL, dtype=q0.dtype, device=q0.device)
+    low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), levels, dim=0)
     return low, high

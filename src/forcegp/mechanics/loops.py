@@ -72,22 +72,23 @@ class LoopClosure(Contact):
         rows = slice(3, 6) if self.turning else slice(0, 3)
         ends = (self.frame, self.point), (self.second_frame, self.second_point)
         J_a, J_b = (kinematics.frame_jacobian(*end)[..., rows, :] for end in ends)
-        normal = J_a.new_tensor(self.surface.normal)
-        A = (normal[None] @ (J_a - J_b))[..., 0, :]
+        normal = self.surface.gradient(self.position(kinematics))
+        A = (normal[..., None, :] @ (J_a - J_b))[..., 0, :]
         drift = None
         if v is not None:
             a, b = (kinematics.frame_bias_acceleration(*end)[..., rows] for end in ends)
             drift = self._along(a - b)
-        return Row(self.distance(kinematics), A, normal.expand(*A.shape[:-1], 3), drift)
+        return Row(self.distance(kinematics), A, normal, drift)
 
     def _along(self, vector: Tensor) -> Tensor:
-        return vector @ vector.new_tensor(self.surface.normal)
+        return (vector * self.surface.gradient(vector)).sum(-1)
 
     def _poses(self, kinematics: Kinematics) -> list[tuple[Tensor, Tensor]]:
         found = []
         for frame, point in ((self.frame, self.point), (self.second_frame, self.second_point)):
             pose = kinematics.frame_pose(frame)
-            found.append((pose[..., :3, :3], pose[..., :3, :3] @ pose.new_tensor(point) + pose[..., :3, 3]))
+            local = torch.tensor(point, dtype=pose.dtype, device=pose.device)
+            found.append((pose[..., :3, :3], pose[..., :3, :3] @ local + pose[..., :3, 3]))
         return found
 
 
