@@ -66,6 +66,8 @@ class MechanicalSystem(Summary):
         object.__setattr__(self, "known_forces", tuple(force.bound_to(self.robot) for force in self.known_forces))
         if sum(isinstance(force, Actuation) for force in self.known_forces) > 1:
             raise InvalidInput("known_forces lists Actuation twice; u acts once: put both into one matrix.")
+        if not all(isinstance(name, str) for name in self.inputs):
+            raise InvalidInput(f"columns of u are called {self.inputs}; give each a name that is text.")
         if len(set(self.inputs)) < len(self.inputs):
             raise InvalidInput(f"columns of u are called {', '.join(self.inputs)}; give each input its own name.")
         for contact in self.contacts:
@@ -125,6 +127,7 @@ class MechanicalSystem(Summary):
         return self.robot.to_mjcf(path, [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named])
 
     @classmethod
+    @usable_arguments("MechanicalSystem.from_file")
     def from_file(cls, path: str | Path, **options: Any) -> "MechanicalSystem":
         """The robot of a file with its closed loops, if it is MJCF; `options` are those of `Robot.from_file`."""
         return cls.from_mjcf(path, **options) if is_mjcf(read_text(path)) else cls(Robot.from_urdf(path, **options))

@@ -19,6 +19,7 @@ from forcegp.robots.arguments import (
     Vector,
     armature_values,
     broadcast_batch,
+    checked_tensor,
     finite_vector,
     locked_positions,
 )
@@ -155,6 +156,7 @@ class Robot(RobotStructure):
         return cls.read_mjcf(text, source, None, **options)[0]
 
     @classmethod
+    @usable_arguments("Robot.from_file")
     def from_file(cls, path: str | Path, **options: Any) -> "Robot":
         """:meth:`from_mjcf` where the root element is <mujoco>, else :meth:`from_urdf`; ``options`` are theirs."""
         return (cls.from_mjcf if is_mjcf(read_text(path)) else cls.from_urdf)(path, **options)
@@ -370,8 +372,10 @@ class Robot(RobotStructure):
         return self.space.neutral().to(self.device)
 
     def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
-        """q with quaternions, and pairs of cos and sin, divided by their lengths."""
-        return self.space.normalized(q)
+        """q with quaternions, and pairs of cos and sin, divided by their lengths. Raises InvalidInput for length 0."""
+        unit = self.space.normalized(checked_tensor("q", q, self.nq, f"positions of {self.name}", self.device))
+        self.space.check(unit)
+        return unit
 
     def random(self, generator: torch.Generator, rows: int = 1) -> Float[Tensor, "rows nq"]:
         """Positions drawn within the limits of the joints, else within half a turn or 1 m; turns of any direction."""
