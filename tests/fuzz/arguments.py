@@ -15,13 +15,33 @@ from hypothesis import strategies as st
 from tests.fuzz.made import INPUTS, QUICK
 from tests.fuzz.oracle import DefectError, Target, allowed
 from tests.models.arm import URDF, arm_system
+from tests.robots.mjcf_models import FOUR_BAR
 
 import forcegp
-from forcegp import models
+from forcegp import mechanics, models
 from forcegp.priors.named import named_prior
 
 STATE = (np.full(3, 0.3), np.full(3, 0.1), np.full(3, 0.5))
-TEXTS = ("", "x", "abc", "10", "nan", "joint", "\ud800", "a\nb", "auto", "joint +", "none", "base", "hand", "pan")
+POSE = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8])
+TEXTS = (
+    "",
+    "x",
+    "abc",
+    "10",
+    "nan",
+    "joint",
+    "\ud800",
+    "a\nb",
+    "auto",
+    "joint +",
+    "none",
+    "base",
+    "hand",
+    "pan",
+    "body",
+    "floating",
+    "planar",
+)
 TENSORS = (
     lambda: torch.ones(3, dtype=torch.float64, requires_grad=True),
     lambda: torch.ones(3, dtype=torch.complex128),
@@ -86,6 +106,11 @@ MADE: dict[str, Callable[[], Any]] = {
     "a Dataset of a row": lambda: INPUTS.data.rows([0]),
     "a Dataset of other joints": lambda: INPUTS.other,
     "a posterior": lambda: INPUTS.posterior,
+    "a Dataset of a drone": lambda: INPUTS.moving,
+    "array (7,)": lambda: np.ones(7),
+    "array (6,)": lambda: np.ones(6),
+    "array (2, 3)": lambda: np.ones((2, 3)),
+    "array (6, 2)": lambda: np.ones((6, 2)),
     "a robot": lambda: INPUTS.data.system.robot,
     "a system": lambda: INPUTS.data.system,
     "a free system": lambda: arm_system(0),
@@ -142,6 +167,29 @@ def _baumgarte(**arguments: Any) -> Any:
 
 def _robot_from(**arguments: Any) -> Any:
     return forcegp.Robot.from_urdf_text(**arguments).forward_dynamics(*(torch.tensor(x) for x in STATE))
+
+
+def _drone() -> Any:
+    return INPUTS.moving.system.robot
+
+
+def _link_force(kind: Any, **arguments: Any) -> Any:
+    made = kind(**arguments)
+    known = (made,) if kind is forcegp.Actuation else (forcegp.Actuation(), made)
+    system = forcegp.MechanicalSystem(_drone(), (), (*known, forcegp.RigidBodyBias()))
+    forcegp.MechanicalSystem.from_json(system.to_json())
+    return system.dynamics(POSE, np.zeros(6), np.ones(len(system.inputs))).M
+
+
+def _held(contacts: Any) -> Any:
+    system = INPUTS.moving.system.with_contacts(contacts)
+    return system.dynamics(POSE, np.zeros(6), np.ones(len(system.inputs))).A
+
+
+def _flying(made: Any) -> None:
+    dynamics = INPUTS.moving.system.dynamics(POSE[None], np.zeros((1, 6)), np.ones((1, 4)))
+    made.mixing(dynamics), made.features(dynamics)
+    made.latent_names(_drone())
 
 
 def _fitted(noise: Any) -> Any:
@@ -253,6 +301,70 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             **{"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None},
             **{"inertias": "strict", "base": None, "root": None, "strict": False},
         },
+    ),
+    "Robot.from_mjcf_text": (
+        lambda **k: repr(forcegp.Robot.from_mjcf_text(**k)),
+        lambda: {
+            **{"text": FOUR_BAR, "gravity": None, "armature": None, "locked": None, "inertias": "strict"},
+            **{"base": None, "strict": False},
+        },
+    ),
+    "MechanicalSystem.from_file": (
+        lambda **k: repr(forcegp.MechanicalSystem.from_file(**k)),
+        lambda: {"path": INPUTS.folder / "drone.xml", "base": None, "locked": None},
+    ),
+    "floating": (
+        lambda **k: forcegp.Robot.from_urdf_text(URDF, **k).neutral(),
+        lambda: {"base": "floating", "locked": None, "armature": None},
+    ),
+    "integrate": (lambda **k: _drone().integrate(**k), lambda: {"q": POSE, "step": np.full(6, 0.1)}),
+    "difference": (lambda **k: _drone().difference(**k), lambda: {"q0": POSE, "q1": POSE}),
+    "normalized": (lambda **k: _drone().normalized(**k), lambda: {"q": POSE}),
+    "dynamics (drone)": (
+        lambda **k: INPUTS.moving.system.dynamics(**k).M,
+        lambda: {"q": POSE, "v": np.full(6, 0.1), "u": np.full(4, 500.0)},
+    ),
+    "Thrusters": (
+        functools.partial(_link_force, mechanics.Thrusters),
+        lambda: {
+            **{"frame": "body", "places": [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], "thrust": 1.0, "torque": 0.1},
+            **{"axes": (0.0, 0.0, 1.0), "power": 2, "names": ("one", "two")},
+        },
+    ),
+    "ObservedWrench": (
+        functools.partial(_link_force, mechanics.ObservedWrench),
+        lambda: {"frame": "body", "names": ("x", "y", "z")},
+    ),
+    "Actuation": (
+        functools.partial(_link_force, forcegp.Actuation),
+        lambda: {"matrix": np.ones((6, 2)), "names": ("one", "two")},
+    ),
+    "fixed_point": (
+        lambda **k: _held(mechanics.fixed_point(**k)),
+        lambda: {"frame": "body", "point": (0.0, 0.0, 0.1), "switch": "stands"},
+    ),
+    "fixed_frame": (
+        lambda **k: _held(mechanics.fixed_frame(**k)),
+        lambda: {"frame": "body", "switch": "stands"},
+    ),
+    "loop_point": (
+        lambda **k: _held(mechanics.loop_point(**k)),
+        lambda: {
+            **{"frame_a": "body", "point_a": (0.0, 0.0, 0.1), "frame_b": "body", "point_b": (0.0, 0.0, 0.1)},
+            "switch": "stands",
+        },
+    ),
+    "AerodynamicForce": (
+        lambda **k: _flying(forcegp.AerodynamicForce(**k)),
+        lambda: {"frame": "body", "inputs": ("velocity", "thrust"), "kernel": "linear", "observe": 0.5},
+    ),
+    "BaseWrench": (
+        lambda **k: _flying(forcegp.BaseWrench(**k)),
+        lambda: {"frame": "body", "inputs": ("velocity",), "kernel": "linear"},
+    ),
+    "QuadrotorConfig": (
+        forcegp.simulation.QuadrotorConfig,
+        lambda: {"seconds": 1.0, "seed": 0, "noise": 0.1, "episodes": 1, "wind": 4.0, "lag": 0.06},
     ),
     "Robot.from_urdf": (forcegp.Robot.from_urdf, lambda: {"path": INPUTS.folder / "arm.urdf"}),
     "inverse_dynamics": (

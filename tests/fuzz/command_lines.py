@@ -15,8 +15,23 @@ from tests.fuzz.values import WORDS, hostile_pickle
 from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 from forcegp.errors import ForceGPError
 
-FILES = ("train.h5", "test.h5", "bare.h5", "arm.urdf", "log.csv", "log.yaml", "log.npz", "log.mcap")
+FILES = (
+    "moving.h5",
+    "drone.xml",
+    "arm.armature.json",
+    "train.h5",
+    "test.h5",
+    "bare.h5",
+    "arm.urdf",
+    "log.csv",
+    "log.yaml",
+    "log.npz",
+    "log.mcap",
+)
 NAMES = "carried network nowhere train.h5/x . .. hostile.pkl loop out.h5 out carried/model.json - -x ~"
+AIR = ("aerodynamic", "aerodynamic:frame=body", "aerodynamic:observe=0", "aerodynamic:observe=-1", "aerodynamic:")
+AIR += ("aerodynamic:observe=nan", "aerodynamic:frame=x", "aerodynamic:observe", "aerodynamic+aerodynamic")
+AIR += ("aerodynamic:height=1", "aerodynamic:inputs=x", "aerodynamic + base-wrench", "floating", "planar", "spherical")
 ODD = ("", "a" * 300, "nowhere/x.h5", "\udcff.h5", "x\udcff", "x\x00y", "\u202ex")
 PATHS = st.sampled_from((*FILES, *NAMES.split(), *ODD))
 """None is absolute, and commands run some folders deep: nothing outside of the folder of a case is ever named."""
@@ -51,6 +66,18 @@ VALID = {
     "reproduce": ("reproduce", "none-such", "--out", "out"),
 }
 """Command lines that are done at once, or refused at once."""
+MOVING = {
+    "robot": ("robot", "drone.xml"),
+    "robot ": ("robot", "arm.urdf", "--base", "floating"),
+    "check": ("check", "moving.h5"),
+    "prepare": ("prepare", "moving.h5", "--cutoff", "20", "--out", "out.h5"),
+    "prepare ": ("prepare", "moving.h5", "--cutoff", "20", "--lag", "auto", "--out", "out.h5"),
+    "fit": ("fit", "moving.h5", "--prior", "aerodynamic:frame=body", *SMALL, "--no-checks", "--out", "out"),
+    "fit ": ("fit", "moving.h5", "--prior", "base-wrench", *SMALL, "--no-checks", "--out", "out"),
+    "compare": ("compare", "moving.h5", "--priors", "aerodynamic,none", *SMALL),
+    "simulate": ("simulate", "quadrotor", "--seconds", "0.1", "--wind", "3", "--out", "out.h5"),
+}
+"""The same of robots whose base moves."""
 LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
 """Nobody may ask for so many seconds of simulation, say, in a test."""
 NEVER = ("debug", "browser")
@@ -69,6 +96,7 @@ class Line:
     """A valid command line with other words: at `where` % its length, `how` is done with `word`."""
 
     command: str
+    moving: str
     edits: list[tuple[int, str, str, str]]
 
 
@@ -77,13 +105,15 @@ def lines(draw: st.DrawFn) -> Line:
     command = draw(st.sampled_from(tuple(COMMANDS)))
     options = st.sampled_from(OPTIONS[command]) | st.sampled_from(OPTIONS[command]) | WORDS
     how = st.sampled_from(("option", "option", "option", "replace", "replace", "path", "drop", "insert"))
-    edit = st.tuples(st.integers(0, 40), how, options, WORDS | PATHS)
-    return Line(command, draw(st.lists(edit, min_size=1, max_size=4)))
+    edit = st.tuples(st.integers(0, 40), how, options, WORDS | PATHS | st.sampled_from(AIR))
+    own = [name for name in MOVING if name.strip() == command]
+    moving = draw(st.sampled_from(("", *own)))
+    return Line(command, moving, draw(st.lists(edit, min_size=1, max_size=4)))
 
 
 def words_of(case: Line) -> list[str]:
     """The words after `forcegp`."""
-    words = list(VALID[case.command])
+    words = list(MOVING[case.moving] if case.moving else VALID[case.command])
     for where, how, option, value in case.edits:
         place = where % len(words)
         match how:

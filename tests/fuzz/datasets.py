@@ -34,6 +34,10 @@ NAMES = (
 )
 ATTRIBUTES = ("format", "format_version", "written_by", "time_ordered", "units")
 ARRAYS = {
+    "no quaternions": lambda x: x * 1.5,
+    "fewer columns": lambda x: x[..., :-1],
+    "more columns": lambda x: np.concatenate([x, x[..., :1]], -1) if x.ndim else x,
+    "w first": lambda x: np.roll(x, 1, -1),
     "nan": lambda x: np.where(np.arange(x.size).reshape(x.shape) == 1, np.nan, x),
     "infinite": lambda x: x + np.inf,
     "huge": lambda x: x * 1e300,
@@ -93,7 +97,7 @@ class DataFile:
 
 CASES = st.builds(
     DataFile,
-    st.sampled_from(("train.h5", "test.h5", "bare.h5")),
+    st.sampled_from(("train.h5", "test.h5", "bare.h5", "moving.h5")),
     st.lists(CHANGES, min_size=1, max_size=3),
     st.none() | st.none() | st.none() | DAMAGE,
 )
@@ -175,8 +179,14 @@ def check_commands(case: DataFile, folder: Path) -> None:
     """The same files under the commands that read datasets."""
     write(case, folder / "data.h5")
     number = sum(map(ord, repr(case)))
-    words = ("check data.h5", "prepare data.h5 --cutoff 20 --out o.h5", f"evaluate {INPUTS.folder / 'carried'} data.h5")
-    require_ended_well(words[number % 3].split(), folder)
+    lag = "prepare data.h5 --cutoff 20 --lag auto --out o.h5"
+    words = (
+        "check data.h5",
+        lag,
+        "prepare data.h5 --cutoff 20 --out o.h5",
+        f"evaluate {INPUTS.folder / 'carried'} data.h5",
+    )
+    require_ended_well(words[number % 4].split(), folder)
 
 
 TARGET = Target(CASES, check, fast=100, nightly=3000)

@@ -20,12 +20,23 @@ from tests.recordings.log_files import (
     write_parquet,
     write_text,
 )
+from tests.robots.mjcf_models import FOUR_BAR, QUADROTOR
 
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import MechanicalSystem
+from forcegp.mechanics import (
+    Actuation,
+    MechanicalSystem,
+    ObservedWrench,
+    RigidBodyBias,
+    Thrusters,
+    fixed_point,
+    loop_point,
+)
 from forcegp.models import IndependentGP, NeuralNetwork, Noise, StructuredGP, save_posterior
 from forcegp.priors.named import named_prior
 from forcegp.robots import Robot
+from forcegp.simulation import QuadrotorConfig
+from forcegp.simulation.quadrotor import simulate_quadrotor
 
 MODELS = ("structured", "carried", "independent", "network")
 QUICK = OptimizerOptions(iterations=2)
@@ -71,4 +82,18 @@ def make(folder: Path) -> None:
     )
     INPUTS.folder, INPUTS.data, INPUTS.posterior, INPUTS.free = folder, data, plain, free
     INPUTS.other = dataset()
+    INPUTS.moving = simulate_quadrotor(QuadrotorConfig(seconds=0.3))
+    INPUTS.moving.save(folder / "moving.h5")
+    (folder / "drone.xml").write_text(QUADROTOR)
+    (folder / "arm.armature.json").write_text('{"pan": 0.1}')
+    INPUTS.systems = (INPUTS.moving.system.to_json(), looped().to_json())
     INPUTS.predictor = plain.predictor(compile=False)
+
+
+def looped() -> MechanicalSystem:
+    """A loop, a contact with a switch, and forces of every kind that files carry."""
+    robot = Robot.from_mjcf_text(FOUR_BAR.split("<equality>")[0] + "</mujoco>")
+    loop = loop_point("coupler", (0.4, 0.0, 0.05), "rocker", (0.0, 0.0, 0.25))
+    push = Thrusters("coupler", [[0.0, 0.0, 0.1]])
+    forces = (Actuation([[1.0], [0.0], [0.0]], ("motor",)), push, ObservedWrench("rocker"), RigidBodyBias())
+    return MechanicalSystem(robot, (*loop, *fixed_point("crank", (0.0, 0.0, 0.1), switch="held")), forces)

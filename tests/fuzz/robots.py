@@ -4,25 +4,52 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from hypothesis import strategies as st
 from tests.fuzz.oracle import DefectError, Target, allowed, require_no_code
-from tests.fuzz.values import DAMAGE, PROLOGUES, XML_EDITS, Damage, XmlEdit, damaged, edited_xml
+from tests.fuzz.values import DAMAGE, MJCF_EDITS, PROLOGUES, XML_EDITS, Damage, XmlEdit, damaged, edited_xml
 from tests.models.arm import URDF
+from tests.robots.mjcf_models import ALL
 
-from forcegp import Robot
+from forcegp import MechanicalSystem, Robot
 
 SECRET = "nobody may read this"
 
 
 @dataclass(frozen=True)
 class RobotFile:
-    """The arm with these edits, after this prologue, damaged."""
+    """A robot with these edits, after this prologue, damaged, held so, with rotor inertias in a file beside it."""
 
     edits: list[XmlEdit]
     prologue: str
     damage: Damage | None
+    robot: str = "arm"
+    base: Any = None
+    beside: str | None = None
+
+
+MIMIC = """<robot name="hand"><link name="palm"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="left" type="prismatic"><parent link="palm"/><child link="l"/><axis xyz="0 1 0"/><limit lower="0" upper="1"
+effort="1" velocity="1"/></joint><link name="l"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="right" type="revolute"><parent link="palm"/><child link="r"/><axis xyz="1 0 0"/><mimic joint="left"
+multiplier="-1.5" offset="0.1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint><link name="r"><inertial>
+<mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+FREE = (
+    MIMIC.replace('type="prismatic"', 'type="floating"')
+    .replace('<mimic joint="left"', "<mimic")
+    .replace('<mimic\nmultiplier="-1.5" offset="0.1"/>', "")
+)
+ROBOTS = {"arm": URDF, "mimic": MIMIC, "free": FREE, "plane": FREE.replace("floating", "planar")} | {
+    f"mjcf {name}": text for name, text in ALL.items()
+}
+BASES = (None, "fixed", "floating", "planar", "spherical", "", "Floating", 5, ("floating",), ["planar"], {}, b"planar")
+BESIDE = ("{}", "[]", "5", '{"pan": 0.1}', '{"pan": -1}', '{"pan": NaN}', '{"pan": "x"}', '{"pan": null}', '{"x": 1}')
+BESIDE += ('{"pan": 1e400}', '{"pan": [1]}', '{"pan": true}', '{"": 0}', "[" * 100_000, '{"pan": ' + "9" * 5000 + "}")
+BESIDE += ('{"left": 0.1}', '{"right": 0.1}', '{"left.x": 1}', "\x00", "")
 
 
 CASES = st.builds(
@@ -31,28 +58,48 @@ CASES = st.builds(
     st.sampled_from(("none",) * 12 + tuple(PROLOGUES)),
     st.none() | st.none() | st.none() | DAMAGE,
 )
+NEW = st.builds(
+    RobotFile,
+    st.lists(MJCF_EDITS | MJCF_EDITS | XML_EDITS, max_size=2),
+    st.sampled_from(("none",) * 400 + tuple(PROLOGUES)),
+    st.sampled_from(range(12)).flatmap(lambda k: st.none() if k else DAMAGE),
+    st.sampled_from(tuple(ROBOTS)),
+    st.sampled_from(BASES[:5] * 8 + BASES),
+    st.none() | st.none() | st.sampled_from(BESIDE),
+)
 
 
 def write(case: RobotFile, path: Path) -> None:
     """The robot file."""
     (path.parent / "secret.txt").write_text(SECRET)
-    content = PROLOGUES[case.prologue] + edited_xml(URDF, case.edits).encode("utf-8", "replace")
+    content = PROLOGUES[case.prologue] + edited_xml(ROBOTS[case.robot], case.edits).encode("utf-8", "replace")
     path.write_bytes(content if case.damage is None else damaged(content, case.damage))
+    if case.beside is not None:
+        path.with_suffix(".armature.json").write_text(case.beside)
 
 
 def check(case: RobotFile, folder: Path) -> None:
     """Refused, or a robot with numbers."""
-    write(case, folder / "arm.urdf")
+    path = folder / ("arm.xml" if case.robot.startswith("mjcf") else "arm.urdf")
+    write(case, path)
     try:
-        robot = Robot.from_urdf(folder / "arm.urdf")
-        repr(robot)
+        system = MechanicalSystem.from_file(path, base=case.base)
+        robot = system.robot
+        repr(system)
         if robot.nv:
-            q = torch.full((robot.nv,), 0.3, dtype=torch.float64)
+            q = robot.random(torch.Generator().manual_seed(0))[0]
             M = robot.mass_matrix(q)
             if not bool(torch.isfinite(M).all()):
                 raise DefectError("a mass matrix that is not finite")
+            system.dynamics(q, torch.zeros(robot.nv).double(), torch.zeros(len(system.inputs)).double())
         text = robot.to_urdf()
-        Robot.from_urdf_text(text)
+        again = Robot.from_urdf_text(text, base=robot.base, locked=robot.locked)
+        if again.nv != robot.nv:
+            raise DefectError("another robot is read from what was written")
+        MechanicalSystem.from_json(system.to_json())
+        if case.robot.startswith("mjcf") and case.damage is None:
+            Robot.from_mjcf_text(path.read_text(errors="replace"), base=case.base)
+        system.to_mjcf()
     except Exception as error:
         if SECRET in str(error):
             raise DefectError("an external entity was read") from None
@@ -61,4 +108,4 @@ def check(case: RobotFile, folder: Path) -> None:
     require_no_code(folder)
 
 
-TARGET = Target(CASES, check, fast=100, nightly=3000)
+TARGET = Target(CASES | NEW, check, fast=100, nightly=3000)

@@ -16,7 +16,7 @@ from tests.fuzz.made import INPUTS, MODELS
 from tests.fuzz.oracle import DefectError, Target, allowed, require_ended_well, require_no_code
 from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, XML_EDITS, Damage, damaged, edited_json, edited_xml
 
-from forcegp import load_posterior
+from forcegp import MechanicalSystem, load_posterior
 from forcegp.atomic_files import write_digests
 from forcegp.models import NeuralNetwork  # noqa: F401  KINDS needs it
 
@@ -158,5 +158,34 @@ def check_commands(case: Stored, folder: Path) -> None:
     require_ended_well((rolled or "evaluate run train.h5").split(), folder)
 
 
+@dataclass(frozen=True)
+class StoredSystem:
+    """A system of thrusters, loops and switches, with these edits."""
+
+    which: int
+    edits: list[Any]
+
+
+def check_system(case: StoredSystem, folder: Path) -> None:
+    """Refused, or a system that moves and is stored again."""
+    text = edited_json(json.loads(INPUTS.systems[case.which]), case.edits)
+    with allowed():
+        system = MechanicalSystem.from_json(text)
+        repr(system)
+        robot = system.robot
+        q = robot.random(torch.Generator().manual_seed(0))
+        dynamics = system.dynamics(q, 0.0 * q[:, : robot.nv], torch.ones(1, len(system.inputs)).double())
+        if not bool(torch.isfinite(dynamics.M).all()):
+            raise DefectError("a mass matrix that is not finite")
+        MechanicalSystem.from_json(system.to_json())
+    require_no_code(folder)
+
+
+SYSTEMS_TARGET = Target(
+    st.builds(StoredSystem, st.integers(0, 1), st.lists(JSON_EDITS, min_size=1, max_size=3)),
+    check_system,
+    fast=30,
+    nightly=2000,
+)
 COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=1500)
-TARGET = Target(CASES, check, fast=100, nightly=4000)
+TARGET = Target(CASES, check, fast=70, nightly=4000)

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 TARGETS = {
     "stored models": stored.TARGET,
     "models of commands": stored.COMMANDS_TARGET,
+    "stored systems": stored.SYSTEMS_TARGET,
     "robot files": robots.TARGET,
     "datasets": datasets.TARGET,
     "datasets of commands": datasets.COMMANDS_TARGET,

@@ -205,6 +205,76 @@ XML_EDITS = st.builds(
         + ("0 0 0", "1 2", "1 0 0 0", "nan 0 0", "1e200 0 0", "base", "upper", "mimic", "floating", "fixed")
     ),
 )
+MJCF_EDITS = st.builds(
+    XmlEdit,
+    st.integers(0, 500),
+    st.sampled_from(("drop", "twice", "lose", "tag", "into", "swap", "extra", *["attribute"] * 8)),
+    st.sampled_from(
+        [
+            "name",
+            "joint",
+            "joint1",
+            "body1",
+            "site",
+            "range",
+            "axis",
+            "pos",
+            "type",
+            "ref",
+            "mass",
+            "armature",
+            "polycoef",
+            "gear",
+            "anchor",
+            "fullinertia",
+            "mimic",
+            "freejoint",
+            "replicate",
+            "count",
+            "include",
+            "file",
+            "equality",
+            "connect",
+            "weld",
+            "actuator",
+            "motor",
+            "option",
+            "compiler",
+            "default",
+            "class",
+            "multiplier",
+            "offset",
+            "euler",
+            "quat",
+            "damping",
+            "limited",
+            "size",
+            "geom",
+            "body",
+            "springref",
+            "stiffness",
+        ]
+    ),
+    st.sampled_from(
+        NUMBERS
+        + ("0 0 0", "0 0 0 0", "1 2", "nan 0 0", "1e200 0 0", "free", "ball", "slide", "hinge", "floating", "planar")
+        + (
+            "left",
+            "right",
+            "crank",
+            "coupler",
+            "world",
+            "true",
+            "radian",
+            "a" * 5000,
+            "",
+            "../secret.txt",
+            "secret.txt",
+            "x/y",
+        )
+    ),
+)
+"""Also for mimic joints and moving bases of URDF."""
 PROLOGUES = {
     "none": b"",
     "punycode": b'<?xml version="1.0" encoding="punycode"?>',
@@ -249,6 +319,8 @@ def edited_xml(text: str, edits: list[XmlEdit]) -> str:
                 element.tag = edit.name
             case "text":
                 element.text = _xml(edit.value)
+            case "extra":
+                element.set(edit.name, _xml(edit.value))
             case "into":
                 other = ET.SubElement(element, edit.name)
                 other.set(edit.name, _xml(edit.value))

@@ -79,6 +79,7 @@ def test_a_combination_has_the_value_of_its_terms(terms, data):
     ("pattern", "names"),
     [
         ("pos{1..3}", ["pos1", "pos2", "pos3"]),
+        ("pos{2..1}", ["pos2", "pos1"]),
         ("q{09..11}", ["q09", "q10", "q11"]),
         ("{3..1}", ["3", "2", "1"]),
         ("{left,right}_{1..2}", ["left_1", "left_2", "right_1", "right_2"]),
