@@ -166,6 +166,7 @@ def test_learned_friction_sees_what_the_urdf_does_not(posterior):
         (lambda: ContactMonitor(TRUE, dt=DT, bandwidth=60.0), "bandwidth is 60.0; give Hz above 0 and below 50"),
         (lambda: ContactMonitor(arm_system(), dt=DT), r"posterior\.with_contacts\(\[\]\)"),
         (lambda: ContactMonitor(TRUE, dt=DT, covariance="noise and posterior"), "with a covariance"),
+        (lambda: ContactMonitor(TRUE, dt=DT, covariance=np.ones(3)), "covariance"),
         (lambda: ContactMonitor(TRUE, dt=DT, covariance="none"), "Valid covariances: noise, noise and posterior"),
         (lambda: ContactMonitor(TRUE, dt=DT).calibrate([motion(20.0, 1)]), "too short for a threshold"),
         (lambda: ContactMonitor(TRUE, dt=DT).calibrate([]), "too short"),

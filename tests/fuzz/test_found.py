@@ -48,6 +48,13 @@ def test_a_joint_beyond_the_moon_is_refused():
         forcegp.Robot.from_urdf_text(URDF.replace('xyz="0 0 0.25"', 'xyz="1e200 0 0"'))
 
 
+def test_a_centre_of_mass_beyond_the_moon_is_refused():
+    place = '<origin xyz="0.02'
+    assert place in URDF
+    with pytest.raises(InvalidNumber, match=r"xyz \[1e\+200, "):
+        forcegp.Robot.from_urdf_text(URDF.replace(place, '<origin xyz="1e200'))
+
+
 @pytest.mark.parametrize("where", ["header", "row"])
 def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, where):
     long = "1" * 140_000
@@ -165,6 +172,8 @@ WRONG = {
     "OptimizerOptions": {"iterations": None},
     "OptimizerOptions ": {"patience": 1.5},
     "OptimizerOptions  ": {"memory": "x"},
+    "OptimizerOptions   ": {"memory": 5e-324},
+    "Plane ": {"normal": torch.ones(3, device="meta")},
     "fit": {"options": "fast"},
     "fit ": {"start": 1},
     "fit  ": {"start": ["a"]},

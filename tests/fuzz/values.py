@@ -256,9 +256,19 @@ MJCF_EDITS = st.builds(
         ]
     ),
     st.sampled_from(
-        NUMBERS
-        + ("0 0 0", "0 0 0 0", "1 2", "nan 0 0", "1e200 0 0", "free", "ball", "slide", "hinge", "floating", "planar")
-        + (
+        (
+            *NUMBERS,
+            "0 0 0",
+            "0 0 0 0",
+            "1 2",
+            "nan 0 0",
+            "1e200 0 0",
+            "free",
+            "ball",
+            "slide",
+            "hinge",
+            "floating",
+            "planar",
             "left",
             "right",
             "crank",

@@ -92,7 +92,7 @@ class ContactMonitor(Summary):
                 "motion, or give posterior.with_contacts([])."
             )
         known = not (isinstance(model, Predictor) and model.kind != "none")
-        covariance = covariance or ("noise" if known else "noise and posterior")
+        covariance = ("noise" if known else "noise and posterior") if covariance is None else covariance
         require_known("covariance", covariance, "ContactMonitor", ("noise", "noise and posterior"))
         self.open = covariance != "noise"
         if self.open and known:

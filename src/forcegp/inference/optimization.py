@@ -50,8 +50,8 @@ class OptimizerOptions:
 
     @usable_arguments("OptimizerOptions")
     def __post_init__(self) -> None:
-        if min(map(operator.index, (self.iterations, self.patience))) < 0:
-            raise InvalidInput(f"iterations={self.iterations} and patience={self.patience} must be >= 0")
+        if min(map(operator.index, (self.iterations, self.patience, self.memory))) < 0:
+            raise InvalidInput(f"iterations={self.iterations} and patience={self.patience} must be >= 0, memory > 0")
         tolerances = (self.tolerance, self.slow, self.gradient_tolerance)
         if not (all(x >= 0 for x in tolerances) and self.memory > 0):
             raise InvalidInput("tolerances must be >= 0, memory > 0")

@@ -142,7 +142,7 @@ def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.nd
     try:
         plain = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
         array = real_array(name, plain).astype(np.float64)
-    except (InvalidInput, TypeError):  # text, of which every letter could be a digit; a sparse tensor
+    except (InvalidInput, TypeError, NotImplementedError):  # text, of which every letter could be a digit; sparse, meta
         array = np.full((), np.nan)
     if array.shape != (size,) or not np.isfinite(array).all():
         raise InvalidInput(f"{name} is {values!r}; give {size} finite numbers{meaning}.")

@@ -237,6 +237,8 @@ def _origin(element: Element | None, place: _Place) -> np.ndarray:
     rpy = _vector(element, "rpy", (0.0, 0.0, 0.0), place)
     if not np.isfinite(rpy).all():
         raise InvalidNumber(f"{place}: <origin> rpy {rpy.tolist()} is not finite; give angles in rad.")
+    if not (np.abs(xyz) < FARTHEST).all():
+        raise InvalidNumber(f"{place}: <origin> xyz {xyz.tolist()} is not finite or far; give metres.")
     return transform(rotation_from_rpy(rpy), xyz)
 
 
@@ -279,8 +281,6 @@ def _joint(
                 f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
     origin = _origin(_optional_child(element, "origin", place), place)
-    if not (np.abs(origin) < FARTHEST).all():
-        raise InvalidNumber(f"{place}: <origin> xyz {origin[:3, 3].tolist()} is not finite or far; give metres.")
     axes = element.findall("axis")
     if len(axes) > 1:
         place.problems.ignore("the first of several <axis> counts", place.owner, f"{len(axes)} <axis>")
