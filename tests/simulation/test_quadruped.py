@@ -5,8 +5,11 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp import JointFriction, StructuredGP
+from forcegp import CoulombJointFriction, JointFriction, StructuredGP, ViscousJointFriction
 from forcegp.errors import InvalidInput
+from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
+from forcegp.models import Coefficients
+from forcegp.priors import NoForces
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -72,3 +75,15 @@ def test_payload_friction_and_foot_forces_are_found():
 def test_other_numbers_are_refused(wrong):
     with pytest.raises(InvalidInput, match=next(iter(wrong))):
         QuadrupedConfig(**wrong)
+
+
+def test_coefficients_of_friction_are_those_of_joints_and_not_of_the_base():
+    train = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=1, joint_friction="coulomb", payload=0.0))
+    known = (Actuation(), RigidBodyBias(), ViscousJointFriction(0.05), CoulombJointFriction(0.5, 0.02))
+    model = StructuredGP(MechanicalSystem(train.system.robot, train.system.contacts, known), NoForces())
+    learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
+    values = model.identify(train, learn, points=60, restarts=1).identification.values
+    assert len(values) == 24
+    assert not [name for name in values if "base" in name]
+    coulomb = [value for name, value in values.items() if "coulomb" in name]
+    np.testing.assert_allclose(coulomb, 0.8, rtol=0.05)

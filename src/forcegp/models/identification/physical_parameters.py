@@ -54,7 +54,8 @@ class Coefficients:
     Parameters
     ----------
     force: one of `COEFFICIENT_UNITS`, for instance 'viscous-joint-friction', which the system must list once.
-    joints: names of the joints whose coefficient is learned; None means all, the others keep theirs.
+    joints: names of the joints whose coefficient is learned; None means all of one degree of freedom. The others keep
+        theirs.
     start: start value in the force's unit; None takes the system's own, which must be positive.
     """
 
@@ -257,7 +258,7 @@ def _link_groups(system: MechanicalSystem, chosen: Sequence[Learned]) -> list[_L
 def _coefficients(system: MechanicalSystem, entry: Coefficients) -> _Coefficients:
     robot = system.robot
     force = system.known_forces[system.force_index(entry.force)]
-    joints = robot.joint_names if entry.joints is None else entry.joints
+    joints = robot.single_joint_names if entry.joints is None else entry.joints
     for joint in joints:
         require_known("joint", joint, robot.name, robot.joint_names, UnknownJoint)
     chosen = torch.tensor([robot.joint_names.index(joint) for joint in joints], device=robot.device)

@@ -1,0 +1,55 @@
+"""A quadruped with an unknown load and friction in its joints: accelerations, the load, and forces on the feet.
+
+Each seed trains on 200 rows of 30 s and tests on 10 s of another motion. `laws` learns mass and centre of the trunk
+with viscous and Coulomb friction of each joint from the same rows by maximum likelihood; `force prior` learns the
+friction as functions. Errors of accelerations are parts of those of the URDF.
+"""
+
+import argparse
+import warnings
+
+import numpy as np
+import torch
+
+from forcegp import CoulombJointFriction, Dataset, JointFriction, StructuredGP, ViscousJointFriction
+from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
+from forcegp.models import Coefficients, Posterior
+from forcegp.priors import NoForces
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+
+def fits(train: Dataset) -> dict[str, Posterior]:
+    trunk = train.system.robot.link("trunk").inertial("mass", "com")
+    laws = (Actuation(), RigidBodyBias(), ViscousJointFriction(0.1), CoulombJointFriction(0.5, 0.02))
+    lawful = MechanicalSystem(train.system.robot, train.system.contacts, laws)
+    friction = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
+    how = {"points": 200, "restarts": 1}
+    return {
+        "laws": StructuredGP(lawful, NoForces()).identify(train, [trunk, *friction], **how),
+        "force prior": StructuredGP(train.system, JointFriction()).identify(train, [trunk], **how),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print(f"{'seed':>4} {'model':12} {'base':>7} {'joints':>7} {'load [kg]':>10} {'foot forces':>12}")
+    for seed in range(1, options.seeds + 1):
+        train = simulate_quadruped(QuadrupedConfig(seconds=30.0, seed=seed))
+        test = simulate_quadruped(QuadrupedConfig(seconds=10.0, seed=100 + seed))
+        q, v, u = (torch.tensor(x) for x in (test.q, test.v, test.u))
+        a, forces = test.truth["a"], test.truth["lambda"]
+        plain = np.square(test.system.dynamics(q, v, u).acceleration_map().offset.numpy() - a)
+        for name, posterior in fits(train).items():
+            found = posterior.predict(q, v, u, covariance=False)
+            error = np.square(found.mean.numpy() - a)
+            parts = [float(np.sqrt(error[:, k].sum() / plain[:, k].sum())) for k in (slice(6), slice(6, None))]
+            load = posterior.identification.values["trunk.mass"] - train.system.robot.link("trunk").mass
+            feet = np.sqrt(np.square(found.multiplier.mean.numpy() - forces).sum() / np.square(forces).sum())
+            print(f"{seed:>4} {name:12} {parts[0]:7.4f} {parts[1]:7.4f} {load:10.4f} {feet:12.4f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
