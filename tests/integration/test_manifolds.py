@@ -4,9 +4,11 @@ import pytest
 import torch
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp.integration import integrate, integrator_named
+from forcegp.errors import InvalidInput
+from forcegp.integration import ConstraintManifold, integrate, integrator_named
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 BODY = """<robot name="body"><link name="body"><inertial><origin xyz="0.02 -0.03 0.05"/><mass value="3"/>
 <inertia ixx="0.06" ixy="0.002" ixz="-0.004" iyy="0.09" iyz="0.003" izz="0.1"/></inertial></link></robot>"""
@@ -55,3 +57,21 @@ def test_steps_have_their_order_on_the_manifold(name, order, base):
         end = moved(robot, name, dt, seconds, 0.5)
         errors.append(float(robot.difference(reference.q[-1], end.q[-1]).norm()))
     assert errors[1] < errors[0] / 2 ** (order - 0.4)
+
+
+def test_a_motion_that_is_lost_has_no_distance_from_its_contacts_and_no_error():
+    data = simulate_quadruped(QuadrupedConfig(seconds=0.1))
+    q, v = (torch.tensor(x[:3]) for x in (data.q, data.v))
+    lost = q.clone()
+    lost[1] = torch.nan
+    (c, rate), (known, known_rate) = (ConstraintManifold(data.system).violation(each, v) for each in (lost, q))
+    assert torch.isnan(c[1]).all()
+    assert torch.isnan(rate[1]).all()
+    torch.testing.assert_close(c[[0, 2]], known[[0, 2]], rtol=0.0, atol=0.0)
+    torch.testing.assert_close(rate[[0, 2]], known_rate[[0, 2]], rtol=0.0, atol=0.0)
+
+
+def test_contacts_that_are_switched_are_not_projected_onto():
+    system = simulate_quadruped(QuadrupedConfig(seconds=0.1)).system
+    with pytest.raises(InvalidInput, match=r"front_left_stands.* switch some of them"):
+        integrator_named("projected", system)

@@ -50,9 +50,14 @@ class ConstraintManifold:
     def violation(
         self, q: Float[Tensor, "*batch nv"], v: Float[Tensor, "*batch nv"]
     ) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
-        """c(q) in m and A(q) v in m/s, for surfaces that are signed distances."""
+        """c(q) in m and A(q) v in m/s, for surfaces that are signed distances; NaN where q is."""
+        space = self.system.robot.space
+        lost = None if space.is_vector_space else torch.isnan(q).any(-1, keepdim=True)
+        if lost is not None:  # no quaternion is made of NaN
+            q = torch.where(lost, space.neutral().to(q), q)
         c, A, _ = self._constraint(self.system.robot.kinematics(q))
-        return c, (A @ v[..., None])[..., 0]
+        rate = (A @ v[..., None])[..., 0]
+        return (c, rate) if lost is None else (c.masked_fill(lost, torch.nan), rate.masked_fill(lost, torch.nan))
 
     def project_position(self, q: Float[Tensor, "n nv"]) -> ProjectedPosition:
         """The positions on all surfaces that Newton's method finds from q: dq = -M^-1 A^T (A M^-1 A^T)^+ c, M fixed.
@@ -360,11 +365,21 @@ class Projected(Integrator):
         return Step(at.q, v_next, a, at.converged)
 
 
+def _projected(system: MechanicalSystem) -> Projected:
+    switched = dict.fromkeys(contact.switch for contact in system.contacts if contact.switch is not None)
+    if switched:
+        raise InvalidInput(
+            f"integrator 'projected' holds all contacts at all times, and {', '.join(switched)} switch some of them; "
+            "use another integrator, or contacts without a switch."
+        )
+    return Projected(ConstraintManifold(system), system.robot.space)
+
+
 INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
     "symplectic-euler": lambda system: SymplecticEuler(system.robot.space),
     "rk4": lambda system: RungeKutta4(system.robot.space),
     "implicit-midpoint": lambda system: ImplicitMidpoint(system.robot.space),
-    "projected": lambda system: Projected(ConstraintManifold(system), system.robot.space),
+    "projected": _projected,
 }
 """Integrators by the name that rollouts and the command line use."""
 
