@@ -65,22 +65,21 @@ def test_equal_seeds_give_equal_flights(test):
 
 @pytest.mark.parametrize("lag", [0.04, 0.1])
 def test_the_lag_of_the_rotors_is_found(lag):
-    dataset = simulate_quadrotor(QuadrotorConfig(seconds=30.0, seed=1, lag=lag))
+    dataset = simulate_quadrotor(QuadrotorConfig(seconds=15.0, seed=1, lag=lag))
     found, std = estimate_thruster_lag(dataset)
     assert found == pytest.approx(lag, rel=0.2)
     assert 0.0 < std < 0.02
 
 
-def test_the_lag_of_actuators_that_push_a_base_is_found():
+def test_the_lag_of_actuators_that_push_a_base_is_found(train):
     """As MJCF has rotors: u are thrusts, and the columns of a matrix the wrenches of the base."""
-    dataset = simulate_quadrotor(QuadrotorConfig(seconds=30.0, seed=1))
-    rotors = dataset.system.known_forces[1]
+    rotors = train.system.known_forces[1]
     q, v = (torch.zeros(4, size, dtype=torch.float64) for size in (7, 6))
     q[:, 6] = 1.0
-    wrenches = rotors.force(dataset.system.state(q, v, torch.eye(4, dtype=torch.float64))) / rotors.thrust[0]
-    system = replace(dataset.system, known_forces=(Actuation(wrenches.mT, rotors.names), RigidBodyBias()))
-    thrusts = dataset.u**2 * float(rotors.thrust[0])
-    found, _ = estimate_thruster_lag(replace(dataset, system=system, u=thrusts, truth={}))
+    wrenches = rotors.force(train.system.state(q, v, torch.eye(4, dtype=torch.float64))) / rotors.thrust[0]
+    system = replace(train.system, known_forces=(Actuation(wrenches.mT, rotors.names), RigidBodyBias()))
+    thrusts = train.u**2 * float(rotors.thrust[0])
+    found, _ = estimate_thruster_lag(replace(train, system=system, u=thrusts, truth={}))
     assert found == pytest.approx(0.06, rel=0.25)
 
 
