@@ -24,3 +24,4 @@ from .windows import (
     WeakForm as WeakForm, Windows as Windows,
 )
 from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag
+from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind

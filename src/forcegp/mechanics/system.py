@@ -22,7 +22,7 @@ from forcegp.mechanics.known_forces import (
 )
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
-from forcegp.mechanics.thrusters import ObservedWrench, Thrusters
+from forcegp.mechanics.thrusters import OBSERVED, Thrusters
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
 from forcegp.robots.mjcf import is_mjcf
@@ -150,9 +150,9 @@ class MechanicalSystem(Summary):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the columns of u: actuators, observed wrenches, then switches of contacts (1 or 0)."""
+        """Names of the columns of u: actuators, observed wrenches and wind, then switches of contacts (1 or 0)."""
         switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)
-        observed = (force.names for force in self.known_forces if isinstance(force, ObservedWrench))
+        observed = (force.names for force in self.known_forces if isinstance(force, OBSERVED))
         return (*self.actuators, *(name for names in observed for name in names), *switches)
 
     @property
@@ -164,7 +164,7 @@ class MechanicalSystem(Summary):
     @property
     def held_inputs(self) -> tuple[int, ...]:
         """Columns of u that are observed, not commanded: predicted motions keep those of their start."""
-        held = {name for force in self.known_forces if isinstance(force, ObservedWrench) for name in force.names}
+        held = {name for force in self.known_forces if isinstance(force, OBSERVED) for name in force.names}
         return tuple(index for index, name in enumerate(self.inputs) if name in held)
 
     @property

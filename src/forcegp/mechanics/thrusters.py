@@ -1,8 +1,9 @@
-"""Forces on one link that come with u: thrusters such as propellers, and a wrench that an observer estimates."""
+"""What comes with u for one link: thrusters such as propellers, and the wrench and wind that an observer estimates."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -95,7 +96,7 @@ class ObservedWrench(LinkForce):
     """
 
     frame: str
-    names: tuple[str, ...] = ("wind_x", "wind_y", "wind_z")
+    names: tuple[str, ...] = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
     @override
     def bound_to(self, robot: Robot) -> "ObservedWrench":
@@ -112,8 +113,33 @@ class ObservedWrench(LinkForce):
         return torch.cat([own, torch.zeros_like(own)], dim=-1) if len(self.names) == 3 else own
 
 
+@dataclass(frozen=True, eq=False)
+class ObservedWind(KnownForce):
+    """The velocity of the air [m/s] in the axes of the world, which an observer estimates, in columns of u.
+
+    It is no force: what air does is for `AerodynamicForce` to learn, which takes velocities against it. Predicted
+    motions keep it as they keep an `ObservedWrench`.
+    """
+
+    names: ClassVar[tuple[str, ...]] = ("wind_x", "wind_y", "wind_z")
+
+    @override
+    def force(self, state: State) -> Tensor:
+        return torch.zeros_like(state.v)
+
+    @classmethod
+    def at(cls, state: State) -> Float[Tensor, "*batch 3"] | None:
+        """The wind of these states; None where their system has no such columns."""
+        if cls.names[0] not in state.inputs:
+            return None
+        first = state.inputs.index(cls.names[0])
+        return state.u[..., first : first + 3]
+
+
+OBSERVED = (ObservedWrench, ObservedWind)
 KNOWN_FORCES["thrusters"] = Thrusters  # here, since these build on the classes of that module
 KNOWN_FORCES["observed-wrench"] = ObservedWrench
+KNOWN_FORCES["observed-wind"] = ObservedWind
 
 
 def _numbers(name: str, given: object, robot: Robot) -> Tensor:

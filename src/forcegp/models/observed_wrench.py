@@ -1,27 +1,30 @@
 """A slow force that no feature explains, such as wind: observed from the past rows of a recording, then known."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.data import Dataset
+from forcegp.data import AirLaw, Dataset, find_wind, with_wind
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import ObservedWrench
+from forcegp.mechanics import MechanicalSystem, ObservedWind, ObservedWrench
 from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
 from forcegp.priors import AerodynamicForce, ForcePrior
 
-USUAL, TRIED = 0.1, (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
-FEWEST_ROWS, TINY = 100, 1e-300
-NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
+MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
 
 def observing(
     posterior: AnyPosterior, dataset: Dataset, *, seconds: float | None = None, frame: str | None = None
 ) -> tuple[AnyPosterior, Dataset]:
     """The posterior and the recording with an `ObservedWrench` on link `frame`, in six more columns of u.
+
+    Where the fit found the wind of its rows (`in_wind`), three more hold the velocity of the air, an `ObservedWind`
+    that the rows before show (`AirLaw.wind_before`).
 
     Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
@@ -35,17 +38,19 @@ def observing(
     """
     prior: ForcePrior | None = getattr(posterior.model, "prior", None)
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
+    times = TRIED if seconds is None else (seconds,)
     if seconds is None:
-        chosen = posterior.settings.get("observe_seconds", USUAL)
-        seconds = 0.0 if own is None else float(chosen if own.observe is None else own.observe)
+        seconds = 0.0 if own is None else LEAST if own.observe is None else own.observe
+        times = times if own is None or own.observe is None else (seconds,)
         if seconds == 0.0 or ObservedWrench in map(type, posterior.system.known_forces):
             return posterior, dataset
     if not 0.0 < seconds < 1e6:
         raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
     frame = frame or (own or AerodynamicForce()).link(posterior.system.robot)
+    posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
-    observed = _observed(unexplained, effect, dataset, seconds)
-    system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES)))
+    observed = _observed(unexplained, effect, dataset, times)
+    system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
     first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
@@ -53,22 +58,36 @@ def observing(
     return posterior.with_system(system), seen.rows(np.flatnonzero(age >= seconds))
 
 
-def with_observer(posterior: AnyPosterior, dataset: Dataset) -> AnyPosterior:
-    """The posterior with the time in `settings` at which an observer predicts the rows of this recording best.
+def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, Dataset] | None:
+    """The recording with the wind that acts on its rows, and the law of air that shows it (`forcegp.data.find_wind`).
 
-    Only where the prior leaves it open (`AerodynamicForce(observe=None)`) and rows are in order of time.
+    None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where u holds the wind already, and
+    where the rows do not show it.
     """
-    prior: ForcePrior = posterior.model.prior
-    open_ones = [term for term in prior.summands() if isinstance(term, AerodynamicForce) and term.observe is None]
-    if not open_ones or not dataset.time_ordered or len(dataset) < FEWEST_ROWS:
-        return posterior
-    unexplained, effect = _unexplained(posterior, dataset, open_ones[0].link(posterior.system.robot))
+    of_air = [term for term in prior.summands() if isinstance(term, AerodynamicForce) and term.observe != 0.0]
+    if not of_air or any(isinstance(force, ObservedWind) for force in system.known_forces):
+        return None
+    if dataset.joint_names != system.robot.joint_names or dataset.u.shape[1] != system.sizes[2]:
+        return None  # which the fit refuses
+    rows = replace(dataset, system=system, truth={})
+    found = find_wind(rows)
+    return None if found is None else (found[0], with_wind(rows, found[1]))
 
-    def error(seconds: float) -> float:
-        left = unexplained - np.einsum("nij,nj->ni", effect, _observed(unexplained, effect, dataset, seconds))
-        return float(np.log(np.square(left).mean(0) + TINY).sum())
 
-    return posterior.with_settings(observe_seconds=min(TRIED, key=error))
+def without_wind(system: MechanicalSystem) -> MechanicalSystem:
+    """The system without columns of wind in u."""
+    return replace(system, known_forces=tuple(x for x in system.known_forces if not isinstance(x, ObservedWind)))
+
+
+def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
+    """Both with the wind that the rows before each one show, where the fit found a law of air."""
+    stored = posterior.settings.get("air")
+    if stored is None or any(isinstance(force, ObservedWind) for force in posterior.system.known_forces):
+        return posterior, dataset
+    rows = replace(dataset, system=posterior.system)
+    seen = with_wind(rows, AirLaw.from_dict(stored).wind_before(rows))
+    assert seen.system is not None, "it was given one"
+    return posterior.with_system(seen.system), seen
 
 
 def _unexplained(
@@ -88,14 +107,19 @@ def _unexplained(
 
 
 def _observed(
-    unexplained: Float[np.ndarray, "rows nv"], effect: Float[np.ndarray, "rows nv 6"], dataset: Dataset, seconds: float
+    unexplained: Float[np.ndarray, "rows nv"], effect: Float[np.ndarray, "rows nv 6"], dataset: Dataset, times: Sequence[float]
 ) -> Float[np.ndarray, "rows 6"]:
-    """The wrench that the rows before each show; none at the first of an episode."""
+    """The wrench that the rows before each show; none at the first of an episode.
+
+    Of several times each component takes the one whose observer missed least in the rows before.
+    """
     wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
     observed = np.zeros_like(wrench)
     for number, rows, _ in episodes_in_order(dataset):
         own = np.flatnonzero(dataset.episode == number)
-        observed[own] = _past_mean(wrench[own], rows.time, seconds)
+        means = np.stack([_past_mean(wrench[own], rows.time, time) for time in times])  # (times, rows, 6)
+        missed = np.stack([_past_mean(np.square(wrench[own] - mean), rows.time, MEMORY) for mean in means])
+        observed[own] = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
     return observed
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, usable_arguments
-from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
+from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem, ObservedWind, State
 from forcegp.priors.force_prior import ExpressedKernels, Scaling
 from forcegp.priors.joint_forces import as_names, chosen_inputs
 from forcegp.priors.kernels import check_kernel
@@ -84,8 +84,9 @@ class BaseWrench(ExpressedKernels):
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state, where = dynamics.state, self._point(dynamics)
+        moving, turning = _halves(where.velocity(state.v))
         linear, angular = (
-            (where.orientation.mT @ part[..., None])[..., 0] for part in _halves(where.velocity(state.v))
+            (where.orientation.mT @ part[..., None])[..., 0] for part in (moving - self._flow(state), turning)
         )
         columns: dict[str, Callable[[], Tensor]] = {
             "velocity": lambda: linear,
@@ -110,6 +111,10 @@ class BaseWrench(ExpressedKernels):
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
         labels = self._labels(robot)
         return (tuple(label for name in self.inputs for label in labels[name]),) * 6
+
+    def _flow(self, state: State) -> Tensor | float:
+        """The velocity of what the link moves through, along the axes of the world."""
+        return 0.0
 
     def _labels(self, robot: Robot) -> dict[str, Sequence[str]]:
         link = self.link(robot)
@@ -155,6 +160,11 @@ class AerodynamicForce(BaseWrench):
         if not 0.0 <= seconds < 1e6:
             raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, 0, or None.")
         object.__setattr__(self, "observe", seconds)
+
+    @override
+    def _flow(self, state: State) -> Tensor | float:
+        wind = ObservedWind.at(state)
+        return 0.0 if wind is None else wind
 
 
 def _halves(six: Tensor) -> tuple[Tensor, Tensor]:

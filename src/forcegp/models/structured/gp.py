@@ -14,7 +14,7 @@ from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
-from forcegp.models.observed_wrench import with_observer
+from forcegp.models.observed_wrench import in_wind, without_wind
 from forcegp.models.search import (
     ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
@@ -222,6 +222,10 @@ class StructuredGP(StructuredModel):
         self, dataset: Dataset, points: int | None, search: Search, engine: Engine | str, learning_points: int | None
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
+        if found := in_wind(self.prior, self.system, dataset):
+            law, rows = found
+            learned = replace(self, system=rows.system)._fit_rows(rows, points, search, engine, learning_points)
+            return learned.with_system(without_wind(learned.system)).with_settings(air=law.to_dict())
         chosen = engine_of(engine)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:
@@ -235,7 +239,7 @@ class StructuredGP(StructuredModel):
         warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
         described = described_rows(all_rows, dataset)
-        return with_observer(on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report), dataset)
+        return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
 
     def _fit_windows(
         self, dataset: Dataset, observe: WeakForm, points: int | None, search: Search
