@@ -12,7 +12,7 @@ from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Actuation, RigidBodyBias
-from forcegp.models import observing
+from forcegp.models import load_posterior, observing, save_posterior
 from forcegp.report.motion import recorded_scene
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -99,7 +99,7 @@ def test_new_wind_is_observed_from_the_past(posterior, test):
     blind = a - posterior.predict(seen.q, seen.v, seen.u[:, :4], covariance=False).mean.numpy()
     left = a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.numpy()
     assert np.all(np.square(left).mean(0) < 0.05 * np.square(blind).mean(0))
-    assert seen.system.held_inputs == tuple(range(4, 10))
+    assert seen.system.held_inputs == tuple(range(4, 13))  # wind, then a wrench
     assert "Q_U" not in seen.truth
 
 
@@ -134,6 +134,20 @@ def test_what_cannot_be_observed_is_refused(posterior, test):
         warnings.simplefilter("ignore")
         fitted = calm.fit(acting(test), points=30, restarts=1)
     assert observing(fitted, test) == (fitted, test)
+
+
+def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_path):
+    """Exactly as a posterior that was stored; rows that show no wind are refused."""
+    rows = acting(test)
+    save_posterior(posterior, tmp_path / "drone")
+    loaded = load_posterior(tmp_path / "drone")
+    more = [each.update(rows.rows(np.arange(300))) for each in (posterior, loaded)]
+    assert more[0].system.inputs == posterior.system.inputs
+    assert len(more[0].training) == len(posterior.training) + 275  # those with .1 s before them
+    means = [each.predict(rows.q[:5], rows.v[:5], rows.u[:5], covariance=False).mean for each in more]
+    torch.testing.assert_close(*means, rtol=1e-9, atol=1e-9)
+    with pytest.raises(InvalidInput, match="longer pieces"):
+        posterior.update(rows.rows(np.arange(10)))
 
 
 def test_a_report_shows_the_air_forces_at_the_body(posterior, test):

@@ -21,6 +21,7 @@ STRONGEST, SURE = 40.0, 2.0  # m/s: a wind beyond, or a standard deviation beyon
 APART = 0.5  # s, between rows that count as independent of each other
 STEP = 0.05  # m/s, of derivatives
 BLOCK = 4096  # rows
+MOVING = 12  # causes that vanish with the velocity
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,7 @@ class AirLaw:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> AirLaw:
         """From what `to_dict` gave."""
-        return cls(
-            tuple(map(tuple, stored["coefficients"])), tuple(stored["deviations"]), tuple(stored["wind"])
-        )
+        return cls(tuple(map(tuple, stored["coefficients"])), tuple(stored["deviations"]), tuple(stored["wind"]))
 
     def wind_before(self, dataset: Dataset, seconds: float = SECONDS) -> Float[np.ndarray, "rows 3"]:
         """The wind [m/s, world] that the rows before each one of its episode show; at the first, that of the law.
@@ -64,8 +63,8 @@ class AirLaw:
             target = left + np.einsum("nij,nj->ni", slope, wind)
             normal = np.einsum("nki,k,nkj->nij", slope, weights, slope)
             right = np.einsum("nki,k,nk->ni", slope, weights, target)
-            # a row's worth of the start holds where nothing was seen yet
-            hold = np.trace(normal, axis1=1, axis2=2).mean() / 3.0 * (0.5 if after else 0.01) * np.eye(3)
+            # a part of what the first row shows stays with the start, which is all there is where nothing was seen yet
+            hold = (np.trace(normal[0]) / 3.0 * (0.5 if after else 0.01) + 1e-12) * np.eye(3)
             joined = np.concatenate([normal.reshape(-1, 9), right], axis=1)
             sums = np.zeros_like(joined)
             for number, rows, _ in episodes_in_order(dataset):
@@ -84,7 +83,7 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
 
     The mean wind of every episode and the law are found together, by least squares with the law projected out
     (Kaufman's variable projection, BIT 1975, with Levenberg-Marquardt steps): a body that moves to and fro shows the
-    slope of the drag, and the force that stays is that slope times the wind. The wind then follows the rows around each.
+    slope of the drag, and the force that stays is that slope times the wind. The wind then follows the rows nearby.
     Nothing is found for bases that do not fly freely, for rows out of order, for fewer than 400, and for winds beyond
     40 m/s or with a standard deviation beyond 2 m/s.
     """
@@ -154,7 +153,7 @@ class _Forces:
         speed = np.linalg.norm(air, axis=1, keepdims=True)
         moving = [air, speed * air, share * air, self.velocity[:, 3:]]  # without any of these no force along x and y
         other = [self.delivered[:, 2:], self.height, np.ones_like(push), np.square(air[:, :2])]
-        return np.concatenate(moving + other, axis=1), np.array([12, 12, 20, 20, 20, 20])
+        return np.concatenate(moving + other, axis=1), np.array([MOVING] * 2 + [20] * 4)
 
     def solved(self, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
         """Coefficients (6, causes) by least squares, what they leave (rows, 6), and an orthonormal basis of each."""
@@ -214,8 +213,11 @@ def _mean_winds(forces: _Forces, own: np.ndarray, count: int, step: float) -> np
         wind = np.clip(solution + moved.reshape(count, 3), -STRONGEST, STRONGEST)
     repeated = max(1.0, APART / step)
     variance = repeated * np.diag(np.linalg.pinv(normal)).reshape(count, 3)
-    found = np.abs(solution).max() < STRONGEST and bool((variance[:, :2] < SURE**2).all())
-    return solution if found else None
+    left = forces.solved(solution[own])[1][:, :2]
+    # drag has to explain more of the forces along x and y than its coefficients would of noise (Akaike 1974)
+    gained = len(own) / repeated * np.log(np.square(forces.wrench[:, :2]).sum(0) / np.square(left).sum(0)).sum()
+    shown = gained > 2.0 * 2 * MOVING and np.abs(solution).max() < STRONGEST
+    return solution if shown and bool((variance[:, :2] < SURE**2).all()) else None
 
 
 def _first_winds(forces: _Forces, own: np.ndarray, count: int) -> np.ndarray:

@@ -15,4 +15,6 @@ from .surfaces import (
     Surface as Surface, surface_axes as surface_axes,
 )
 from .system import MechanicalSystem as MechanicalSystem
-from .thrusters import LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench, Thrusters as Thrusters
+from .thrusters import (
+    LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench, Thrusters as Thrusters,
+)

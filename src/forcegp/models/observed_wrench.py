@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_wind
 from forcegp.data.filtering import episodes_in_order
@@ -53,16 +53,14 @@ def observing(
     system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
-    first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
-    age = dataset.time - np.array([first[number] for number in dataset.episode])
-    return posterior.with_system(system), seen.rows(np.flatnonzero(age >= seconds))
+    return posterior.with_system(system), seen.rows(_with_past(dataset, seconds))
 
 
 def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, Dataset] | None:
     """The recording with the wind that acts on its rows, and the law of air that shows it (`forcegp.data.find_wind`).
 
-    None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where u holds the wind already, and
-    where the rows do not show it.
+    None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where u holds the wind already,
+    and where the rows do not show it.
     """
     of_air = [term for term in prior.summands() if isinstance(term, AerodynamicForce) and term.observe != 0.0]
     if not of_air or any(isinstance(force, ObservedWind) for force in system.known_forces):
@@ -77,6 +75,29 @@ def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tu
 def without_wind(system: MechanicalSystem) -> MechanicalSystem:
     """The system without columns of wind in u."""
     return replace(system, known_forces=tuple(x for x in system.known_forces if not isinstance(x, ObservedWind)))
+
+
+def rows_in_wind(posterior: Posterior, rows: Dataset) -> Dataset | None:
+    """Rows to `update` with: those of the system that a model with wind was trained on, with the wind before each.
+
+    None for any other posterior. Raises InvalidInput for rows with less than .1 s of their own past, which show none.
+    """
+    target, own = posterior.target, posterior.model.system
+    if "air" not in posterior.settings or target is None or target.to_dict() != without_wind(own).to_dict():
+        return None
+    _, seen = _in_observed_wind(posterior, rows)
+    late = _with_past(rows, LEAST)
+    if not len(late):
+        raise InvalidInput(
+            f"the rows hold less than {LEAST} s of flight, which does not show their wind; update with longer pieces."
+        )
+    return seen.rows(late)
+
+
+def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
+    """Which rows have a past of that time in their episode."""
+    first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
+    return np.flatnonzero(dataset.time - np.array([first[number] for number in dataset.episode]) >= seconds)
 
 
 def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
@@ -107,7 +128,10 @@ def _unexplained(
 
 
 def _observed(
-    unexplained: Float[np.ndarray, "rows nv"], effect: Float[np.ndarray, "rows nv 6"], dataset: Dataset, times: Sequence[float]
+    unexplained: Float[np.ndarray, "rows nv"],
+    effect: Float[np.ndarray, "rows nv 6"],
+    dataset: Dataset,
+    times: Sequence[float],
 ) -> Float[np.ndarray, "rows 6"]:
     """The wrench that the rows before each show; none at the first of an episode.
 

@@ -31,6 +31,7 @@ from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
+from forcegp.models.observed_wrench import rows_in_wind
 from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -277,6 +278,9 @@ class StructuredPosterior(Posterior):
         (docs/how-to/incremental.md). Rows of a call count as simultaneous, those of the fit as at its first row. Raises
         InvalidInput where time goes back.
         """
+        if (in_wind := rows_in_wind(self, rows)) is not None:
+            there = replace(self, target=None).update(in_wind, budget, keep=keep, horizon=horizon)
+            return replace(there, target=self.target)
         if self.target is not None:
             raise InvalidInput(
                 "the posterior was carried to another system than the one that its rows were measured on; update it "

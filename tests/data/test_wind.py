@@ -1,0 +1,121 @@
+"""The wind of a recording: found exactly where the law of air is exact, and observed from the past only."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from forcegp import AerodynamicForce, Dataset, MechanicalSystem, Robot
+from forcegp.data import AirLaw, find_wind, with_wind
+from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters, fixed_point
+from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
+
+BODY = (
+    '<robot name="drone"><link name="body"><inertial><mass value="1.2"/>'
+    '<inertia ixx="0.01" iyy="0.012" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+)
+PLACES = [(0.1, -0.1, 0.0), (-0.1, 0.1, 0.0), (0.1, 0.1, 0.0), (-0.1, -0.1, 0.0)]
+DRAG, SQUARED = np.array([0.2, 0.3, 0.4]), np.array([0.05, 0.04, 0.06])
+
+
+def flight(wind, *, drag=1.0, episodes=1, rows=800, seed=0, noise=0.0):
+    """Random smooth motions of a body on which drag is the only unmodelled force, a law that `AirLaw` holds exactly."""
+    robot = Robot.from_urdf_text(BODY, base="floating")
+    rotors = Thrusters("body", PLACES, 1.0, [0.02, 0.02, -0.02, -0.02])
+    system = MechanicalSystem(robot, (), (Actuation(), rotors, RigidBodyBias()))
+    rng, parts = np.random.default_rng(seed), []
+    time = np.arange(rows) / 100
+    for episode in range(episodes):
+
+        def waves(columns, size, rng=rng):
+            rate, phase = rng.uniform(0.5, 6.0, (2, columns)), rng.uniform(0, 6, (2, columns))
+            return size * np.sin(rate[:, None] * time[:, None] + phase[:, None]).sum(0)
+
+        turn = np.concatenate([waves(3, 0.2), np.ones((rows, 1))], axis=1)
+        q = np.concatenate([waves(3, 1.0), turn / np.linalg.norm(turn, axis=1, keepdims=True)], axis=1)
+        parts.append(
+            (q, waves(6, 1.5), 3.0 + waves(4, 0.5), np.full(rows, episode), np.broadcast_to(wind[episode], (rows, 3)))
+        )
+    q, v, u, episode, blowing = map(np.concatenate, zip(*parts, strict=True))
+    state = system.dynamics(*map(torch.tensor, (q, v, u)))
+    rotation = state.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
+    air = v[:, :3] - np.einsum("nji,nj->ni", rotation, blowing)
+    force = -drag * (DRAG * air + SQUARED * np.linalg.norm(air, axis=1, keepdims=True) * air)
+    torque = -drag * 0.01 * air[:, [1, 0, 2]]
+    a = state.acceleration(torch.tensor(np.concatenate([force, torque], axis=1))).numpy()
+    a = a + noise * rng.standard_normal(a.shape)
+    return Dataset(q=q, v=v, u=u, a=a, time=np.tile(time, episodes) + 100.0 * episode, episode=episode, system=system)
+
+
+@pytest.mark.parametrize("wind", [(0.0, 0.0, 0.0), (3.0, -2.0, 0.0), (-9.0, 7.0, 0.0)])
+def test_the_wind_of_an_exact_law_is_found(wind):
+    dataset = flight([wind])
+    law, found = find_wind(dataset)
+    np.testing.assert_allclose(law.wind, wind, atol=1e-5)
+    np.testing.assert_allclose(found, np.broadcast_to(wind, found.shape), atol=1e-5)
+    assert max(law.deviations) < 1e-5
+
+
+def test_every_episode_has_its_wind():
+    winds = [(4.0, 1.0, 0.0), (-2.0, 5.0, 0.0), (0.0, 0.0, 0.0)]
+    dataset = flight(winds, episodes=3, noise=0.05)
+    _, found = find_wind(dataset)
+    for episode, wind in enumerate(winds):
+        np.testing.assert_allclose(found[dataset.episode == episode].mean(0), wind, atol=0.1)
+
+
+def test_another_wind_is_observed_from_the_rows_before():
+    law, _ = find_wind(flight([(3.0, -2.0, 0.0)]))
+    other = flight([(-5.0, 4.0, 0.0)], seed=1)
+    observed = law.wind_before(other)
+    np.testing.assert_allclose(observed[0], law.wind)
+    np.testing.assert_allclose(observed[60:], np.broadcast_to((-5.0, 4.0, 0.0), observed[60:].shape), atol=0.1)
+    changed = other.a.copy()
+    changed[300:] += 3.0
+    after = law.wind_before(replace(other, a=changed))
+    np.testing.assert_array_equal(after[:301], observed[:301])
+    assert np.abs(after[301] - observed[301]).max() > 1e-3
+
+
+def test_a_law_comes_back_from_plain_numbers():
+    law, _ = find_wind(flight([(1.0, 2.0, 0.0)]))
+    assert AirLaw.from_dict(law.to_dict()) == law
+
+
+def test_the_mean_wind_of_a_simulated_flight_in_gusts():
+    dataset = simulate_quadrotor(QuadrotorConfig(seconds=20.0, seed=3, episodes=2, wind=6.0, lag=0.04))
+    _, found = find_wind(dataset)
+    for episode, wind in enumerate(dataset.metadata["wind"]):
+        assert np.linalg.norm(found[dataset.episode == episode].mean(0)[:2] - wind[:2]) < 1.5
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("case", ["no drag", "few rows", "out of order", "contact"])
+def test_nothing_is_found_where_rows_do_not_show_it(case, seed):
+    dataset = flight([(3.0, 0.0, 0.0)], drag=0.0 if case == "no drag" else 1.0, noise=0.3, seed=seed)
+    if case == "few rows":
+        dataset = dataset.rows(np.arange(300))
+    if case == "out of order":
+        dataset = dataset.rows(np.random.default_rng(0).permutation(len(dataset)))
+    if case == "contact":
+        dataset = replace(dataset, system=dataset.system.with_contacts(fixed_point("body", (0, 0, 0))))
+    assert find_wind(dataset) is None
+
+
+def test_wind_and_velocity_are_the_same_to_the_air():
+    """Features of a body in wind are those of one that moves against still air."""
+    dataset = flight([(3.0, -2.0, 1.0)], rows=500)
+    there = with_wind(dataset, np.broadcast_to((3.0, -2.0, 1.0), (500, 3)))
+    assert there.system.inputs[4:] == ("wind_x", "wind_y", "wind_z")
+    windy = there.system.dynamics(*map(torch.tensor, (there.q, there.v, there.u)))
+    rotation = windy.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
+    v = dataset.v.copy()
+    v[:, :3] -= np.einsum("nji,j->ni", rotation, (3.0, -2.0, 1.0))
+    still = dataset.system.dynamics(*map(torch.tensor, (dataset.q, v, dataset.u)))
+    prior = AerodynamicForce()
+    torch.testing.assert_close(prior.features(windy)[0], prior.features(still)[0])
+    # and it is no force
+    torch.testing.assert_close(
+        windy.Q_K, dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K
+    )
