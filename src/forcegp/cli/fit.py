@@ -192,6 +192,7 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
         "converged": result.converged,
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
+        "wind": posterior.settings.get("air", {}).get("wind"),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
@@ -229,7 +230,7 @@ def _points_used(summary: Mapping[str, Any]) -> str:
 
 
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
-    forces = summary.get("force_noise_std")
+    forces, air = summary.get("force_noise_std"), summary.get("wind")
     # the status counts failed evaluations, too, and the starts
     status = with_option_names(summary["status"], ("iterations",))
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
@@ -244,6 +245,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
             "search": status if summary["converged"] else f"not converged: {status}",
             "noise std": _per_joint(summary["noise_std"]),
             **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
+            **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
             "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
         },
     )

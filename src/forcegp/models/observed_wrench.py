@@ -1,4 +1,4 @@
-"""A slow force that no feature explains, such as wind: observed from the past rows of a recording, then known."""
+"""Wind, and a slow force that no feature explains: observed from the past rows of a recording, then known."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,8 +30,8 @@ def observing(
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
     what follows, and rows with a past shorter than that time are left out. By default the prior's `AerodynamicForce`
-    gives frame and time, or the fit chose the time (`with_observer`); without one, or where its time is 0, both come
-    back as they are.
+    gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s which missed least in
+    the second before. Without such a prior, or where its time is 0, both come back as they are.
 
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording whose rows are not in order of time.

@@ -139,10 +139,11 @@ class AerodynamicForce(BaseWrench):
 
     The six functions of `BaseWrench` depend on velocity, speed times velocity, rates, attitude, height and what the
     actuators deliver, so that a linear kernel holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018) and
-    a thrust that differs from the data sheet. The wind of the training data is a constant force of the world in them.
-    Another wind is an unknown slow input: `forcegp evaluate` and `forcegp rollout` observe it from the last `observe`
-    seconds of the recording, as a disturbance observer does in flight (`forcegp.models.observing`). With None the fit
-    chooses the time on its own rows; 0 observes nothing.
+    a thrust that differs from the data sheet. Velocities are those against the air: the fit finds the wind of its rows
+    (`forcegp.data.find_wind`), and without columns of an `ObservedWind` in u the air is still. `forcegp evaluate` and
+    `forcegp rollout` observe the wind of a recording, and the force that stays unexplained, from the rows before each
+    (`forcegp.models.observing`). `observe` is the time in s that the observer of this force looks back; with None it
+    follows the recording, and 0 observes nothing, neither here nor in the fit.
     """
 
     inputs: tuple[str, ...] = ("velocity", "drag", "angular-velocity", "thrust", "height", "attitude")
