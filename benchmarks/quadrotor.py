@@ -72,8 +72,8 @@ def seed_scores(seed: int, lag: float, points: int) -> dict[str, object]:
     usual = min(TIMES, key=lambda each: training_error(models["parametric"], rows, each))
     result: dict[str, object] = {"seed": seed, "lag": lag, "found lag": round(found, 4), "fit CPU s": seconds}
     for name, posterior in models.items():
-        observer = {"seconds": usual} if name == "parametric" else {}
-        result[name] = [scores(*observing(posterior, test, **observer)) for test in tests]
+        seconds_back = usual if name == "parametric" else None
+        result[name] = [scores(*observing(posterior, test, seconds=seconds_back)) for test in tests]
         if name in ("force prior", "parametric"):
             result[f"{name}, unobserved"] = [scores(posterior, test) for test in tests]
     return {**result, "observer's time of the parametric model": usual}

@@ -101,10 +101,9 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
         return None
     forces, start = _Forces.of(dataset), means[episode]
     law = forces.law(start)
-    for _ in range(2):
-        wind = law._smoothed(forces, dataset, start, SECONDS, after=True)
-        law = forces.law(wind)
-    return law, wind
+    wind = law._smoothed(forces, dataset, start, SECONDS, after=True)
+    wind = forces.law(wind)._smoothed(forces, dataset, start, SECONDS, after=True)
+    return forces.law(wind), wind
 
 
 def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
@@ -190,6 +189,7 @@ def _mean_winds(forces: _Forces, own: np.ndarray, count: int, step: float) -> np
     """The mean wind (episodes, 3), or None where it is not to be found."""
     wind = _first_winds(forces, own, count)
     damping, best, solution = 1e-3, np.inf, wind
+    normal, right = np.zeros((3 * count, 3 * count)), np.zeros(3 * count)
     for _ in range(40):
         law, left, bases = forces.solved(wind[own])
         variances = np.square(left).mean(0)
