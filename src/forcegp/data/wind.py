@@ -1,4 +1,4 @@
-"""The wind of a recording: a slow velocity of the air that nobody measured, from the forces on a body that flies."""
+"""The wind of a recording: a slow velocity of the air that was not measured, from the forces on a body that flies."""
 
 from __future__ import annotations
 
