@@ -71,6 +71,8 @@ def test_another_wind_is_observed_from_the_rows_before():
     observed = law.wind_before(other)
     np.testing.assert_allclose(observed[0], law.wind)
     np.testing.assert_allclose(observed[60:], np.broadcast_to((-5.0, 4.0, 0.0), observed[60:].shape), atol=0.1)
+    first = other.rows(np.arange(200))
+    np.testing.assert_allclose(law.wind_before(first), observed[:200], atol=1e-12)  # nor does the length count
     changed = other.a.copy()
     changed[300:] += 3.0
     after = law.wind_before(replace(other, a=changed))
@@ -84,7 +86,7 @@ def test_a_law_comes_back_from_plain_numbers():
 
 
 def test_the_mean_wind_of_a_simulated_flight_in_gusts():
-    dataset = simulate_quadrotor(QuadrotorConfig(seconds=20.0, seed=3, episodes=2, wind=6.0, lag=0.04))
+    dataset = simulate_quadrotor(QuadrotorConfig(seconds=10.0, seed=3, episodes=2, wind=6.0, lag=0.04))
     _, found = find_wind(dataset)
     for episode, wind in enumerate(dataset.metadata["wind"]):
         assert np.linalg.norm(found[dataset.episode == episode].mean(0)[:2] - wind[:2]) < 1.5
