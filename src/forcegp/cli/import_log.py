@@ -59,15 +59,23 @@ class Import(PreparationOptions, RobotOptions):
     step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
     """Seconds between two rows, for a log without time stamps."""
     q: Columns = None
-    """Positions, one per joint."""
+    """Positions, one per joint; of a moving base x, y, z and its orientation."""
     v: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of q", str)] = None
-    """Velocities, one per joint."""
+    """Velocities, one per joint; of a moving base linear, then angular. derive: differentiate this one."""
     u: Columns = None
     """Forces or torques of the actuators; a constant such as 0 is for all joints."""
     a: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of v", str)] = None
     """Accelerations, one per joint."""
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
     """Names of the joints in the order of the columns."""
+    orientation: Annotated[Literal["xyzw", "wxyz", "angles"] | None, unless_given("xyzw|wxyz|angles", "xyzw")] = None
+    """Orientation of a base that moves: a quaternion with w last or first, or angles roll, pitch, yaw (in a plane yaw
+    alone)."""
+    axes: Text = None
+    """Axes of a moving base's v and a, of the linear and the angular part: body, world, or imu, which is what an
+    accelerometer at its origin measures. For instance v=world,body,a=imu; body unless stated."""
+    ned: bool = False
+    """World axes are north, east, down and base axes forward, right, down (PX4); y and z change sign."""
     unit: Text = None
     """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm."""
     sign: Text = None
@@ -152,9 +160,9 @@ class Import(PreparationOptions, RobotOptions):
         return stored.changed_by(self._flags())
 
     def _flags(self) -> forcegp.ColumnMapping:
-        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes")
+        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes", "orientation")
         given: dict[str, Any] = {name: getattr(self, name) for name in names}
-        given["side_by_side"] = self.side_by_side
+        given |= {"side_by_side": self.side_by_side, "ned": self.ned}
         if self.delimiter is not None:
             given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
@@ -162,8 +170,9 @@ class Import(PreparationOptions, RobotOptions):
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
             given["headerless"] = [int(word) for word in words]
-        if self.unit is not None:
-            given["unit"] = forcegp.recordings.by_quantity("unit", self.unit)
+        for name in ("unit", "axes"):
+            if (text := getattr(self, name)) is not None:
+                given[name] = forcegp.recordings.by_quantity(name, text)
         for name in ("sign", "scale", "offset"):
             text = getattr(self, name)
             if text is not None:

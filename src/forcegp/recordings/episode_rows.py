@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.interpolate import make_interp_spline
 
-from forcegp.data import differentiate
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError, MistakenUnit
+from forcegp.recordings.moving_base import Layout
 from forcegp.recordings.reading import RawRecording, Spool
 
 REPEATED = 0.05
@@ -177,14 +177,13 @@ DIFFERENCE_HALO = 3
 class EpisodeRows:
     """The rows of a stretch in pieces, equal to those of the whole stretch at once up to rounding.
 
-    Parameters: `kept` as in `Stamps`; `logged` signals in the order of the spool's columns, `nv` of each; `step` [s]
-    between even times, or None for the times of the log.
+    Parameters: `kept` as in `Stamps`; `layout` of the spool; `step` [s] between even times, or None for the times of
+    the log.
     """
 
     stretch: Stretch
     kept: np.ndarray
-    logged: tuple[str, ...]
-    nv: int
+    layout: Layout
     step: float | None
 
     def pieces(self, spool: Spool, rows: int = ROWS_AT_A_TIME) -> Iterator[dict[str, np.ndarray]]:
@@ -204,15 +203,17 @@ class EpisodeRows:
         def interpolated(at: np.ndarray) -> np.ndarray:
             low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
             high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
-            return make_interp_spline(stamps[low:high], logged(low, high), k=3)(at)
+            table, held = logged(low, high), list(self.layout.held)
+            between = make_interp_spline(stamps[low:high], table, k=3)(at)
+            if held:
+                before = np.searchsorted(stamps[low:high], at * (1 + 1e-12), side="right") - 1
+                between[:, held] = table[before][:, held]
+            return between
 
         for start in range(0, len(time), rows):
             end = min(start + rows, len(time))
             low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
             table = logged(low, high) if self.step is None else interpolated(time[low:high])
-            signals = {name: table[:, self.nv * i : self.nv * (i + 1)] for i, name in enumerate(self.logged)}
-            for name, source in (("v", "q"), ("a", "v")):
-                if name not in signals:
-                    signals[name] = differentiate(signals[source], time[low:high])
+            signals = self.layout.signals(table, time[low:high])
             own = slice(start - low, end - low)
             yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}

@@ -1,0 +1,194 @@
+"""Logs of bases that move: how they write orientations, velocities and accelerations, turned into those of a Dataset.
+
+A Dataset has quaternions x, y, z, w of the orientation R, velocities v = (R^T p', w) in the axes of the base, and their
+plain derivative v'. So a' of the world's axes gives v' = R^T p'' - w x R^T p', and an accelerometer at the origin of
+the base, which measures the specific force f = R^T (p'' - g), gives v' = f + R^T g - w x R^T p' (Titterton & Weston,
+"Strapdown inertial navigation technology", 2004, section 3.5). Angular velocities are alike in both axes:
+(R w)' = R (w' + w x w) = R w'.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from forcegp.data import differentiate
+from forcegp.data.configurations import LARGEST_TURN
+from forcegp.errors import DatasetError
+from forcegp.recordings.source import Source
+from forcegp.robots import Robot
+from forcegp.robots.manifold import ConfigurationSpace, Group, pose
+
+ANGLES = ("roll", "pitch", "yaw")
+TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
+"""What changes sign by half a turn of world and base about x: north, east, down becomes north, west, up."""
+LARGEST_ERROR = 0.01
+"""Of the length of a quaternion: more is no rounding."""
+ROUNDED = 1e-9
+"""Differences from length 1 beyond this are reported."""
+
+
+def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
+    """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
+    names, singles, place = list[str](), iter(joints), 0
+    groups = {group.place: group for group in robot.space.groups}
+    while place < robot.nq:
+        group = groups.get(place)
+        names += [next(singles)] if group is None else [f"{group.name}.{x}" for x in _written(group, orientation)]
+        place += 1 if group is None else len(group.motion.positions)
+    return tuple(names)
+
+
+def _written(group: Group, orientation: str) -> tuple[str, ...]:
+    place, turn = group.motion.positions[: group.motion.turn.start], group.motion.positions[group.motion.turn]
+    if orientation == "angles":
+        return place + (ANGLES[2:] if group.kind == "planar" else ANGLES)
+    return place + (turn[-1:] + turn[:-1] if orientation == "wxyz" and group.kind != "planar" else turn)
+
+
+class Poses:
+    """Positions as the log writes them, piece by piece, as q: turns of length 1, quaternions whose sign never jumps.
+
+    `jumps` are rows before which a base turns by more than a quarter of a turn, what was seen, and what to do; `worst`
+    is the largest difference of a length from 1.
+    """
+
+    def __init__(self, space: ConfigurationSpace, orientation: str, source: Source) -> None:
+        self.space, self.orientation, self.source = space, orientation, source
+        self.last: dict[str, np.ndarray] = {}
+        self.jumps: list[tuple[int, str, str]] = []
+        self.worst = 0.0
+
+    def read(
+        self, table: Float[np.ndarray, "rows columns"], rows: int, restarts: Sequence[int]
+    ) -> Float[np.ndarray, "rows nq"]:
+        """q of a piece that follows `rows` others; rows in `restarts` begin another episode.
+
+        Raises DatasetError, naming the row, where a turn is more than 1 % longer or shorter than 1.
+        """
+        q = np.empty((len(table), self.space.nq))
+        start = place = 0
+        for group in self.space.groups:
+            between = slice(start, start + group.place - place)
+            start, place = between.stop + len(_written(group, self.orientation)), group.places.stop
+            q[:, group.place - (between.stop - between.start) : group.place] = table[:, between]
+            q[:, group.places] = self._pose(group, table[:, between.stop : start], rows, restarts)
+        q[:, place:] = table[:, start:]
+        return q
+
+    def note(self) -> tuple[str, ...]:
+        """That orientations were divided by their length, if more than rounding."""
+        many = self.worst > ROUNDED
+        return (f"orientations divided by their length, which differs from 1 by up to {self.worst:.2g}",) * many
+
+    def _pose(self, group: Group, given: np.ndarray, rows: int, restarts: Sequence[int]) -> np.ndarray:
+        first = group.motion.turn.start
+        if self.orientation == "angles" and group.kind == "planar":
+            turn = np.hstack([np.cos(given[:, first:]), np.sin(given[:, first:])])
+        elif self.orientation == "angles":
+            turn = np.asarray(Rotation.from_euler("xyz", given[:, first:]).as_quat())
+        else:
+            turn = self._unit(group, given[:, first:], rows)
+        half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
+        before = np.concatenate([self.last.get(group.name, turn[0])[None], turn[:-1]])
+        cosine = (turn * before).sum(axis=1)
+        if half:
+            turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
+        self.last[group.name] = turn[-1].copy()
+        jumped = (np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1))
+        jumped[list(restarts)] = False
+        seen = f"{group.name!r} turns by more than a quarter of a turn"
+        remedy = (
+            "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
+        )
+        self.jumps += [(rows + int(row), seen, remedy) for row in np.flatnonzero(jumped)]
+        return np.hstack([given[:, :first], turn])
+
+    def _unit(self, group: Group, turn: np.ndarray, rows: int) -> np.ndarray:
+        length = np.linalg.norm(turn, axis=1)
+        error = np.abs(length - 1.0)
+        if (error > LARGEST_ERROR).any():
+            row = int(np.argmax(error > LARGEST_ERROR))
+            names = ", ".join(group.motion.positions[group.motion.turn])
+            raise DatasetError(
+                f"{self.source.path}: the orientation of {group.name!r} ({names}) has the length {length[row]:.4g} at "
+                f"{self.source.place(rows + row)}; a turn has length 1. Map its columns, give `orientation` angles if "
+                "they are roll, pitch and yaw, or repair or remove these rows."
+            )
+        self.worst = max(self.worst, float(error.max(initial=0.0)))
+        return turn / length[:, None]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the signals stand in the spool, and what is left to do about those of a base.
+
+    Fields
+    ------
+    places: columns of each signal that was logged; q as a Dataset has it.
+    space: of the positions.
+    axes: of v and a, those of the linear and of the angular part.
+    gravity: (3,) [m/s^2], for accelerometers.
+    derived: entries of v and a that the log lacks.
+    held: columns of the spool that hold from row to row.
+    """
+
+    places: Mapping[str, slice]
+    space: ConfigurationSpace
+    axes: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
+    derived: Mapping[str, list[int]] = field(default_factory=dict)
+    held: tuple[int, ...] = ()
+
+    @property
+    def width(self) -> int:
+        """Columns of the spool."""
+        return max(place.stop for place in self.places.values())
+
+    def signals(self, table: np.ndarray, time: Float[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
+        """q, v, u and a of rows of the spool, with differences (second order) for what was not logged."""
+        found = {name: table[:, place] for name, place in self.places.items()}
+        if not self.space.is_vector_space:  # a spline through quaternions does not end on the sphere
+            found["q"] = self.space.normalized(torch.tensor(found["q"])).numpy()
+        for name, source in (("v", "q"), ("a", "v")):
+            lacking = self.derived.get(name, [])
+            if name in found:
+                found[name] = self._in_body(name, found[name], found["q"], found["v"])
+            if name not in found or lacking:
+                made = differentiate(found[source], time, self.space if name == "v" else None)
+                own = np.arange(self.space.nv)[:, None] == np.array(lacking or range(self.space.nv))
+                found[name] = np.where(own.any(axis=1), made, found.get(name, made))
+        return found
+
+    def _in_body(self, signal: str, values: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """v or a (rows, nv) as a Dataset has them; `v` in body axes where a is asked for."""
+        linear, angular = self.axes.get(signal, ("body", "body"))
+        if (linear, angular) == ("body", "body"):
+            return values
+        values = values.copy()
+        for group in self.space.groups:
+            rotation = pose(group.kind, torch.tensor(q[:, group.places]))[0].numpy()
+            six = partial(_six, group)
+            own = six(values)
+            turn = partial(np.einsum, "nji,nj->ni", rotation)
+            if linear == "world":
+                own[:, :3] = turn(own[:, :3])
+            if angular == "world":
+                own[:, 3:] = turn(own[:, 3:])
+            if linear == "imu":
+                own[:, :3] += turn(np.broadcast_to(self.gravity, (len(q), 3)))
+            if signal == "a" and linear != "body":
+                own[:, :3] -= np.cross(six(v)[:, 3:], six(v)[:, :3])
+            values[:, group.rows] = own[:, list(group.motion.free)]
+        return values
+
+
+def _six(group: Group, values: np.ndarray) -> np.ndarray:
+    """Linear and angular part (rows, 6) of a base, 0 where it cannot move."""
+    six = np.zeros((len(values), 6))
+    six[:, list(group.motion.free)] = values[:, group.rows]
+    return six
