@@ -63,9 +63,10 @@ class Stamps:
 def read_stamps(recording: RawRecording, gap: float | None, start: float | None, end: float | None) -> Stamps:
     """Stretches of a recording between gaps of more than `gap` seconds (default `GAP` median steps).
 
-    Of rows with the same stamp the first is kept: what comes after it is a sample that was sent again, or one whose
-    time is not known. `start` and `end` [s] are counted from the first row of each episode.
-    Raises DatasetError for time that runs backwards, and for rates that no robot is logged at.
+    Rows in a pause of one topic of several are left out. Of rows with the same stamp the first is kept: what comes
+    after it is a sample that was sent again, or one whose time is not known. `start` and `end` [s] are counted from the
+    first row of each episode. Raises DatasetError for time that runs backwards, and for rates that no robot is logged
+    at.
     """
     begins = recording.episodes[:, 1]
     typical = _typical_step(recording)
@@ -74,13 +75,15 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
     repeated = len(kept) - int(kept.sum())
     if start is not None or end is not None:
         kept &= _between(recording, start, end)
-    used = np.flatnonzero(kept)
+    paused = recording.source.paused(gap, GAP)
+    paused = np.zeros(len(kept), bool) if paused is None else paused
+    used = np.flatnonzero(kept & ~paused)
     number = np.searchsorted(begins, used, side="right") - 1
     same = np.diff(number) == 0
     between = np.diff(recording.time[used])
     step = float(np.median(between[same])) if same.any() else typical
     limit = GAP * step if gap is None else gap
-    inside = same & (between <= limit)
+    inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)
     bounds = [0, *(np.flatnonzero(~inside) + 1).tolist(), len(used)]
     stretches, dropped = [], 0
     for first, last in pairwise(bounds):
@@ -96,7 +99,7 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
         )
     gaps = tuple(between[same & ~inside].tolist())
     worst = float(np.abs(between[inside] / step - 1.0).max())
-    return Stamps(tuple(stretches), kept, step, worst, repeated, gaps, dropped)
+    return Stamps(tuple(stretches), kept & ~paused, step, worst, repeated, gaps, dropped)
 
 
 def _typical_step(recording: RawRecording) -> float:

@@ -15,6 +15,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 from forcegp.recordings.array_file import ArrayFile
 from forcegp.recordings.episode_rows import EpisodeRows, Stamps, Stretch, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
+from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.reading import (
     RawRecording,
@@ -99,7 +100,9 @@ def import_recordings(
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot = None if system is None else system.robot
     sources = _sources([Path(path) for path in paths], mapping)
-    plans = [signal_plan(mapping, source, system) for _, source in sources]
+    joined = [on_one_clock(source, signal_plan(mapping, source, system)) for _, source in sources]
+    sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
+    plans = [plan for _, plan in joined]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):

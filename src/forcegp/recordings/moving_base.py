@@ -90,11 +90,11 @@ class Poses:
         if self.orientation == "angles" and group.kind == "planar":
             turn = np.hstack([np.cos(given[:, first:]), np.sin(given[:, first:])])
         elif self.orientation == "angles":
-            turn = np.asarray(Rotation.from_euler("xyz", given[:, first:]).as_quat())
+            turn = np.array(Rotation.from_euler("xyz", given[:, first:]).as_quat())
         else:
             turn = self._unit(group, given[:, first:], rows)
         half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
-        before = np.concatenate([self.last.get(group.name, turn[0])[None], turn[:-1]])
+        before = np.vstack([self.last.get(group.name, turn[0]), turn[:-1]])
         cosine = (turn * before).sum(axis=1)
         if half:
             turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
