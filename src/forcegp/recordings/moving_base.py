@@ -94,7 +94,8 @@ class Poses:
         else:
             turn = self._unit(group, given[:, first:], rows)
         half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
-        before = np.vstack([self.last.get(group.name, turn[0]), turn[:-1]])
+        last = self.last[group.name] if group.name in self.last else turn[0]
+        before = np.vstack([last, turn[:-1]])
         cosine = (turn * before).sum(axis=1)
         if half:
             turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
