@@ -46,11 +46,14 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
     v[:, 3:6] = (turned @ v[:, 3:6, None])[..., 0]
     findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
     assert findings[0].seen.startswith("positions of 'base' change as if it had velocities in the axes of the world")
-    assert "--axes v=world," in findings[0].remedy
+    assert "--axes v=world. " in findings[0].remedy
     v[:, 3:6] = (np.linalg.inv(turned) @ v[:, 3:6, None])[..., 0]
     findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
     assert "linear velocities in the axes of the world" in findings[0].seen
-    assert "--axes v=world,body" in findings[0].remedy
+    assert "--axes v=world,body." in findings[0].remedy
+    q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
+    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
+    assert "--orientation wxyz --axes v=world,body." in findings[0].remedy
 
 
 def test_an_accelerometer_is_no_acceleration(log):

@@ -13,9 +13,10 @@ from torch import Tensor
 from forcegp.checks.check_input import Finding, look, ok, wrong
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
+from forcegp.data.configurations import in_base
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
-from forcegp.robots.manifold import Group, pose
+from forcegp.robots.manifold import Group
 
 CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
@@ -37,9 +38,9 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
     for group in system.robot.layout.groups:
         yield from _of_velocity(system.robot, group, q0, q1, step, middle)
         error, size = _rms(change[:, group.rows] - a[:, group.rows]), _rms(change[:, group.rows])
-        q, own = torch.tensor(dataset.q[after]), torch.tensor(dataset.v[after])
-        gravity = system.robot.gravity.to(q.device)
-        specific = _rms(change[:, group.rows] - _of_specific_force(group, q, own, a, gravity))
+        at, gravity = q0[:, group.places], system.robot.gravity
+        measured = in_base(group, at, a[:, group.rows], ("imu", "body"), middle[:, group.rows], gravity)
+        specific = _rms(change[:, group.rows] - measured)
         if error > 2.0 * size and specific < CLEARLY * error:
             yield wrong(
                 subject="base acceleration",
@@ -61,44 +62,41 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
 
 def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tensor, v: Tensor) -> Iterator[Finding]:
     own = v[:, group.rows]
-    body = _in_body(group, q0, own)
-
-    def error(first: Tensor, second: Tensor, velocity: Tensor, part: list[int]) -> float:
-        moved = robot.space.difference(first, second)[:, group.rows] / step
-        return _rms((moved - velocity)[:, part])
+    whole = list(range(own.shape[1]))
+    parts = {"linear ": [k for k in whole if group.motion.free[k] < 3]}
+    parts["angular "] = [k for k in whole if k not in parts["linear "]]
 
     def mistaken(recorded: float, other: float, speed: float) -> bool:
         return recorded > CLEARLY * speed and other < CLEARLY * min(recorded, speed)
 
-    whole = list(range(own.shape[1]))
-    recorded, speed = error(q0, q1, own, whole), _rms(own)
-    parts = {"linear ": [k for k in whole if group.motion.free[k] < 3]}
-    parts["angular "] = [k for k in whole if k not in parts["linear "]]
-    of_world = [
-        name
-        for name, part in parts.items()
-        if part and mistaken(error(q0, q1, own, part), error(q0, q1, body, part), _rms(own[:, part]))
-    ]
-    reading, other, remedy = "", recorded, ""
-    if of_world:
-        reading = f"{of_world[0] if len(of_world) == 1 else ''}velocities in the axes of the world"
-        axes = [name in of_world for name in parts]
-        stated = ",".join("world" if each else "body" for each in (axes if axes[0] != axes[1] else axes[:1]))
-        turned = own.clone()
-        for name in of_world:
-            turned[:, parts[name]] = body[:, parts[name]]
-        other, remedy = (
-            error(q0, q1, turned, whole),
-            f"forcegp import --axes v={stated}, or R^T v of the orientation R.",
-        )
+    def best_axes(first: Tensor, second: Tensor) -> tuple[list[str], float]:
+        """Which parts of v fit in the axes of the world only, and the error that is left with them turned."""
+        moved = robot.space.difference(first, second)[:, group.rows] / step
+        body, turned, of_world = in_base(group, first[:, group.places], own, ("world", "world")), own.clone(), []
+        for name, part in parts.items():
+            as_recorded, other = (_rms((moved - velocity)[:, part]) for velocity in (own, body))
+            if part and mistaken(as_recorded, other, _rms(own[:, part])):
+                turned[:, part] = body[:, part]
+                of_world.append(name)
+        return of_world, _rms(moved - turned)
+
+    recorded = _rms(robot.space.difference(q0, q1)[:, group.rows] / step - own)
+    speed, meant, flags = _rms(own), [], []
+    of_world, other = best_axes(q0, q1)
     if group.kind != "planar":
         turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
         first, second = q0.clone(), q1.clone()
         first[:, turn], second[:, turn] = q0[:, turn].roll(-1, -1), q1[:, turn].roll(-1, -1)
-        reordered = error(first, second, own, whole)
+        axes, reordered = best_axes(first, second)
         if mistaken(recorded, reordered, speed) and reordered < other:
-            reading, other = "a quaternion w, x, y, z", reordered
-            remedy = "forcegp import --orientation wxyz. Reorder its columns elsewhere: forcegp has x, y, z, w."
+            of_world, other = axes, reordered
+            meant, flags = ["a quaternion w, x, y, z"], ["--orientation wxyz"]
+    if of_world:
+        both = len(of_world) == 2
+        meant.append(f"{'' if both else of_world[0]}velocities in the axes of the world")
+        flags.append(f"--axes v={'world' if both else ','.join('world' if x in of_world else 'body' for x in parts)}")
+    reading = " and ".join(meant)
+    remedy = f"forcegp import {' '.join(flags)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
     numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
     if reading:
         yield wrong(
@@ -118,28 +116,6 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
         )
     else:
         yield ok(subject="base", seen=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
-
-
-def _in_body(group: Group, q: Tensor, v: Tensor) -> Tensor:
-    """Velocities of the world's axes in those of the body."""
-    rotation, _ = pose(group.kind, q[:, group.places])
-    turned = (rotation.mT[:, None] @ _six(group, v).unflatten(-1, (2, 3))[..., None])[..., 0]
-    return turned.flatten(1)[:, list(group.motion.free)]
-
-
-def _of_specific_force(group: Group, q: Tensor, v: Tensor, a: Tensor, gravity: Tensor) -> Tensor:
-    """The derivative of v if `a` has the specific force at the origin of the base: f + R^T g - w x v."""
-    rotation, _ = pose(group.kind, q[:, group.places])
-    six, moving = _six(group, a[:, group.rows]), _six(group, v[:, group.rows])
-    six[:, :3] += (rotation.mT @ gravity[:, None])[..., 0] - torch.linalg.cross(moving[:, 3:], moving[:, :3])
-    return six[:, list(group.motion.free)]
-
-
-def _six(group: Group, values: Tensor) -> Tensor:
-    """Linear and angular part (rows, 6), 0 where the base cannot move."""
-    six = values.new_zeros(len(values), 6)
-    six[:, list(group.motion.free)] = values
-    return six
 
 
 def _rms(values: Tensor) -> float:

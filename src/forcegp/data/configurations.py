@@ -11,10 +11,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError
-from forcegp.robots.manifold import ConfigurationSpace
+from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 
 LEAST_LENGTH = 0.7
 """Of a filtered quaternion: below it the turn is faster than what the filter passes."""
@@ -82,6 +83,38 @@ def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " row
     positions = torch.tensor(q)
     moved = space.difference(positions[:, None], positions[near]).numpy()
     return np.einsum("nk,nkj->nj", weights, moved)
+
+
+def in_base(
+    group: Group,
+    q: Float[Tensor, "rows positions"],
+    values: Float[Tensor, "rows velocities"],
+    axes: tuple[str, str],
+    v: Float[Tensor, "rows velocities"] | None = None,
+    gravity: Float[Tensor, "3"] | None = None,
+) -> Float[Tensor, "rows velocities"]:
+    """v of a base at its positions q, or with `v` and `gravity` its derivative a, from what was measured in `axes`.
+
+    `axes` are those of the linear and of the angular part: "body", "world", or "imu". A Dataset has v = (R^T p', w) and
+    its plain derivative. So world axes give v' = R^T p'' - w x R^T p', and an accelerometer at the origin of the base,
+    which measures f = R^T (p'' - g), gives v' = f + R^T g - w x R^T p' (Titterton & Weston, "Strapdown inertial
+    navigation technology", 2004, section 3.5). Angular parts are alike: (R w)' = R (w' + w x w) = R w'.
+    """
+    free = list(group.motion.free)
+
+    def six(own: Tensor) -> Tensor:
+        return own.new_zeros(len(own), 6).index_copy(1, torch.tensor(free), own).unflatten(-1, (2, 3))
+
+    inverse = pose(group.kind, q)[0].mT
+    turned, found = (inverse[:, None] @ six(values)[..., None])[..., 0], six(values)
+    for part, name in enumerate(axes):
+        if name == "world":
+            found[:, part] = turned[:, part]
+    if v is not None and gravity is not None and axes[0] != "body":
+        found[:, 0] -= torch.linalg.cross(six(v)[:, 1], six(v)[:, 0])
+        if axes[0] == "imu":
+            found[:, 0] += inverse @ gravity
+    return found.flatten(1)[:, free]
 
 
 def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:

@@ -1,15 +1,7 @@
-"""Logs of bases that move: how they write orientations, velocities and accelerations, turned into those of a Dataset.
-
-A Dataset has quaternions x, y, z, w of the orientation R, velocities v = (R^T p', w) in the axes of the base, and their
-plain derivative v'. So a' of the world's axes gives v' = R^T p'' - w x R^T p', and an accelerometer at the origin of
-the base, which measures the specific force f = R^T (p'' - g), gives v' = f + R^T g - w x R^T p' (Titterton & Weston,
-"Strapdown inertial navigation technology", 2004, section 3.5). Angular velocities are alike in both axes:
-(R w)' = R (w' + w x w) = R w'.
-"""
+"""Logs of bases that move: their orientations, velocities and accelerations, turned into those of a Dataset."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 import torch
@@ -17,11 +9,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from forcegp.data import differentiate
-from forcegp.data.configurations import LARGEST_TURN
+from forcegp.data.configurations import LARGEST_TURN, in_base
 from forcegp.errors import DatasetError
 from forcegp.recordings.source import Source
 from forcegp.robots import Robot
-from forcegp.robots.manifold import ConfigurationSpace, Group, pose
+from forcegp.robots.manifold import ConfigurationSpace, Group
 
 ANGLES = ("roll", "pitch", "yaw")
 TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
@@ -167,29 +159,11 @@ class Layout:
 
     def _in_body(self, signal: str, values: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """v or a (rows, nv) as a Dataset has them; `v` in body axes where a is asked for."""
-        linear, angular = self.axes.get(signal, ("body", "body"))
-        if (linear, angular) == ("body", "body"):
+        if signal not in self.axes:
             return values
-        values = values.copy()
+        found, moving, at = (torch.tensor(x) for x in (values, v, q))
+        more = {"gravity": torch.tensor(self.gravity, dtype=torch.float64)} if signal == "a" else {}
         for group in self.space.groups:
-            rotation = pose(group.kind, torch.tensor(q[:, group.places]))[0].numpy()
-            six = partial(_six, group)
-            own = six(values)
-            turn = partial(np.einsum, "nji,nj->ni", rotation)
-            if linear == "world":
-                own[:, :3] = turn(own[:, :3])
-            if angular == "world":
-                own[:, 3:] = turn(own[:, 3:])
-            if linear == "imu":
-                own[:, :3] += turn(np.broadcast_to(self.gravity, (len(q), 3)))
-            if signal == "a" and linear != "body":
-                own[:, :3] -= np.cross(six(v)[:, 3:], six(v)[:, :3])
-            values[:, group.rows] = own[:, list(group.motion.free)]
-        return values
-
-
-def _six(group: Group, values: np.ndarray) -> np.ndarray:
-    """Linear and angular part (rows, 6) of a base, 0 where it cannot move."""
-    six = np.zeros((len(values), 6))
-    six[:, list(group.motion.free)] = values[:, group.rows]
-    return six
+            own = {**more, "v": moving[:, group.rows]} if more else {}
+            found[:, group.rows] = in_base(group, at[:, group.places], found[:, group.rows], self.axes[signal], **own)
+        return found.numpy()

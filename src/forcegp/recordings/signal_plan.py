@@ -288,6 +288,7 @@ def _layout(
     nv: int,
 ) -> Layout:
     """Where everything stands once positions are those of a Dataset."""
+    groups = () if system is None else system.robot.space.groups
     sizes = dict.fromkeys(SIGNALS, nv)
     if system is not None:
         sizes |= {"q": system.robot.nq, "u": len(system.inputs)}
@@ -301,6 +302,11 @@ def _layout(
         for name in ("v", "a")
     }
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
+    for name, group in ((name, group) for name in axes for group in groups):
+        for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
+            rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
+            if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived[name]}) < len(rows):
+                raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
     if system is None:
         return Layout(places, ConfigurationSpace(nv), axes, derived=derived)
     switches = range(places["u"].start + len(system.actuators), places["u"].stop)
