@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.recordings.log_files import EPOCH
 
+from forcegp import MechanicalSystem, Robot
 from forcegp.data import Dataset
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings, open_source, ros_bag
@@ -136,6 +137,57 @@ def test_commands_hold_and_forces_are_interpolated(tmp_path, flight, monkeypatch
     assert "/imu interpolated" in note
     assert f"; {len(flight) - len(rows)} rows before" in note
     assert found.metadata["import"]["recordings"][0]["notes"][-1] == note
+
+
+HOPPER = """<robot name="hopper"><link name="trunk"><inertial><mass value="5"/>
+<inertia ixx="0.05" iyy="0.06" izz="0.04" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="knee" type="revolute"><parent link="trunk"/><child link="foot"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="50" velocity="20"/></joint><link name="foot"><inertial><mass value="0.5"/>
+<inertia ixx="0.002" iyy="0.002" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+def test_joints_of_another_topic_are_interpolated_and_their_torques_held(tmp_path):
+    """The base of a legged robot and its joints; stamps of JointState at its own rate."""
+    base, joint = np.arange(60) / 100, np.arange(-0.01, 0.7, 0.003)
+    messages = [
+        ("/odom", int(s), odometry(int(s), [t, 0, 1, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0]))
+        for t, s in zip(base, nanoseconds(base), strict=True)
+    ]
+    for t, stamp in zip(joint, nanoseconds(joint).tolist(), strict=True):
+        values = {"position": np.array([0.3 * t]), "velocity": np.array([0.3]), "effort": np.array([5.0 + t])}
+        own = message("sensor_msgs/msg/JointState", header=header(stamp), name=["knee"], **values)
+        messages.append(("/joints", stamp + LATE, own))
+    mapping = ColumnMapping(
+        q=("/odom:pose", "/joints:position.{joints}"),
+        v=("/odom:twist", "/joints:velocity.{joints}"),
+        u=("/joints:effort.{joints}",),
+    )
+    system = MechanicalSystem(Robot.from_urdf_text(HOPPER, base="floating"))
+    done = import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, system=system)
+    found = Dataset.load(tmp_path / "out.h5")
+    np.testing.assert_allclose(found.time, base, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.q[:, 7], 0.3 * base, rtol=0, atol=1e-8)
+    last = joint[np.searchsorted(joint, base + 1e-9, side="right") - 1]
+    np.testing.assert_allclose(found.u[:, 0], 5.0 + last, rtol=0, atol=1e-12)
+    assert done["guessed"] == ["time = /odom:header.stamp"]
+    assert "/joints interpolated, u held" in done["recordings"][0]["notes"][-1]
+
+
+def test_commands_hold_where_rows_get_even_times(tmp_path, flight):
+    """Rows of the pose jitter; a command never comes before its stamp."""
+    time = flight.time + np.random.default_rng(1).uniform(-3e-4, 3e-4, len(flight))
+    stamps = nanoseconds(time).tolist()
+    rows = zip(stamps, flight.q, flight.v, strict=True)
+    messages = [("/odom", stamp + LATE, odometry(stamp, q, v)) for stamp, q, v in rows]
+    at = np.arange(-0.01, 1.2, 0.05)
+    messages += [("/rotors", int(nanoseconds(t)), commands([100.0 * k] * 4)) for k, t in enumerate(at)]
+    found, done = imported(written(tmp_path, messages), flight)
+    assert done["resampled_to_step"] == pytest.approx(1 / 240)
+    assert set(np.unique(found.u)) <= set(100.0 * np.arange(len(at)))
+    newest = 100.0 * (np.searchsorted(at, found.time + time[0] + 1e-9, side="right") - 1)
+    late = newest - found.u[:, 0]
+    assert (late >= 0).all()
+    assert (late > 0).mean() < 0.15  # rows up to one step behind a command
 
 
 def test_a_pause_of_a_topic_is_a_gap(tmp_path, flight):

@@ -234,6 +234,19 @@ def test_what_cannot_be_is_refused(tmp_path, flight, changes, stated, message):
         imported(tmp_path, flight, changes, replace(PLAIN, **stated))
 
 
+def test_motors_of_an_mjcf_file_are_the_inputs(tmp_path, flight):
+    sites = "".join(f'<site name="s{k}" pos="{0.1 * (-1) ** k} {0.1 * (k // 2) - 0.05} 0"/>' for k in range(4))
+    motors = "".join(f'<motor name="m{k}" site="s{k}" gear="0 0 1 0 0 {0.02 * (-1) ** k}"/>' for k in range(4))
+    (tmp_path / "drone.xml").write_text(
+        f'<mujoco model="d"><worldbody><body name="body"><freejoint name="free"/><geom size=".1" mass="1"/>{sites}</body>'
+        f"</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    system = MechanicalSystem.from_file(tmp_path / "drone.xml", base="floating")
+    found = imported(tmp_path, flight, mapping=replace(PLAIN, unit={"u": ("1",)}), system=system)
+    assert system_of(found).inputs == ("m0", "m1", "m2", "m3")
+    np.testing.assert_array_equal(found.u, flight.u)
+
+
 @pytest.mark.parametrize(
     "mapping",
     [
