@@ -238,8 +238,8 @@ def test_motors_of_an_mjcf_file_are_the_inputs(tmp_path, flight):
     sites = "".join(f'<site name="s{k}" pos="{0.1 * (-1) ** k} {0.1 * (k // 2) - 0.05} 0"/>' for k in range(4))
     motors = "".join(f'<motor name="m{k}" site="s{k}" gear="0 0 1 0 0 {0.02 * (-1) ** k}"/>' for k in range(4))
     (tmp_path / "drone.xml").write_text(
-        f'<mujoco model="d"><worldbody><body name="body"><freejoint name="free"/><geom size=".1" mass="1"/>{sites}</body>'
-        f"</worldbody><actuator>{motors}</actuator></mujoco>"
+        f'<mujoco model="d"><worldbody><body name="body"><freejoint name="free"/><geom size=".1" mass="1"/>{sites}'
+        f"</body></worldbody><actuator>{motors}</actuator></mujoco>"
     )
     system = MechanicalSystem.from_file(tmp_path / "drone.xml", base="floating")
     found = imported(tmp_path, flight, mapping=replace(PLAIN, unit={"u": ("1",)}), system=system)

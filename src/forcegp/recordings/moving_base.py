@@ -10,7 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from forcegp.data import differentiate
 from forcegp.data.configurations import LARGEST_TURN, in_base
-from forcegp.errors import DatasetError
+from forcegp.data.dataset_fields import ROTATION, TRANSLATION
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.mechanics import MechanicalSystem
+from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping
 from forcegp.recordings.source import Source
 from forcegp.robots import Robot
 from forcegp.robots.manifold import ConfigurationSpace, Group
@@ -40,6 +43,41 @@ def _written(group: Group, orientation: str) -> tuple[str, ...]:
     if orientation == "angles":
         return place + (ANGLES[2:] if group.kind == "planar" else ANGLES)
     return place + (turn[-1:] + turn[:-1] if orientation == "wxyz" and group.kind != "planar" else turn)
+
+
+def singles(robot: Robot) -> tuple[str, ...]:
+    """Joints of one degree of freedom."""
+    of_bases = {row for group in robot.space.groups for row in range(group.rows.start, group.rows.stop)}
+    return tuple(name for row, name in enumerate(robot.joint_names) if row not in of_bases)
+
+
+def columns_of(
+    mapping: ColumnMapping, system: MechanicalSystem | None, joints: tuple[str, ...]
+) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
+    """By signal: name and SI unit of its columns in the order of the log, and names in the order of the Dataset.
+
+    Unit None: whatever the actuator takes.
+    """
+    if system is None:
+        return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
+    robot, own = system.robot, singles(system.robot)
+    kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
+    of_log = dict(zip(own, joints, strict=True))
+    driven = tuple(system.actuation.names) == own
+    switches = system.inputs[len(system.actuators) :]
+
+    def unit(signal: str, name: str) -> str | None:
+        if signal == "u" and not (driven and name in own):
+            return "1" if name in switches else None
+        return kinds[name][signal] if name in kinds else "rad" if name.endswith(ANGLES) else "1"
+
+    written = mapping.orientation or ORIENTATIONS[0]
+    velocities = tuple(of_log.get(name, name) for name in robot.joint_names)
+    inputs = tuple(of_log.get(name, name) if driven else name for name in system.inputs)
+    log = {"q": position_columns(robot, joints, written), "v": velocities, "u": inputs, "a": velocities}
+    stored = position_columns(robot, own, "angles" if written == "angles" else ORIENTATIONS[0])
+    order = {"q": stored, "v": robot.joint_names, "u": system.inputs, "a": robot.joint_names}
+    return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
 
 
 class Poses:
@@ -167,3 +205,37 @@ class Layout:
             own = {**more, "v": moving[:, group.rows]} if more else {}
             found[:, group.rows] = in_base(group, at[:, group.places], found[:, group.rows], self.axes[signal], **own)
         return found.numpy()
+
+
+def layout_of(
+    mapping: ColumnMapping,
+    system: MechanicalSystem | None,
+    lacking: Mapping[str, Sequence[bool]],
+    nv: int,
+) -> Layout:
+    """Where everything stands once positions are those of a Dataset.
+
+    `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
+    there where their axes turn.
+    """
+    groups = () if system is None else system.robot.space.groups
+    sizes = dict.fromkeys(SIGNALS, nv)
+    if system is not None:
+        sizes |= {"q": system.robot.nq, "u": len(system.inputs)}
+    places, end = dict[str, slice](), 0
+    for name in SIGNALS:
+        if sizes[name] == 0 or name in lacking:
+            places[name] = slice(end, end + sizes[name])
+            end += sizes[name]
+    derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
+    axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
+    for name, group in ((name, group) for name in axes for group in groups):
+        for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
+            rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
+            if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
+                raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
+    if system is None:
+        return Layout(places, ConfigurationSpace(nv), axes, derived=derived)
+    switches = range(places["u"].start + len(system.actuators), places["u"].stop)
+    gravity = tuple(system.robot.gravity.tolist())
+    return Layout(places, system.robot.space, axes, gravity, derived, tuple(switches))

@@ -14,9 +14,8 @@ from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, uni
 from forcegp.errors import InvalidInput
 from forcegp.recordings.column_names import LinearExpression, expanded, guessed_columns, guessed_time, parse_expression
 from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping, LogUnit, log_unit
-from forcegp.recordings.moving_base import ANGLES, TURNED, Layout, position_columns
+from forcegp.recordings.moving_base import TURNED, Layout, columns_of, layout_of, singles
 from forcegp.recordings.source import Columns, Source
-from forcegp.robots.manifold import ConfigurationSpace
 
 LACKING = LinearExpression({}, 0.0)
 """This very object: an entry of v or a that the log lacks, which is differentiated."""
@@ -83,7 +82,7 @@ def signal_plan(
     """
     robot = None if system is None else system.robot
     joints = _joints(mapping, robot)
-    log, order = _columns(mapping, system, joints)
+    log, order = columns_of(mapping, system, joints)
     guessed: list[str] = []
     found: dict[str, list[LinearExpression]] = {}
     for signal in SIGNALS:
@@ -124,6 +123,7 @@ def signal_plan(
     signals = tuple(
         item for name, own in found.items() for item in _signals(mapping, name, own, log[name], order[name], joints)
     )
+    lacking = {name: [x.expression is LACKING for x in signals if x.signal == name] for name in found}
     episode = mapping.episode
     if episode is None and source.suggested_episode in source.columns():
         episode = source.suggested_episode
@@ -134,7 +134,7 @@ def signal_plan(
         joints=tuple(order["v"]),
         units=units,
         signals=signals,
-        layout=_layout(mapping, system, signals, len(order["v"])),
+        layout=layout_of(mapping, system, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
         time=time,
         time_unit=time_unit,
@@ -151,47 +151,13 @@ def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     if robot is None:
         return mapping.joints
-    own = _singles(robot)
+    own = singles(robot)
     if mapping.joints and sorted(mapping.joints) != sorted(own):
         raise InvalidInput(
             f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
             "Give the columns of exactly these, or another `system`."
         )
     return mapping.joints or own
-
-
-def _singles(robot: forcegp.robots.Robot) -> tuple[str, ...]:
-    of_bases = {row for group in robot.space.groups for row in range(group.rows.start, group.rows.stop)}
-    return tuple(name for row, name in enumerate(robot.joint_names) if row not in of_bases)
-
-
-def _columns(
-    mapping: ColumnMapping, system: forcegp.mechanics.MechanicalSystem | None, joints: tuple[str, ...]
-) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
-    """By signal: name and SI unit of its columns in the order of the log, and names in the order of the Dataset.
-
-    Unit None: whatever the actuator takes.
-    """
-    if system is None:
-        return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
-    robot, own = system.robot, _singles(system.robot)
-    kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
-    of_log = dict(zip(own, joints, strict=True))
-    driven = tuple(system.actuation.names) == own
-    switches = system.inputs[len(system.actuators) :]
-
-    def unit(signal: str, name: str) -> str | None:
-        if signal == "u" and not (driven and name in own):
-            return "1" if name in switches else None
-        return kinds[name][signal] if name in kinds else "rad" if name.endswith(ANGLES) else "1"
-
-    written = mapping.orientation or ORIENTATIONS[0]
-    velocities = tuple(of_log.get(name, name) for name in robot.joint_names)
-    inputs = tuple(of_log.get(name, name) if driven else name for name in system.inputs)
-    log = {"q": position_columns(robot, joints, written), "v": velocities, "u": inputs, "a": velocities}
-    stored = position_columns(robot, own, "angles" if written == "angles" else ORIENTATIONS[0])
-    order = {"q": stored, "v": robot.joint_names, "u": system.inputs, "a": robot.joint_names}
-    return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
 
 
 def _expressions(
@@ -279,39 +245,6 @@ def _unit(
             f"or one for each of the {len(kinds)} columns."
         )
     return fitting[index][0] if fitting[index] else log_unit(signal, kinds[index] or "1")
-
-
-def _layout(
-    mapping: ColumnMapping,
-    system: forcegp.mechanics.MechanicalSystem | None,
-    signals: Sequence[JointSignal],
-    nv: int,
-) -> Layout:
-    """Where everything stands once positions are those of a Dataset."""
-    groups = () if system is None else system.robot.space.groups
-    sizes = dict.fromkeys(SIGNALS, nv)
-    if system is not None:
-        sizes |= {"q": system.robot.nq, "u": len(system.inputs)}
-    places, end = dict[str, slice](), 0
-    for name in SIGNALS:
-        if sizes[name] == 0 or any(item.signal == name for item in signals):
-            places[name] = slice(end, end + sizes[name])
-            end += sizes[name]
-    derived = {
-        name: [row for row, item in enumerate(x for x in signals if x.signal == name) if item.expression is LACKING]
-        for name in ("v", "a")
-    }
-    axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
-    for name, group in ((name, group) for name in axes for group in groups):
-        for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
-            rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
-            if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived[name]}) < len(rows):
-                raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
-    if system is None:
-        return Layout(places, ConfigurationSpace(nv), axes, derived=derived)
-    switches = range(places["u"].start + len(system.actuators), places["u"].stop)
-    gravity = tuple(system.robot.gravity.tolist())
-    return Layout(places, system.robot.space, axes, gravity, derived, tuple(switches))
 
 
 def _slides(given: Mapping[str, list[LogUnit]], index: int, joints: Sequence[str]) -> bool:
