@@ -9,7 +9,7 @@ from tests.recordings.log_files import EPOCH
 
 from forcegp import MechanicalSystem, Robot
 from forcegp.data import Dataset
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import DatasetError
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings, open_source, ros_bag
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -57,6 +57,11 @@ def imu(stamp, force):
     turn = vector([0, 0, 0, 1], "Quaternion")
     values = {"orientation": turn, "angular_velocity": vector([0, 0, 0]), "linear_acceleration": vector(force)}
     return message("sensor_msgs/msg/Imu", header=header(stamp), **values, **own)
+
+
+def joint_state(stamp, angle):
+    own = {"position": np.array([angle]), "velocity": np.zeros(0), "effort": np.zeros(0)}
+    return message("sensor_msgs/msg/JointState", header=header(stamp), name=["knee"], **own)
 
 
 def written(folder: Path, messages) -> Path:
@@ -108,6 +113,22 @@ def test_poses_and_twists_are_named_by_their_topic(tmp_path, flight):
     expected = tuple(f"{part}{kind}.{axis}" for kind in ("linear", "angular") for axis in "xyz")
     assert source.vectors["/odom:twist"] == expected
     assert source.vectors["/imu:linear_acceleration"] == tuple(f"/imu:linear_acceleration.{axis}" for axis in "xyz")
+
+
+def test_stamped_poses_and_transforms_are_named_by_their_field(tmp_path):
+    turn, stamped = vector([0, 0, 0, 1], "Quaternion"), header(EPOCH)
+    pose = message("geometry_msgs/msg/Pose", position=vector([1, 2, 3], "Point"), orientation=turn)
+    transform = message("geometry_msgs/msg/Transform", translation=vector([1, 2, 3]), rotation=turn)
+    own = {"header": stamped, "child_frame_id": "body", "transform": transform}
+    messages = [
+        ("/mocap", EPOCH, message("geometry_msgs/msg/PoseStamped", header=stamped, pose=pose)),
+        ("/vicon", EPOCH, message("geometry_msgs/msg/TransformStamped", **own)),
+    ]
+    vectors = open_source(written(tmp_path, messages)).vectors
+    parts = {"/mocap:pose": ("position", "orientation"), "/vicon:transform": ("translation", "rotation")}
+    for name, (place, turned) in parts.items():
+        expected = [f"{name}.{place}.{axis}" for axis in "xyz"] + [f"{name}.{turned}.{axis}" for axis in "xyzw"]
+        assert list(vectors[name]) == expected
 
 
 @pytest.mark.parametrize("piece", [7, 16384])
@@ -172,6 +193,25 @@ def test_joints_of_another_topic_are_interpolated_and_their_torques_held(tmp_pat
     assert "/joints interpolated, u held" in done["recordings"][0]["notes"][-1]
 
 
+def test_angles_that_wrap_are_not_interpolated_across(tmp_path):
+    """Joints at 70 Hz turn once; as `unwrap` continues them they are on the motion to one of their steps."""
+    base, joint = np.arange(200) / 100, np.arange(-0.1, 2.2, 1 / 70)
+    rows = zip(base, nanoseconds(base).tolist(), strict=True)
+    messages = [("/odom", s, odometry(s, [t, 0, 1, 0, 0, 0, 1], [1.0, 0, 0, 0, 0, 0])) for t, s in rows]
+    for t, stamp in zip(joint, nanoseconds(joint).tolist(), strict=True):
+        angle = (np.rad2deg(3.0 * t) + 180.0) % 360.0 - 180.0
+        messages.append(("/joints", stamp, joint_state(stamp, angle)))
+    path = written(tmp_path, messages)
+    mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), unit={"q": ("deg",)})
+    system = MechanicalSystem(Robot.from_urdf_text(HOPPER.replace("revolute", "continuous"), base="floating"))
+    with pytest.raises(DatasetError, match="jumps by more than half a turn"):
+        import_recordings([path], tmp_path / "out.h5", mapping, system=system)
+    import_recordings([path], tmp_path / "out.h5", mapping, system=system, options=ImportOptions(unwrap=True))
+    off = np.abs(Dataset.load(tmp_path / "out.h5").q[:, 7] - 3.0 * base)
+    assert np.sort(off)[-4] < 1e-6
+    assert off.max() < 3.0 / 70
+
+
 def test_commands_hold_where_rows_get_even_times(tmp_path, flight):
     """Rows of the pose jitter; a command never comes before its stamp."""
     time = flight.time + np.random.default_rng(1).uniform(-3e-4, 3e-4, len(flight))
@@ -204,7 +244,7 @@ def test_memory_holds_a_few_messages_only(tmp_path, flight):
 
     bag = open_source(bag_of(tmp_path, flight, np.arange(0, 1, 0.01)))
     assert isinstance(bag, ros_bag.RosBag)
-    joined = JoinedTopics(bag, "/odom:header.stamp", 1e-9, {"/rotors:data[0]"})
+    joined = JoinedTopics(bag, "/odom:header.stamp", 1e-9, {"/rotors:data[0]"}, {}, [])
     most = 0
     for _ in joined.chunks(["/odom:header.stamp", "/rotors:data[0]"], 1):
         most = max(most, *(len(track.seen) for track in joined._tracks.values()))
@@ -215,9 +255,24 @@ def test_topics_that_cannot_be_joined_are_refused(tmp_path, flight):
     path = bag_of(tmp_path, flight, 100.0 + np.arange(0, 1, 0.01))
     with pytest.raises(DatasetError, match="do not overlap"):
         imported(path, flight)
-    clock = ColumnMapping(q=POSE.q, v=POSE.v, u=POSE.u, time="/rotors:log_time")
-    with pytest.raises(InvalidInput, match="not interpolated between messages"):
-        imported(path, flight, clock)
+
+
+def test_rows_at_the_clock_of_another_topic_have_turns_in_between(tmp_path):
+    """Poses at 100 Hz with either sign of their quaternions, rows at 330 Hz."""
+    rate, pose, rows = np.array([0.5, -0.3, 0.4]), np.arange(100) / 100, np.arange(0.005, 0.9, 1 / 330)
+    q = np.hstack([pose[:, None] * rate, Rotation.from_rotvec(np.outer(pose, rate)).as_quat()])
+    q[:, 3:] *= np.random.default_rng(4).choice([-1.0, 1.0], 100)[:, None]
+    stamped = zip(nanoseconds(pose).tolist(), q, strict=True)
+    messages = [("/odom", s + LATE, odometry(s, each, np.zeros(6))) for s, each in stamped]
+    messages += [("/joints", s, joint_state(s, 0.1)) for s in nanoseconds(rows).tolist()]
+    mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), time="/joints:header.stamp")
+    system = MechanicalSystem(Robot.from_urdf_text(HOPPER, base="floating"))
+    import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, system=system)
+    found = Dataset.load(tmp_path / "out.h5")
+    assert len(found) == len(rows)
+    error = Rotation.from_quat(found.q[:, 3:7]).inv() * Rotation.from_rotvec(np.outer(rows, rate))
+    assert error.magnitude().max() < 1e-7
+    np.testing.assert_allclose(found.q[:, :3], rows[:, None] * rate, rtol=0, atol=1e-7)
 
 
 def test_stamps_that_run_backwards_are_refused(tmp_path, flight):

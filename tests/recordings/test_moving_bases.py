@@ -220,6 +220,7 @@ def test_lengths_are_mended_or_refused(tmp_path, flight):
         ({}, {"q": ("q{0..5}",)}, "q has 6 columns for 7 positions"),
         ({}, {"u": ("u0",)}, "u has 1 columns for 4 inputs"),
         ({}, {"v": ("v{0..1}", "derive", "v{3..5}"), "axes": {"v": ("world",)}}, "needs all of its linear part"),
+        ({}, {"a": None, "axes": {"a": ("imu",)}}, "the log has no a"),
         ({}, {"unit": {"q": ("mm", "cm")}}, "at most one of each kind"),
         ({}, {"unit": {"v": ("deg/s", "rpm")}}, "at most one of each kind"),
         ({"q": "turned"}, {}, "turns by more than a quarter of a turn at"),

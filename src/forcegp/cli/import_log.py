@@ -31,15 +31,16 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 class Import(PreparationOptions, RobotOptions):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
-    State which columns are the time, the positions, velocities and forces of the joints, and their units: by flags, or
-    in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS are names, patterns such
-    as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
+    State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
+    their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
+    are names, patterns such as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
     a --cutoff, --delay, --lag, --every or --trim, rows stay as they were logged.
 
     For example:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
       forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
+      forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
     """
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "none", Path)] = None
@@ -55,7 +56,7 @@ class Import(PreparationOptions, RobotOptions):
     write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "not written", Path)] = None
     """Write the mapping that results from flags and --mapping."""
     time: Columns = None
-    """Time stamps."""
+    """Time stamps; of a bag with several topics, those of the messages that become rows."""
     step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
     """Seconds between two rows, for a log without time stamps."""
     q: Columns = None
@@ -63,7 +64,7 @@ class Import(PreparationOptions, RobotOptions):
     v: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of q", str)] = None
     """Velocities, one per joint; of a moving base linear, then angular. derive: differentiate this one."""
     u: Columns = None
-    """Forces or torques of the actuators; a constant such as 0 is for all joints."""
+    """Forces or torques of the actuators, or what motors of the robot take; a constant such as 0 is for all."""
     a: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of v", str)] = None
     """Accelerations, one per joint."""
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
@@ -77,7 +78,8 @@ class Import(PreparationOptions, RobotOptions):
     ned: bool = False
     """World axes are north, east, down and base axes forward, right, down (PX4); y and z change sign."""
     unit: Text = None
-    """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm."""
+    """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm.
+    With a moving base, each is for the columns of its kind."""
     sign: Text = None
     """1 or -1 per joint, for all signals (--sign=1,-1) or for one (u=-1)."""
     scale: Text = None

@@ -2,7 +2,7 @@
 
 from array import array
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,9 +11,11 @@ from jaxtyping import Bool
 from typing_extensions import override
 
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.recordings.mapping import LogUnit
 from forcegp.recordings.ros_bag import LOG_TIME, STAMP, RosBag
 from forcegp.recordings.signal_plan import SignalPlan
 from forcegp.recordings.source import Columns, Source, as_column
+from forcegp.robots.manifold import QUATERNION
 
 
 def on_one_clock(source: Source, plan: SignalPlan) -> tuple[Source, SignalPlan]:
@@ -32,26 +34,41 @@ def on_one_clock(source: Source, plan: SignalPlan) -> tuple[Source, SignalPlan]:
     def elsewhere(expression: Any) -> set[str]:
         return {name for name in expression.weights if source.topic_of(name) != clock}
 
-    single = set(plan.joints) | {item.joint for item in plan.signals if item.signal == "u"}
+    parts: dict[str, list[str]] = {}  # of quaternions
     for item in plan.signals:
-        if item.signal == "q" and item.joint not in single and elsewhere(item.expression):
-            raise InvalidInput(
-                f"{source.path}: the orientation ({item.joint}) is not on {clock}, the topic of the time, and is not "
-                "interpolated between messages. Leave `time` out, or name the stamp of its topic."
-            )
+        base, _, part = item.joint.rpartition(".")
+        if item.signal == "q" and part in QUATERNION and item.unit.si == "1":
+            parts.setdefault(base, []).extend(item.expression.weights)
     held = set[str]().union(*(elsewhere(item.expression) for item in plan.signals if item.signal == "u"))
     held -= set().union(*(item.expression.weights for item in plan.signals if item.signal != "u"))
     inputs, place = [item for item in plan.signals if item.signal == "u"], plan.layout.places["u"].start
     columns = {place + row for row, item in enumerate(inputs) if elsewhere(item.expression)}
     layout = replace(plan.layout, held=tuple(sorted({*plan.layout.held, *columns})))
-    return JoinedTopics(source, time, plan.time_unit.in_si(np.ones(1)).item(), held), replace(plan, layout=layout)
+    half = {
+        name: np.pi / abs(weight * item.factor * _in_si(item.unit))
+        for item in plan.signals
+        for name, weight in item.expression.weights.items()
+        if item.signal == "q" and item.unit.si == "rad"
+    }
+    return JoinedTopics(source, time, _in_si(plan.time_unit), held, half, list(parts.values())), replace(
+        plan, layout=layout
+    )
+
+
+def _in_si(unit: LogUnit) -> float:
+    return unit.in_si(np.ones(1)).item()
 
 
 @dataclass
 class _Track:
-    """The messages of one topic around the present row: stamp, then values."""
+    """The messages of one topic around the present row: stamp, then values.
 
-    held: list[bool]
+    Values that differ by `most` or more are held: those of commands always, angles where they wrap. `turns` are places
+    of quaternions, whose sign means nothing.
+    """
+
+    most: list[float]
+    turns: list[list[int]]
     seen: deque[list[Any]] = field(default_factory=deque)
     steps: array = field(default_factory=lambda: array("d"))
     ages: array = field(default_factory=lambda: array("d"))
@@ -65,28 +82,41 @@ class _Track:
             return None
         stamp, *values = seen[0]
         age = time - stamp
-        if age and not all(self.held):
+        if age and any(self.most):
             if len(seen) == 1:
                 return None
             later, *others = seen[1]
+            for turn in self.turns:
+                if sum(values[k] * others[k] for k in turn) < 0.0:
+                    others = [-x if k in turn else x for k, x in enumerate(others)]
             share, span = age / (later - stamp), later - stamp
-            pairs = zip(self.held, values, others, strict=True)
-            values, age = [x if held else x + share * (y - x) for held, x, y in pairs], span
+            pairs = zip(self.most, values, others, strict=True)
+            values, age = [x + share * (y - x) if abs(y - x) < most else x for most, x, y in pairs], span
         return [age, *values]
 
 
 class JoinedTopics(Source):
     """The messages of the topic of `time`, with columns of other topics.
 
-    Those in `held` are as they were last, the others interpolated between the messages before and behind. Memory holds
-    the messages until those of every topic have come, and the stamps. `seconds` is the unit of the time.
+    Those in `held` are as they were last, the others interpolated between the messages before and behind, but for
+    angles that differ by more than `half` a turn; columns of `turns` are quaternions. Memory holds the messages until
+    those of every topic have come, and the stamps. `seconds` is the unit of the time.
     """
 
     row_word = "message"
 
-    def __init__(self, bag: RosBag, time: str, seconds: float, held: Collection[str]) -> None:
+    def __init__(
+        self,
+        bag: RosBag,
+        time: str,
+        seconds: float,
+        held: Collection[str],
+        half: Mapping[str, float],
+        turns: Sequence[Sequence[str]],
+    ) -> None:
         super().__init__(bag.path)
-        self.bag, self.seconds, self.held = bag, seconds, held
+        self.bag, self.seconds, self.turns = bag, seconds, turns
+        self.most = {**half, **dict.fromkeys(held, 0.0)}
         self.clock = bag.topic_of(time)
         self.stamp = time.removeprefix(f"{self.clock}:")
         self._tracks: dict[str, _Track] = {}
@@ -111,11 +141,11 @@ class JoinedTopics(Source):
 
     @override
     def notes(self) -> tuple[str, ...]:
-        def how(topic: str, held: list[bool]) -> str:
-            way = "held" if all(held) else "interpolated, u held" if any(held) else "interpolated"
+        def how(topic: str, most: list[float]) -> str:
+            way = "held" if not any(most) else "interpolated" if all(most) else "interpolated, u held"
             return f"{topic} {way}" + (f" (by {LOG_TIME})" if self._stamp_of(topic) != self.stamp else "")
 
-        ways = ", ".join(how(topic, track.held) for topic, track in self._tracks.items())
+        ways = ", ".join(how(topic, track.most) for topic, track in self._tracks.items())
         joined = f"rows are those of {self.clock}: {ways}"
         lost = f"; {self._outside} rows before the first or behind the last message of a topic left out"
         return (*self.bag.notes(), joined + lost * bool(self._outside))
@@ -138,7 +168,7 @@ class JoinedTopics(Source):
         wanted = {
             topic: [self._stamp_of(topic), *(name.removeprefix(f"{topic}:") for name in own[topic])] for topic in topics
         }
-        self._tracks = {topic: _Track([name in self.held for name in own[topic]]) for topic in topics[1:]}
+        self._tracks = {topic: self._track(own[topic]) for topic in topics[1:]}
         self._outside, table = 0, list[list[Any]]()
         for row in self._rows(wanted):
             table.append(row)
@@ -152,6 +182,10 @@ class JoinedTopics(Source):
                 f"{self.path}: the stamps of {', '.join(topics)} do not overlap; compare their clocks, or name `time` "
                 f"{self.clock}:{LOG_TIME}."
             )
+
+    def _track(self, names: list[str]) -> _Track:
+        turns = [[names.index(name) for name in turn] for turn in self.turns if {*turn} <= {*names}]
+        return _Track([self.most.get(name, np.inf) for name in names], turns)
 
     def _rows(self, wanted: dict[str, list[str]]) -> Iterator[list[Any]]:
         """Values of all topics at every stamp of the clock, topic by topic."""

@@ -29,11 +29,11 @@ ROUNDED = 1e-9
 
 def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
     """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
-    names, singles, place = list[str](), iter(joints), 0
+    names, rest, place = list[str](), iter(joints), 0
     groups = {group.place: group for group in robot.space.groups}
     while place < robot.nq:
         group = groups.get(place)
-        names += [next(singles)] if group is None else [f"{group.name}.{x}" for x in _written(group, orientation)]
+        names += [next(rest)] if group is None else [f"{group.name}.{x}" for x in _written(group, orientation)]
         place += 1 if group is None else len(group.motion.positions)
     return tuple(names)
 
@@ -191,8 +191,8 @@ class Layout:
                 found[name] = self._in_body(name, found[name], found["q"], found["v"])
             if name not in found or lacking:
                 made = differentiate(found[source], time, self.space if name == "v" else None)
-                own = np.arange(self.space.nv)[:, None] == np.array(lacking or range(self.space.nv))
-                found[name] = np.where(own.any(axis=1), made, found.get(name, made))
+                own = np.isin(np.arange(self.space.nv), lacking) | (not lacking)
+                found[name] = np.where(own, made, found.get(name, made))
         return found
 
     def _in_body(self, signal: str, values: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -229,6 +229,10 @@ def layout_of(
             end += sizes[name]
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
+    for name in axes.keys() - lacking.keys():
+        raise InvalidInput(
+            f"axes of {name} are stated, but the log has no {name}; name its columns, or leave axes out."
+        )
     for name, group in ((name, group) for name in axes for group in groups):
         for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
             rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
