@@ -100,7 +100,7 @@ def import_recordings(
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot = None if system is None else system.robot
     sources = _sources([Path(path) for path in paths], mapping)
-    joined = [on_one_clock(source, signal_plan(mapping, source, system)) for _, source in sources]
+    joined = [on_one_clock(source, signal_plan(mapping, source, system), out.parent) for _, source in sources]
     sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
     plans = [plan for _, plan in joined]
     plan = plans[0]

@@ -1,24 +1,24 @@
 """ROS topics with different clocks as one table: rows of one topic, the others held or interpolated at its stamps."""
 
-from array import array
-from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.recordings.mapping import LogUnit
+from forcegp.recordings.reading import Spool
 from forcegp.recordings.ros_bag import LOG_TIME, STAMP, RosBag
 from forcegp.recordings.signal_plan import SignalPlan
-from forcegp.recordings.source import Columns, Source, as_column
+from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import QUATERNION
 
 
-def on_one_clock(source: Source, plan: SignalPlan) -> tuple[Source, SignalPlan]:
+def on_one_clock(source: Source, plan: SignalPlan, folder: Path) -> tuple[Source, SignalPlan]:
     """The source with the columns of all topics on the clock of that of the time; others stay as they are.
 
     Inputs u hold the last message, which a row never precedes; everything else is interpolated. Raises InvalidInput
@@ -30,77 +30,63 @@ def on_one_clock(source: Source, plan: SignalPlan) -> tuple[Source, SignalPlan]:
         raise InvalidInput(f"{source.path}: several topics are joined by their stamps; name one column as `time`.")
     [time] = plan.time.weights
     clock = source.topic_of(time)
-
-    def elsewhere(expression: Any) -> set[str]:
-        return {name for name in expression.weights if source.topic_of(name) != clock}
-
-    parts: dict[str, list[str]] = {}  # of quaternions
-    for item in plan.signals:
+    own = {signal: [item for item in plan.signals if item.signal == signal] for signal in plan.logged}
+    measured = {name for item in plan.signals if item.signal != "u" for name in item.expression.weights}
+    most, turns, held = dict[str, float](), dict[str, list[str]](), list(plan.layout.held)
+    for item in own["q"]:
         base, _, part = item.joint.rpartition(".")
-        if item.signal == "q" and part in QUATERNION and item.unit.si == "1":
-            parts.setdefault(base, []).extend(item.expression.weights)
-    held = set[str]().union(*(elsewhere(item.expression) for item in plan.signals if item.signal == "u"))
-    held -= set().union(*(item.expression.weights for item in plan.signals if item.signal != "u"))
-    inputs, place = [item for item in plan.signals if item.signal == "u"], plan.layout.places["u"].start
-    columns = {place + row for row, item in enumerate(inputs) if elsewhere(item.expression)}
-    layout = replace(plan.layout, held=tuple(sorted({*plan.layout.held, *columns})))
-    half = {
-        name: np.pi / abs(weight * item.factor * _in_si(item.unit))
-        for item in plan.signals
-        for name, weight in item.expression.weights.items()
-        if item.signal == "q" and item.unit.si == "rad"
-    }
-    return JoinedTopics(source, time, _in_si(plan.time_unit), held, half, list(parts.values())), replace(
-        plan, layout=layout
-    )
+        if item.unit.si == "1" and part in QUATERNION:
+            turns.setdefault(base, []).extend(item.expression.weights)
+        if item.unit.si == "rad":  # half a turn, in the units of the log
+            half = {name: np.pi / abs(weight * item.factor) for name, weight in item.expression.weights.items()}
+            most |= {name: turn / item.unit.in_si(np.ones(1)).item() for name, turn in half.items()}
+    for row, item in enumerate(own.get("u", ())):
+        elsewhere = {name for name in item.expression.weights if source.topic_of(name) != clock}
+        most |= dict.fromkeys(elsewhere - measured, 0.0)
+        held += [plan.layout.places["u"].start + row] * bool(elsewhere)
+    seconds = plan.time_unit.in_si(np.ones(1)).item()
+    joined = JoinedTopics(source, time, seconds, most, list(turns.values()), folder)
+    return joined, replace(plan, layout=replace(plan.layout, held=tuple(sorted(set(held)))))
 
 
-def _in_si(unit: LogUnit) -> float:
-    return unit.in_si(np.ones(1)).item()
-
-
-@dataclass
-class _Track:
-    """The messages of one topic around the present row: stamp, then values.
+@dataclass(frozen=True)
+class _Topic:
+    """The messages of one topic: stamps, and values in a spool.
 
     Values that differ by `most` or more are held: those of commands always, angles where they wrap. `turns` are places
     of quaternions, whose sign means nothing.
     """
 
-    most: list[float]
-    turns: list[list[int]]
-    seen: deque[list[Any]] = field(default_factory=deque)
-    steps: array = field(default_factory=lambda: array("d"))
-    ages: array = field(default_factory=lambda: array("d"))
+    stamps: Shaped[np.ndarray, " messages"]
+    spool: Spool
+    most: Float[np.ndarray, " columns"]
+    turns: Sequence[Sequence[int]]
 
-    def at(self, time: Any) -> list[Any] | None:
-        """Values at a time, and how long nothing was heard about them; None before the first or behind the last."""
-        seen = self.seen
-        while len(seen) > 1 and seen[1][0] <= time:
-            seen.popleft()
-        if not seen or seen[0][0] > time:
-            return None
-        stamp, *values = seen[0]
-        age = time - stamp
-        if age and any(self.most):
-            if len(seen) == 1:
-                return None
-            later, *others = seen[1]
-            for turn in self.turns:
-                if sum(values[k] * others[k] for k in turn) < 0.0:
-                    others = [-x if k in turn else x for k, x in enumerate(others)]
-            share, span = age / (later - stamp), later - stamp
-            pairs = zip(self.most, values, others, strict=True)
-            values, age = [x + share * (y - x) if abs(y - x) < most else x for most, x, y in pairs], span
-        return [age, *values]
+    def at(self, time: Shaped[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values (rows, columns), how long nothing was heard about them, and whether there are any, at these times."""
+        before = np.searchsorted(self.stamps, time, side="right") - 1
+        there, first = before >= 0, np.maximum(before, 0)
+        since, after = time - self.stamps[first], first
+        if self.most.any():
+            after = first + (since > 0)
+            there &= after < len(self.stamps)
+            after = np.minimum(after, len(self.stamps) - 1)
+        low = int(first.min())
+        table = self.spool.read(low, int(after.max()) + 1)
+        values, later = table[first - low], table[after - low]
+        for turn in self.turns:
+            later[:, turn] *= np.where((values[:, turn] * later[:, turn]).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+        span = self.stamps[after] - self.stamps[first]
+        change = np.where(np.abs(later - values) < self.most, later - values, 0.0)
+        share = np.divide(since, span, out=np.zeros(len(time)), where=span > 0)
+        return values + share[:, None] * change, np.where(span > 0, span, since), there
 
 
 class JoinedTopics(Source):
     """The messages of the topic of `time`, with columns of other topics.
 
-    Those in `held` are as they were last, the others interpolated between the messages before and behind, but for
-    angles that differ by more than `half` a turn; columns of `turns` are quaternions. Memory holds the messages until
-    those of every topic have come, and the stamps. `seconds` is the unit of the time.
+    These are interpolated between the messages before and behind, but for values that differ by `most` or more; columns
+    of `turns` are quaternions. Memory holds stamps, a file in `folder` the values. `seconds` is the unit of the time.
     """
 
     row_word = "message"
@@ -110,117 +96,91 @@ class JoinedTopics(Source):
         bag: RosBag,
         time: str,
         seconds: float,
-        held: Collection[str],
-        half: Mapping[str, float],
+        most: Mapping[str, float],
         turns: Sequence[Sequence[str]],
+        folder: Path,
     ) -> None:
         super().__init__(bag.path)
-        self.bag, self.seconds, self.turns = bag, seconds, turns
-        self.most = {**half, **dict.fromkeys(held, 0.0)}
+        self.bag, self.seconds, self.most, self.turns, self.folder = bag, seconds, most, turns, folder
         self.clock = bag.topic_of(time)
         self.stamp = time.removeprefix(f"{self.clock}:")
-        self._tracks: dict[str, _Track] = {}
-        self._outside = 0
+        self._notes: list[str] = []
+        self._silent: dict[str, tuple[float, list[np.ndarray]]] = {}
 
     @override
     def columns(self) -> tuple[str, ...]:
         return self.bag.columns()
 
     @override
-    def files(self) -> tuple[Any, ...]:
+    def files(self) -> tuple[Path, ...]:
         return self.bag.files()
-
-    def _stamp_of(self, topic: str) -> str:
-        """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
-        known = self.bag.columns()
-        kinds = [self.stamp, *((STAMP, LOG_TIME) if self.stamp in (STAMP, LOG_TIME) else ())]
-        found = next((kind for kind in kinds if f"{topic}:{kind}" in known), None)
-        if found is None:
-            raise InvalidInput(f"{self.path}: {topic} has no {self.stamp}; name `time` {self.clock}:{LOG_TIME}.")
-        return found
 
     @override
     def notes(self) -> tuple[str, ...]:
-        def how(topic: str, most: list[float]) -> str:
-            way = "held" if not any(most) else "interpolated" if all(most) else "interpolated, u held"
-            return f"{topic} {way}" + (f" (by {LOG_TIME})" if self._stamp_of(topic) != self.stamp else "")
-
-        ways = ", ".join(how(topic, track.most) for topic, track in self._tracks.items())
-        joined = f"rows are those of {self.clock}: {ways}"
-        lost = f"; {self._outside} rows before the first or behind the last message of a topic left out"
-        return (*self.bag.notes(), joined + lost * bool(self._outside))
+        return tuple(self._notes)
 
     @override
     def paused(self, gap: float | None, steps: float) -> Bool[np.ndarray, " rows"] | None:
-        paused = np.zeros(0, bool)
-        for track in self._tracks.values():
-            typical = steps * float(np.median(track.steps)) if track.steps else np.inf
-            late = np.array(track.ages) > (typical if gap is None else gap / self.seconds)
-            paused = late if not len(paused) else paused | late
-        return paused
+        limits = [(ages, steps * step if gap is None else gap / self.seconds) for step, ages in self._silent.values()]
+        return np.any([np.concatenate(ages) > limit for ages, limit in limits], axis=0)
 
     @override
     def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
-        topics = list(dict.fromkeys([self.clock, *map(self.bag.topic_of, names)]))
-        own = {topic: [name for name in names if self.bag.topic_of(name) == topic] for topic in topics}
-        order = {name: k for k, name in enumerate(name for topic in topics for name in own[topic])}
-        wanted = {
-            topic: [self._stamp_of(topic), *(name.removeprefix(f"{topic}:") for name in own[topic])] for topic in topics
-        }
-        self._tracks = {topic: self._track(own[topic]) for topic in topics[1:]}
-        self._outside, table = 0, list[list[Any]]()
-        for row in self._rows(wanted):
-            table.append(row)
-            if len(table) == rows:
-                yield _columns(table, order, names)
-                table = []
-        if table:
-            yield _columns(table, order, names)
-        elif not any(track.ages for track in self._tracks.values()):
+        topics = dict.fromkeys(topic for name in names if (topic := self.bag.topic_of(name)) != self.clock)
+        self._notes, self._silent, outside, ways = [], {}, 0, []
+        with ExitStack() as stack:
+            tracks: dict[str, tuple[list[str], _Topic]] = {}
+            for topic in topics:
+                own = [name for name in names if self.bag.topic_of(name) == topic]
+                track = self._read(topic, own, rows, stack)
+                tracks[topic] = own, track
+                steps = np.diff(track.stamps)
+                self._silent[topic] = float(np.median(steps)) if len(steps) else np.inf, []
+                how = "interpolated" if track.most.all() else "interpolated, u held" if track.most.any() else "held"
+                ways.append(f"{topic} {how}" + f" (by {LOG_TIME})" * (self._stamp_of(topic) != self.stamp))
+            own = [name for name in names if self.bag.topic_of(name) == self.clock]
+            stamp = f"{self.clock}:{self.stamp}"
+            for piece in self.bag.chunks(list(dict.fromkeys([stamp, *own])), rows):
+                found = {topic: (own, *track.at(piece[stamp])) for topic, (own, track) in tracks.items()}
+                kept = np.all([there for _, _, _, there in found.values()], axis=0)
+                outside += int((~kept).sum())
+                joined = {name: values[kept] for name, values in piece.items()}
+                for topic, (own, values, ages, _) in found.items():
+                    self._silent[topic][1].append(ages[kept])
+                    joined |= {name: values[kept, column] for column, name in enumerate(own)}
+                if kept.any():
+                    yield {name: joined[name] for name in names}
+        if not sum(len(ages) for _, pieces in self._silent.values() for ages in pieces):
             raise DatasetError(
-                f"{self.path}: the stamps of {', '.join(topics)} do not overlap; compare their clocks, or name `time` "
-                f"{self.clock}:{LOG_TIME}."
+                f"{self.path}: the stamps of {', '.join([self.clock, *topics])} do not overlap; compare their clocks, "
+                f"or name `time` {self.clock}:{LOG_TIME}."
             )
+        lost = f"; {outside} rows before the first or behind the last message of a topic left out" * bool(outside)
+        self._notes += [*self.bag.notes(), f"rows are those of {self.clock}: {', '.join(ways)}{lost}"]
 
-    def _track(self, names: list[str]) -> _Track:
+    def _read(self, topic: str, names: Sequence[str], rows: int, stack: ExitStack) -> _Topic:
+        """All messages of a topic. Raises DatasetError for stamps that run backwards."""
+        stamp = f"{topic}:{self._stamp_of(topic)}"
+        spool, stamps = stack.enter_context(Spool(self.folder, len(names))), list[np.ndarray]()
+        for piece in self.bag.chunks(list(dict.fromkeys([stamp, *names])), rows):
+            stamps.append(piece[stamp])
+            spool.append(np.stack([piece[name] for name in names], axis=1).astype(np.float64))
+        self._notes += self.bag.notes()
+        joined = np.concatenate(stamps)
+        back = float(np.diff(joined).min(initial=0)) * self.seconds
+        if back < 0.0:
+            raise DatasetError(
+                f"{self.path}: the stamps of {topic} run backwards by {-back:.6g} s; topics are joined in the order of "
+                f"time. Name `time` {self.clock}:{LOG_TIME}, or mend the bag."
+            )
         turns = [[names.index(name) for name in turn] for turn in self.turns if {*turn} <= {*names}]
-        return _Track([self.most.get(name, np.inf) for name in names], turns)
+        return _Topic(joined, spool, np.array([self.most.get(name, np.inf) for name in names]), turns)
 
-    def _rows(self, wanted: dict[str, list[str]]) -> Iterator[list[Any]]:
-        """Values of all topics at every stamp of the clock, topic by topic."""
-        waiting: deque[list[Any]] = deque()
-        newest: dict[str, Any] = {}
-        for topic, values in self.bag.messages(wanted):
-            before, newest[topic] = newest.get(topic), values[0]
-            if before is not None and values[0] < before:
-                raise DatasetError(
-                    f"{self.path}: the stamps of {topic} run backwards by {(before - values[0]) * self.seconds:.6g} s; "
-                    f"topics are joined in the order of time. Name `time` {self.clock}:{LOG_TIME}, or mend the bag."
-                )
-            if topic == self.clock:
-                waiting.append(values)
-            else:
-                track = self._tracks[topic]
-                if before is not None:
-                    track.steps.append(values[0] - before)
-                track.seen.append(values)
-            while waiting and all(name in newest and newest[name] > waiting[0][0] for name in self._tracks):
-                yield from self._joined(waiting.popleft())
-        for values in waiting:
-            yield from self._joined(values)
-
-    def _joined(self, values: list[Any]) -> Iterator[list[Any]]:
-        found = [track.at(values[0]) for track in self._tracks.values()]
-        complete = [each for each in found if each is not None]
-        if len(complete) < len(found):
-            self._outside += 1
-            return
-        for track, (age, *_) in zip(self._tracks.values(), complete, strict=True):
-            track.ages.append(age)
-        yield [*values[1:], *(value for each in complete for value in each[1:])]
-
-
-def _columns(table: list[list[Any]], order: dict[str, int], names: Sequence[str]) -> Columns:
-    columns = list(zip(*table, strict=True))
-    return {name: as_column(np.array(columns[order[name]])) for name in names}
+    def _stamp_of(self, topic: str) -> str:
+        """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
+        kinds = [self.stamp, *((STAMP, LOG_TIME) if self.stamp in (STAMP, LOG_TIME) else ())]
+        found: Any = next((kind for kind in kinds if f"{topic}:{kind}" in self.bag.columns()), None)
+        if found is None:
+            raise InvalidInput(f"{self.path}: {topic} has no {self.stamp}; name `time` {self.clock}:{LOG_TIME}.")
+        return found

@@ -137,36 +137,24 @@ class RosBag(Source):
         if len(topics) != 1:
             raise InvalidInput(
                 f"{self.path}: the columns come from the topics {', '.join(topics)}, whose messages have times of "
-                "their own; name columns of one topic."
+                "their own; read them one by one."
             )
-        found = self.messages({topics[0]: [name[len(topics[0]) + 1 :] for name in names]})
-        while table := [values for _, values in islice(found, rows)]:
-            columns = zip(*table, strict=True)
-            yield {name: as_column(np.array(column)) for name, column in zip(names, columns, strict=True)}
-
-    def messages(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, list[Any]]]:
-        """Topic and the `wanted` fields of every message of these topics that has them all, as the recorder got them.
-
-        Raises FileFormatError for topics with messages of several types.
-        """
+        wanted = [name[len(topics[0]) + 1 :] for name in names]
         self._left_out = 0
         with self._open() as reader:
-            connections = [item for item in reader.connections if item.topic in wanted]
-            for topic in wanted:
-                kinds = sorted({item.msgtype for item in connections if item.topic == topic})
-                if len(kinds) > 1:
-                    raise FileFormatError(f"{self.path}: topic {topic} has messages of several types: {kinds}.")
-            fields = {
-                topic: {own.partition(".")[0].partition("[")[0] for own in each} for topic, each in wanted.items()
-            }
-            for connection, at, raw in reader.messages(connections):
-                topic = connection.topic
-                message = reader.deserialize(raw, connection.msgtype)
-                values = {**numbers(message, fields[topic]), LOG_TIME: at}
-                if values.keys() >= set(wanted[topic]):
-                    yield topic, [values[own] for own in wanted[topic]]
-                else:
-                    self._left_out += 1
+            connections = [item for item in reader.connections if item.topic == topics[0]]
+            kinds = sorted({item.msgtype for item in connections})
+            if len(kinds) > 1:
+                raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
+            messages = reader.messages(connections)
+            fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
+            while batch := list(islice(messages, rows)):
+                found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
+                table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
+                self._left_out += len(batch) - len(table)
+                if table:
+                    columns = zip(*table, strict=True)
+                    yield {name: as_column(np.array(column)) for name, column in zip(names, columns, strict=True)}
 
 
 def _require_plausible_chunks(path: Path, reader: Any) -> None:
