@@ -260,3 +260,36 @@ def test_without_a_base_that_moves_nothing_of_it_can_be_stated(tmp_path, flight,
     path = write_text(tmp_path / "log.csv", columns(flight))
     with pytest.raises(InvalidInput, match="about a base that moves"):
         import_recordings([path], tmp_path / "out.h5", mapping)
+
+
+MIDDLE = """<robot name="rail"><link name="rail"/><link name="cart"><inertial><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><axis xyz="1 0 0"/>
+<limit lower="-9" upper="9" effort="9" velocity="9"/></joint>
+<joint name="ball" type="spherical"><parent link="cart"/><child link="head"/></joint><link name="head"><inertial>
+<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="turn" type="continuous"><parent link="head"/><child link="tip"/><axis xyz="0 0 1"/></joint>
+<link name="tip"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/>
+</inertial></link></robot>"""
+
+
+@pytest.mark.parametrize("orientation", ["xyzw", "wxyz", "angles"])
+def test_turning_joints_stand_where_the_robot_has_them(tmp_path, orientation):
+    """Joints of one degree of freedom before and behind, named in another order in the log."""
+    system = MechanicalSystem(Robot.from_urdf_text(MIDDLE, base="fixed"))
+    assert system.robot.position_names == ("slide", "ball.qx", "ball.qy", "ball.qz", "ball.qw", "turn")
+    angle = np.random.default_rng(5).uniform(-0.5, 0.5, 3) * np.linspace(0, 1, 50)[:, None]
+    quaternion, slide, turned = (
+        Rotation.from_euler("xyz", angle).as_quat(),
+        np.linspace(0, 1, 50),
+        np.linspace(2, 3, 50),
+    )
+    middle = {"xyzw": quaternion, "wxyz": np.roll(quaternion, 1, axis=1), "angles": angle}[orientation]
+    table = {"time": np.arange(50) / 100, **{f"q{k}": q for k, q in enumerate([turned, *middle.T, slide])}}
+    mapping = ColumnMapping(
+        time="time", q=(f"q{{0..{len(table) - 2}}}",), u=("0",), joints=("turn", "slide"), orientation=orientation
+    )
+    mapping = replace(mapping, ned=True)  # no base: nothing to turn
+    import_recordings([write_text(tmp_path / "log.csv", table)], tmp_path / "out.h5", mapping, system=system)
+    expected = np.column_stack([slide, quaternion, turned])
+    np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q, expected, rtol=0, atol=1e-14)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.checks.check_input import Finding, look, ok, wrong
+from forcegp.checks.check_input import Finding, import_flags, look, ok, wrong
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
 from forcegp.data.configurations import in_base
@@ -22,6 +22,7 @@ CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
 itself below this share of the speed."""
 MOST_ROWS = 2000
+IMU = {"axes": {"a": ("imu",)}}
 
 
 def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
@@ -46,7 +47,8 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
                 subject="base acceleration",
                 seen=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
                 f"velocity it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}.",
-                remedy="forcegp import --axes a=imu; or differentiate v.",
+                remedy=f"forcegp import {import_flags(IMU)}; or differentiate v.",
+                correction=IMU,
                 numbers={"error": error, "specific": specific, "size": size},
             )
         elif error > 2.0 * size:  # noise of the velocities alone makes both large
@@ -81,7 +83,7 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
         return of_world, _rms(moved - turned)
 
     recorded = _rms(robot.space.difference(q0, q1)[:, group.rows] / step - own)
-    speed, meant, flags = _rms(own), [], []
+    speed, meant, correction = _rms(own), list[str](), dict[str, dict[str, tuple[str, ...]]]()
     of_world, other = best_axes(q0, q1)
     if group.kind != "planar":
         turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
@@ -90,13 +92,16 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
         axes, reordered = best_axes(first, second)
         if mistaken(recorded, reordered, speed) and reordered < other:
             of_world, other = axes, reordered
-            meant, flags = ["a quaternion w, x, y, z"], ["--orientation wxyz"]
+            meant, correction["orientation"] = ["a quaternion w, x, y, z"], {"q": ("wxyz",)}
     if of_world:
         both = len(of_world) == 2
         meant.append(f"{'' if both else of_world[0]}velocities in the axes of the world")
-        flags.append(f"--axes v={'world' if both else ','.join('world' if x in of_world else 'body' for x in parts)}")
+        axes = tuple("world" if part in of_world else "body" for part in parts)
+        correction["axes"] = {"v": axes[:1] if both else axes}
     reading = " and ".join(meant)
-    remedy = f"forcegp import {' '.join(flags)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
+    remedy = (
+        f"forcegp import {import_flags(correction)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
+    )
     numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
     if reading:
         yield wrong(
@@ -104,6 +109,7 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
             seen=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
             f"{recorded:.2g}, of a speed of {speed:.2g}.",
             remedy=remedy,
+            correction=correction,
             numbers=numbers,
         )
     elif recorded > CLEARLY * speed and speed > 0.0:

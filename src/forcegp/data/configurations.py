@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
@@ -37,18 +37,26 @@ def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
     """
     for group in space.groups:
         turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
-        cosine = (q[1:, turn] * q[:-1, turn]).sum(axis=1)
-        half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
-        jumps = np.flatnonzero((np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1)))
-        if len(jumps):
+        followed, jumped = following(group, q[:, turn], q[0, turn])
+        if jumped.any():
             raise DatasetError(
-                f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row {jumps[0]}; check "
-                "the order of the quaternion's columns, or leave these rows out."
+                f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row "
+                f"{np.argmax(jumped) - 1}; check the order of the quaternion's columns, or leave these rows out."
             )
-        if half and (cosine < 0.0).any():
-            q = q.copy()
-            q[1:, turn] *= np.cumprod(np.sign(cosine))[:, None]
+        q = q.copy()
+        q[:, turn] = followed
     return q
+
+
+def following(
+    group: Group, turn: Float[np.ndarray, "rows parts"], before: Float[np.ndarray, " parts"]
+) -> tuple[Float[np.ndarray, "rows parts"], Bool[np.ndarray, " rows"]]:
+    """Turns whose quaternions have the sign that is nearer to the row before, and rows that turn too far from it."""
+    half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
+    cosine = (turn * np.vstack([before, turn[:-1]])).sum(axis=1)
+    if half:
+        turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
+    return turn, (np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1))
 
 
 def through(space: ConfigurationSpace, q: Positions, change: Callable[[np.ndarray], np.ndarray]) -> Positions:

@@ -196,8 +196,8 @@ class ColumnMapping:
     ) -> "ColumnMapping":
         """The mapping after a correction that `forcegp.check` found, whose entries are in the order of `joints`.
 
-        Units replace what was stated, signs multiply it, and an order (joint k has the column of joint order[k]) needs
-        the `columns` of every signal, as `import_recordings` returns them.
+        Units, orientation and axes replace what was stated, signs multiply it, and an order (joint k has the column of
+        joint order[k]) needs the `columns` of every signal, as `import_recordings` returns them.
         """
         places = [joints.index(name) for name in self.joints or joints]
 
@@ -214,6 +214,10 @@ class ColumnMapping:
             now = now * len(places) if len(now) == 1 else now
             turned = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
             changes["sign"] = {**self.sign, **changes.get("sign", {}), signal: turned}
+        if "orientation" in correction:
+            [changes["orientation"]] = correction["orientation"]["q"]
+        if "axes" in correction:
+            changes["axes"] = {**self.axes, **correction["axes"]}
         for signal, order in correction.get("order", {}).items():
             if signal in columns:
                 changes[signal] = tuple(columns[signal][order[place]] for place in places)

@@ -1,6 +1,6 @@
 """Logs of bases that move: their orientations, velocities and accelerations, turned into those of a Dataset."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,13 +9,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from forcegp.data import differentiate
-from forcegp.data.configurations import LARGEST_TURN, in_base
+from forcegp.data.configurations import following, in_base
 from forcegp.data.dataset_fields import ROTATION, TRANSLATION
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping
 from forcegp.recordings.source import Source
 from forcegp.robots import Robot
+from forcegp.robots.layout import WORLD
 from forcegp.robots.manifold import ConfigurationSpace, Group
 
 ANGLES = ("roll", "pitch", "yaw")
@@ -29,13 +30,19 @@ ROUNDED = 1e-9
 
 def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
     """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
-    names, rest, place = list[str](), iter(joints), 0
-    groups = {group.place: group for group in robot.space.groups}
-    while place < robot.nq:
-        group = groups.get(place)
-        names += [next(rest)] if group is None else [f"{group.name}.{x}" for x in _written(group, orientation)]
-        place += 1 if group is None else len(group.motion.positions)
+    names = list(joints)
+    for group, span in spans(robot.space, orientation):
+        names[span.start : span.start] = [f"{group.name}.{part}" for part in _written(group, orientation)]
     return tuple(names)
+
+
+def spans(space: ConfigurationSpace, orientation: str) -> Iterator[tuple[Group, slice]]:
+    """Every base and its columns among those of q in a log."""
+    more = 0
+    for group in space.groups:
+        start, size = group.place + more, len(_written(group, orientation))
+        more += size - len(group.motion.positions)
+        yield group, slice(start, start + size)
 
 
 def _written(group: Group, orientation: str) -> tuple[str, ...]:
@@ -43,6 +50,11 @@ def _written(group: Group, orientation: str) -> tuple[str, ...]:
     if orientation == "angles":
         return place + (ANGLES[2:] if group.kind == "planar" else ANGLES)
     return place + (turn[-1:] + turn[:-1] if orientation == "wxyz" and group.kind != "planar" else turn)
+
+
+def bases(robot: Robot) -> tuple[Group, ...]:
+    """The joints of several degrees of freedom whose parent is the world: their axes are its."""
+    return tuple(group for group in robot.space.groups if robot.layout.parents[group.body] == WORLD)
 
 
 def singles(robot: Robot) -> tuple[str, ...]:
@@ -100,14 +112,11 @@ class Poses:
 
         Raises DatasetError, naming the row, where a turn is more than 1 % longer or shorter than 1.
         """
-        q = np.empty((len(table), self.space.nq))
-        start = place = 0
-        for group in self.space.groups:
-            between = slice(start, start + group.place - place)
-            start, place = between.stop + len(_written(group, self.orientation)), group.places.stop
-            q[:, group.place - (between.stop - between.start) : group.place] = table[:, between]
-            q[:, group.places] = self._pose(group, table[:, between.stop : start], rows, restarts)
-        q[:, place:] = table[:, start:]
+        turned = list(spans(self.space, self.orientation))
+        q = np.delete(table, [column for _, span in turned for column in range(span.start, span.stop)], axis=1)
+        for group, span in turned:
+            pose = self._pose(group, table[:, span], rows, restarts)
+            q = np.hstack([q[:, : group.place], pose, q[:, group.place :]])
         return q
 
     def note(self) -> tuple[str, ...]:
@@ -123,14 +132,9 @@ class Poses:
             turn = np.array(Rotation.from_euler("xyz", given[:, first:]).as_quat())
         else:
             turn = self._unit(group, given[:, first:], rows)
-        half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
         last = self.last[group.name] if group.name in self.last else turn[0]
-        before = np.vstack([last, turn[:-1]])
-        cosine = (turn * before).sum(axis=1)
-        if half:
-            turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
+        turn, jumped = following(group, turn, last)
         self.last[group.name] = turn[-1].copy()
-        jumped = (np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1))
         jumped[list(restarts)] = False
         seen = f"{group.name!r} turns by more than a quarter of a turn"
         remedy = (
@@ -162,6 +166,7 @@ class Layout:
     ------
     places: columns of each signal that was logged; q as a Dataset has it.
     space: of the positions.
+    bases: joints of several degrees of freedom whose parent is the world.
     axes: of v and a, those of the linear and of the angular part.
     gravity: (3,) [m/s^2], for accelerometers.
     derived: entries of v and a that the log lacks.
@@ -170,6 +175,7 @@ class Layout:
 
     places: Mapping[str, slice]
     space: ConfigurationSpace
+    bases: tuple[Group, ...] = ()
     axes: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
     derived: Mapping[str, list[int]] = field(default_factory=dict)
@@ -201,7 +207,7 @@ class Layout:
             return values
         found, moving, at = (torch.tensor(x) for x in (values, v, q))
         more = {"gravity": torch.tensor(self.gravity, dtype=torch.float64)} if signal == "a" else {}
-        for group in self.space.groups:
+        for group in self.bases:
             own = {**more, "v": moving[:, group.rows]} if more else {}
             found[:, group.rows] = in_base(group, at[:, group.places], found[:, group.rows], self.axes[signal], **own)
         return found.numpy()
@@ -218,7 +224,7 @@ def layout_of(
     `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
     there where their axes turn.
     """
-    groups = () if system is None else system.robot.space.groups
+    groups = () if system is None else bases(system.robot)
     sizes = dict.fromkeys(SIGNALS, nv)
     if system is not None:
         sizes |= {"q": system.robot.nq, "u": len(system.inputs)}
@@ -239,7 +245,7 @@ def layout_of(
             if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
                 raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
     if system is None:
-        return Layout(places, ConfigurationSpace(nv), axes, derived=derived)
+        return Layout(places, ConfigurationSpace(nv), derived=derived)
     switches = range(places["u"].start + len(system.actuators), places["u"].stop)
     gravity = tuple(system.robot.gravity.tolist())
-    return Layout(places, system.robot.space, axes, gravity, derived, tuple(switches))
+    return Layout(places, system.robot.space, groups, axes, gravity, derived, tuple(switches))

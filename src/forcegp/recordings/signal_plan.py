@@ -1,7 +1,7 @@
 """A mapping applied to a table: which combination of its columns each joint's signals are."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, uni
 from forcegp.errors import InvalidInput
 from forcegp.recordings.column_names import LinearExpression, expanded, guessed_columns, guessed_time, parse_expression
 from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping, LogUnit, log_unit
-from forcegp.recordings.moving_base import TURNED, Layout, columns_of, layout_of, singles
+from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, layout_of, singles
 from forcegp.recordings.source import Columns, Source
 
 LACKING = LinearExpression({}, 0.0)
@@ -120,8 +120,11 @@ def signal_plan(
     units = _units(mapping, joints) if robot is None else units_for(robot)
     if robot is None:
         log = {name: dict(zip(joints, unit_of_each(name, units[name], len(joints)), strict=True)) for name in SIGNALS}
+    turned = {f"{x.name}.{part}" for x in (bases(robot) if robot and mapping.ned else ()) for part in TURNED}
     signals = tuple(
-        item for name, own in found.items() for item in _signals(mapping, name, own, log[name], order[name], joints)
+        item
+        for name, expressions in found.items()
+        for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
     )
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name] for name in found}
     episode = mapping.episode
@@ -190,8 +193,12 @@ def _signals(
     columns: Mapping[str, str | None],
     order: Sequence[str],
     joints: Sequence[str],
+    turned: Collection[str],
 ) -> Iterator[JointSignal]:
-    """One signal in the order of the Dataset. `columns`: name and SI unit, in the order of the log."""
+    """One signal in the order of the Dataset. `columns`: name and SI unit, in the order of the log.
+
+    `turned` are entries of bases that change sign.
+    """
     names = list(columns)
     plain = set(names) <= set(joints)
     if len(expressions) == 1 and len(names) > 1 and not expressions[0].weights:
@@ -222,7 +229,7 @@ def _signals(
             _at(f"{what} of {signal}", getattr(mapping, what).get(signal, (neutral,)), index, names)
             for what, neutral in (("sign", 1.0), ("scale", 1.0), ("offset", 0.0))
         )
-        if mapping.ned and signal != "u" and name not in joints and name.rpartition(".")[2] in TURNED:
+        if name in turned and signal != "u":
             sign, offset = -sign, -offset
         yield JointSignal(signal, name, expressions[index], unit, sign * scale, offset)
 
