@@ -23,6 +23,9 @@ def test_orientation_and_axes_of_a_base_replace():
     mapping = ColumnMapping(axes={"v": ("world",)}, ned=True)
     found = mapping.corrected_by({"orientation": {"q": ("wxyz",)}, "axes": {"a": ("imu",)}}, JOINTS, COLUMNS)
     assert (found.orientation, found.axes, found.ned) == ("wxyz", {"v": ("world",), "a": ("imu",)}, True)
+    assert found.q == ("q1", "q2", "q3")
+    by_name = ColumnMapping().corrected_by({"orientation": {"q": ("wxyz",)}}, ("pan", "lift", "bend"), COLUMNS)
+    assert by_name.q == ("q1", "q2", "q3")
     words = parse_arguments(["import", "log.csv", *found.flags(), "--out", "o.h5"])
     assert (words.orientation, words.axes, words.ned) == ("wxyz", "v=world,a=imu", True)
 

@@ -216,6 +216,8 @@ class ColumnMapping:
             changes["sign"] = {**self.sign, **changes.get("sign", {}), signal: turned}
         if "orientation" in correction:
             [changes["orientation"]] = correction["orientation"]["q"]
+            if self.q is None and not self.joints:  # found by name: now their places count
+                changes["q"] = tuple(columns["q"])
         if "axes" in correction:
             changes["axes"] = {**self.axes, **correction["axes"]}
         for signal, order in correction.get("order", {}).items():
