@@ -39,7 +39,8 @@ class ImportOptions:
 
     Fields
     ------
-    gap: seconds between two rows that begin another episode; None for ten median steps.
+    gap: seconds without a row, or a message of one of several topics, that begin another episode; None for ten median
+        steps.
     resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
     rate: of the even times in Hz, instead of the median of the recordings' median rates.
     start, end: seconds from the first row of each episode that are kept.

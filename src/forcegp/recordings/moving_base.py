@@ -27,6 +27,9 @@ LARGEST_ERROR = 0.01
 ROUNDED = 1e-9
 """Differences from length 1 beyond this are reported."""
 
+MOST_JUMPS = 1000
+"""That are remembered of one piece: the first one that matters is reported."""
+
 
 def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
     """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
@@ -140,7 +143,7 @@ class Poses:
         remedy = (
             "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
         )
-        self.jumps += [(rows + int(row), seen, remedy) for row in np.flatnonzero(jumped)]
+        self.jumps += [(rows + int(row), seen, remedy) for row in np.flatnonzero(jumped)[:MOST_JUMPS]]
         return np.hstack([given[:, :first], turn])
 
     def _unit(self, group: Group, turn: np.ndarray, rows: int) -> np.ndarray:

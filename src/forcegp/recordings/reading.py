@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 import forcegp.robots
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, MistakenUnit
-from forcegp.recordings.moving_base import Poses
+from forcegp.recordings.moving_base import MOST_JUMPS, Poses
 from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
 
@@ -50,8 +50,6 @@ class Spool:
 
 ROWS_AT_A_TIME = 16384
 TURN = 2.0 * np.pi
-MOST_JUMPS = 1000
-"""That are remembered of one piece: the first one that matters is reported."""
 
 
 @dataclass(frozen=True)
