@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from tests.recordings.log_files import write_text
 
@@ -260,6 +261,35 @@ def test_without_a_base_that_moves_nothing_of_it_can_be_stated(tmp_path, flight,
     path = write_text(tmp_path / "log.csv", columns(flight))
     with pytest.raises(InvalidInput, match="about a base that moves"):
         import_recordings([path], tmp_path / "out.h5", mapping)
+
+
+def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
+    """A body that tumbles in free fall: the dynamics of the robot give the accelerations that were imported."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    text = """<mujoco model="box"><option timestep="0.001" integrator="RK4"/><worldbody><body name="body">
+    <freejoint name="base"/><inertial pos="0.05 -0.02 0.03" mass="2" diaginertia="0.01 0.02 0.025"/></body>
+    </worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    data.qvel[:] = [1.0, -0.5, 2.0, 3.0, -2.0, 4.0]
+    rows = []
+    for _ in range(200):
+        mujoco.mj_forward(model, data)
+        rows.append(np.concatenate([[data.time], data.qpos, data.qvel, data.qacc]))
+        mujoco.mj_step(model, data)
+    names = ["time", *(f"q{k}" for k in range(7)), *(f"v{k}" for k in range(6)), *(f"a{k}" for k in range(6))]
+    path = write_text(tmp_path / "log.csv", dict(zip(names, np.array(rows).T, strict=True)))
+    (tmp_path / "box.xml").write_text(text)
+    system = MechanicalSystem.from_file(tmp_path / "box.xml", base="floating")
+    axes = {"v": ("world", "body"), "a": ("world", "body")}
+    import_recordings([path], tmp_path / "out.h5", replace(PLAIN, u=None, orientation="wxyz", axes=axes), system=system)
+    found = Dataset.load(tmp_path / "out.h5")
+    moved = differentiate(found.q, found.time, system.robot.space)
+    np.testing.assert_allclose(found.v[1:-1], moved[1:-1], rtol=0, atol=1e-4)
+    q, v, u = (torch.tensor(x) for x in (found.q, found.v, found.u))
+    np.testing.assert_allclose(
+        found.a, system.dynamics(q, v, u).acceleration(torch.zeros_like(v)).numpy(), rtol=0, atol=1e-9
+    )
 
 
 MIDDLE = """<robot name="rail"><link name="rail"/><link name="cart"><inertial><mass value="1"/>
