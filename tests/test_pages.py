@@ -7,10 +7,12 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.cli.in_process import run_here
 from tests.examples import run_example
 
+from forcegp import Dataset
 from forcegp.cli.main import parse_arguments
 
 
@@ -32,15 +34,28 @@ def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "moving-bases.md").read_text(encoding="utf-8")
     example, poses = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert run_example(poses, tmp_path).split() == ["True", "True"]
+    run_example(poses, tmp_path)
+    simulated, own, bags = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    for command in own:
+        done = run_here(*shlex.split(command)[1:], folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+    for name in ("poses.h5", "flight.h5"):
+        log = Dataset.load(tmp_path / name)
+        t, turned = log.time, 0.4 * log.time
+        velocity = np.cos(t) * np.cos(turned) - np.sin(t) * np.sin(turned)
+        acceleration = -1.4 * np.sin(t + turned)
+        np.testing.assert_allclose(log.v[:, 0], velocity, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(log.a[:, 0], acceleration, rtol=0, atol=2e-2)
+        np.testing.assert_allclose(log.v[:, 5], 0.4, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(log.u, 5180 * np.pi / 30)
+    assert "base: positions and velocities of 'base' agree" in done.stdout
     sizes, step, inputs, force = run_example(example, tmp_path).splitlines()
     assert sizes.startswith("8 7 ('base.x', ")
     assert [round(float(x), 6) for x in re.findall(r"-?\d\.\d+(?:e-\d+)?", step)] == [0.1, 0, 0, 0, 0, 0.3, 0.2]
     assert inputs == "('knee', 'foot_stands')"
     assert len(re.findall(r"-?\d+\.\d+", force)) == 3
-    (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-    for command in re.findall(r"^forcegp (.*)$", commands, re.MULTILINE):
-        parse_arguments(shlex.split(command))
+    for command in (*simulated, *bags):
+        parse_arguments(shlex.split(command)[1:])
 
 
 def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):

@@ -27,7 +27,7 @@ def test_a_quaternion_that_begins_with_w_is_named(log):
     (finding,) = quick_check(replace(log, q=q))
     assert (finding.severity, finding.subject) == ("wrong", "base")
     assert "w, x, y, z" in finding.seen
-    assert "Reorder" in finding.remedy
+    assert "forcegp import --orientation wxyz" in finding.remedy
 
 
 def test_velocities_in_the_axes_of_the_world_are_named(log):
@@ -45,14 +45,27 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
     v[:, :3] = (turned @ v[:, :3, None])[..., 0]
     v[:, 3:6] = (turned @ v[:, 3:6, None])[..., 0]
     findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
-    assert "axes of the world" in findings[0].seen
+    assert findings[0].seen.startswith("positions of 'base' change as if it had velocities in the axes of the world")
+    assert "--axes v=world. " in findings[0].remedy
+    v[:, 3:6] = (np.linalg.inv(turned) @ v[:, 3:6, None])[..., 0]
+    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
+    assert "linear velocities in the axes of the world" in findings[0].seen
+    assert "--axes v=world,body." in findings[0].remedy
+    q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
+    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
+    assert "--orientation wxyz --axes v=world,body." in findings[0].remedy
 
 
 def test_an_accelerometer_is_no_acceleration(log):
     a = log.a.copy()
-    a[:, 2] += 9.81
+    rotation = log.system.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
+    a[:, :3] += np.cross(log.v[:, 3:6], log.v[:, :3]) + 9.81 * rotation[:, 2, :]
     (finding,) = quick_check(replace(log, a=a))
-    assert finding.subject == "base acceleration"
+    assert (finding.subject, finding.severity) == ("base acceleration", "wrong")
+    assert "--axes a=imu" in finding.remedy
+    a[:, :3] *= -1.0
+    (finding,) = quick_check(replace(log, a=a))
+    assert (finding.subject, finding.severity) == ("base acceleration", "look")
 
 
 def test_quaternions_of_another_length_are_refused(log):

@@ -118,6 +118,8 @@ MORE = st.lists(
                 "--episode",
                 "--episodes",
                 "--a",
+                "--orientation",
+                "--axes",
             )
         ),
         WORDS,

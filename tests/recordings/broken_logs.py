@@ -323,7 +323,7 @@ BROKEN = {
     "unknown compression": Broken(unknown_compression, "'brot'", TOPIC),
     "two topics": Broken(
         mcap,
-        "map columns of one topic",
+        "several topics are joined by their stamps",
         "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --joints shoulder,elbow",
     ),
     "fewer frames": Broken(lerobot(lambda info: info.update(total_frames=7)), "has 7 frames", LEROBOT),

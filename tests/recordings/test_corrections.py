@@ -19,6 +19,17 @@ def test_units_replace_and_signs_multiply():
     assert found.q == mapping.q
 
 
+def test_orientation_and_axes_of_a_base_replace():
+    mapping = ColumnMapping(axes={"v": ("world",)}, ned=True)
+    found = mapping.corrected_by({"orientation": {"q": ("wxyz",)}, "axes": {"a": ("imu",)}}, JOINTS, COLUMNS)
+    assert (found.orientation, found.axes, found.ned) == ("wxyz", {"v": ("world",), "a": ("imu",)}, True)
+    assert found.q == ("q1", "q2", "q3")
+    by_name = ColumnMapping().corrected_by({"orientation": {"q": ("wxyz",)}}, ("pan", "lift", "bend"), COLUMNS)
+    assert by_name.q == ("q1", "q2", "q3")
+    words = parse_arguments(["import", "log.csv", *found.flags(), "--out", "o.h5"])
+    assert (words.orientation, words.axes, words.ned) == ("wxyz", "v=world,a=imu", True)
+
+
 def test_an_order_names_the_columns_that_were_read():
     found = ColumnMapping().corrected_by({"order": {"u": (1, 0, 2), "v": (1, 0, 2)}}, JOINTS, COLUMNS)
     assert found.u == ("b", "a", "c")

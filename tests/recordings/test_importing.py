@@ -26,7 +26,9 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 from forcegp.recordings.episode_rows import EpisodeRows, Stretch
 from forcegp.recordings.formats import open_source
+from forcegp.recordings.moving_base import Layout
 from forcegp.recordings.reading import Spool
+from forcegp.robots.manifold import ConfigurationSpace
 
 NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{joints}",), joints=JOINTS)
 ARRAYS = ColumnMapping(time="time", q=("q",), v=("v",), u=("u",), joints=JOINTS)
@@ -117,7 +119,8 @@ def test_pieces_of_an_episode_are_those_of_the_whole(tmp_path, rows, logged):
     recording = reading.RawRecording(
         "log", source, 0, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), np.zeros(4), np.zeros(4), ()
     )
-    episode = EpisodeRows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), logged, 2, STEP)
+    layout = Layout({name: slice(2 * k, 2 * k + 2) for k, name in enumerate(logged)}, ConfigurationSpace(2))
+    episode = EpisodeRows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), layout, STEP)
     with Spool(tmp_path, signals.shape[1]) as spool:
         spool.append(signals[:400])
         spool.append(signals[400:])

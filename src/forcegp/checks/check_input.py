@@ -41,7 +41,7 @@ class Finding:
     remedy: what to do about it; empty if nothing.
     joints: names of the joints concerned; numbers: the numbers of `seen`, for programs.
     correction: what an import has to state about the columns, for `ColumnMapping.corrected_by`: unit, sign and order by
-    signal, for all joints or one each, in the order of the joints.
+    signal, for all joints or one each, in the order of the joints; orientation of q and axes of v and a.
     """
 
     severity: Severity
@@ -62,9 +62,9 @@ wrong, look, ok = partial(Finding, severity="wrong"), partial(Finding, severity=
 
 
 def import_flags(correction: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> str:
-    """The options of `forcegp import` that state these units and signs."""
-    texts = []
-    for what in ("unit", "sign"):
+    """The options of `forcegp import` that state these units and signs, orders of quaternions and axes."""
+    texts = [f"--{what} {own[0]}" for what in ("orientation",) for own in correction.get(what, {}).values()]
+    for what in ("axes", "unit", "sign"):
         stated = correction.get(what, {})
         each = (
             f"{name}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for name, own in stated.items()

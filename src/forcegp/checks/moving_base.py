@@ -10,17 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.checks.check_input import Finding, look, ok, wrong
+from forcegp.checks.check_input import Finding, import_flags, look, ok, wrong
 from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset
+from forcegp.data.configurations import in_base
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
-from forcegp.robots.manifold import Group, pose
+from forcegp.robots.manifold import Group
 
 CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
 itself below this share of the speed."""
 MOST_ROWS = 2000
+IMU = {"axes": {"a": ("imu",)}}
 
 
 def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
@@ -37,7 +39,19 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
     for group in system.robot.layout.groups:
         yield from _of_velocity(system.robot, group, q0, q1, step, middle)
         error, size = _rms(change[:, group.rows] - a[:, group.rows]), _rms(change[:, group.rows])
-        if error > 2.0 * size:  # noise of the velocities alone makes both large
+        at, gravity = q0[:, group.places], system.robot.gravity
+        measured = in_base(group, at, a[:, group.rows], ("imu", "body"), middle[:, group.rows], gravity)
+        specific = _rms(change[:, group.rows] - measured)
+        if error > 2.0 * size and specific < CLEARLY * error:
+            yield wrong(
+                subject="base acceleration",
+                seen=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
+                f"velocity it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}.",
+                remedy=f"forcegp import {import_flags(IMU)}; or differentiate v.",
+                correction=IMU,
+                numbers={"error": error, "specific": specific, "size": size},
+            )
+        elif error > 2.0 * size:  # noise of the velocities alone makes both large
             yield look(
                 subject="base acceleration",
                 seen=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
@@ -50,32 +64,52 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
 
 def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tensor, v: Tensor) -> Iterator[Finding]:
     own = v[:, group.rows]
-    speed = _rms(own)
+    whole = list(range(own.shape[1]))
+    parts = {"linear ": [k for k in whole if group.motion.free[k] < 3]}
+    parts["angular "] = [k for k in whole if k not in parts["linear "]]
 
-    def error(first: Tensor, second: Tensor, velocity: Tensor) -> float:
+    def mistaken(recorded: float, other: float, speed: float) -> bool:
+        return recorded > CLEARLY * speed and other < CLEARLY * min(recorded, speed)
+
+    def best_axes(first: Tensor, second: Tensor) -> tuple[list[str], float]:
+        """Which parts of v fit in the axes of the world only, and the error that is left with them turned."""
         moved = robot.space.difference(first, second)[:, group.rows] / step
-        return _rms(moved - velocity)
+        body, turned, of_world = in_base(group, first[:, group.places], own, ("world", "world")), own.clone(), []
+        for name, part in parts.items():
+            as_recorded, other = (_rms((moved - velocity)[:, part]) for velocity in (own, body))
+            if part and mistaken(as_recorded, other, _rms(own[:, part])):
+                turned[:, part] = body[:, part]
+                of_world.append(name)
+        return of_world, _rms(moved - turned)
 
-    recorded = error(q0, q1, own)
-    readings = {"velocities in the axes of the world": error(q0, q1, _in_body(group, q0, own))}
-    remedies = {
-        "velocities in the axes of the world": "Turn them into the axes of the base: R^T v of its orientation R."
-    }
+    recorded = _rms(robot.space.difference(q0, q1)[:, group.rows] / step - own)
+    speed, meant, correction = _rms(own), list[str](), dict[str, dict[str, tuple[str, ...]]]()
+    of_world, other = best_axes(q0, q1)
     if group.kind != "planar":
         turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
-        order = "a quaternion w, x, y, z"
         first, second = q0.clone(), q1.clone()
         first[:, turn], second[:, turn] = q0[:, turn].roll(-1, -1), q1[:, turn].roll(-1, -1)
-        readings[order] = error(first, second, own)
-        remedies[order] = "Reorder its columns: forcegp has x, y, z, w."
-    best = min(readings, key=lambda name: readings[name])
-    numbers = {"as recorded": recorded, **readings, "speed": speed}
-    if recorded > CLEARLY * speed and readings[best] < CLEARLY * min(recorded, speed):
+        axes, reordered = best_axes(first, second)
+        if mistaken(recorded, reordered, speed) and reordered < other:
+            of_world, other = axes, reordered
+            meant, correction["orientation"] = ["a quaternion w, x, y, z"], {"q": ("wxyz",)}
+    if of_world:
+        both = len(of_world) == 2
+        meant.append(f"{'' if both else of_world[0]}velocities in the axes of the world")
+        axes = tuple("world" if part in of_world else "body" for part in parts)
+        correction["axes"] = {"v": axes[:1] if both else axes}
+    reading = " and ".join(meant)
+    remedy = (
+        f"forcegp import {import_flags(correction)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
+    )
+    numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
+    if reading:
         yield wrong(
             subject="base",
-            seen=f"positions of {group.name!r} change as if it had {best}: off by {readings[best]:.2g}, as recorded by "
+            seen=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
             f"{recorded:.2g}, of a speed of {speed:.2g}.",
-            remedy=remedies[best],
+            remedy=remedy,
+            correction=correction,
             numbers=numbers,
         )
     elif recorded > CLEARLY * speed and speed > 0.0:
@@ -88,15 +122,6 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
         )
     else:
         yield ok(subject="base", seen=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
-
-
-def _in_body(group: Group, q: Tensor, v: Tensor) -> Tensor:
-    """Velocities of the world's axes in those of the body."""
-    rotation, _ = pose(group.kind, q[:, group.places])
-    six = v.new_zeros(len(v), 6)
-    six[:, list(group.motion.free)] = v
-    turned = (rotation.mT[:, None] @ six.unflatten(-1, (2, 3))[..., None])[..., 0]
-    return turned.flatten(1)[:, list(group.motion.free)]
 
 
 def _rms(values: Tensor) -> float:

@@ -31,15 +31,16 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 class Import(PreparationOptions, RobotOptions):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
-    State which columns are the time, the positions, velocities and forces of the joints, and their units: by flags, or
-    in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS are names, patterns such
-    as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
+    State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
+    their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
+    are names, patterns such as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
     a --cutoff, --delay, --lag, --every or --trim, rows stay as they were logged.
 
     For example:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
       forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
+      forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
     """
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "none", Path)] = None
@@ -55,21 +56,30 @@ class Import(PreparationOptions, RobotOptions):
     write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "not written", Path)] = None
     """Write the mapping that results from flags and --mapping."""
     time: Columns = None
-    """Time stamps."""
+    """Time stamps; of a bag with several topics, those of the messages that become rows."""
     step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
     """Seconds between two rows, for a log without time stamps."""
     q: Columns = None
-    """Positions, one per joint."""
+    """Positions, one per joint; of a moving base x, y, z and its orientation."""
     v: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of q", str)] = None
-    """Velocities, one per joint."""
+    """Velocities, one per joint; of a moving base linear, then angular. derive: differentiate this one."""
     u: Columns = None
-    """Forces or torques of the actuators; a constant such as 0 is for all joints."""
+    """Forces or torques of the actuators, or what motors of the robot take; a constant such as 0 is for all."""
     a: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of v", str)] = None
     """Accelerations, one per joint."""
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
     """Names of the joints in the order of the columns."""
+    orientation: Annotated[Literal["xyzw", "wxyz", "angles"] | None, unless_given("xyzw|wxyz|angles", "xyzw")] = None
+    """Orientation of a base that moves: a quaternion with w last or first, or angles roll, pitch, yaw (in a plane yaw
+    alone)."""
+    axes: Text = None
+    """Axes of a moving base's v and a, of the linear and the angular part: body, world, or imu, which is what an
+    accelerometer at its origin measures. For instance v=world,body,a=imu; body unless stated."""
+    ned: bool = False
+    """World axes are north, east, down and base axes forward, right, down (PX4); y and z change sign."""
     unit: Text = None
-    """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm."""
+    """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm.
+    With a moving base, each is for the columns of its kind."""
     sign: Text = None
     """1 or -1 per joint, for all signals (--sign=1,-1) or for one (u=-1)."""
     scale: Text = None
@@ -152,9 +162,9 @@ class Import(PreparationOptions, RobotOptions):
         return stored.changed_by(self._flags())
 
     def _flags(self) -> forcegp.ColumnMapping:
-        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes")
+        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes", "orientation")
         given: dict[str, Any] = {name: getattr(self, name) for name in names}
-        given["side_by_side"] = self.side_by_side
+        given |= {"side_by_side": self.side_by_side, "ned": self.ned}
         if self.delimiter is not None:
             given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
@@ -162,8 +172,9 @@ class Import(PreparationOptions, RobotOptions):
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
             given["headerless"] = [int(word) for word in words]
-        if self.unit is not None:
-            given["unit"] = forcegp.recordings.by_quantity("unit", self.unit)
+        for name in ("unit", "axes"):
+            if (text := getattr(self, name)) is not None:
+                given[name] = forcegp.recordings.by_quantity(name, text)
         for name in ("sign", "scale", "offset"):
             text = getattr(self, name)
             if text is not None:

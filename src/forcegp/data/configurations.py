@@ -10,11 +10,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError
-from forcegp.robots.manifold import ConfigurationSpace
+from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 
 LEAST_LENGTH = 0.7
 """Of a filtered quaternion: below it the turn is faster than what the filter passes."""
@@ -36,18 +37,26 @@ def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
     """
     for group in space.groups:
         turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
-        cosine = (q[1:, turn] * q[:-1, turn]).sum(axis=1)
-        half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
-        jumps = np.flatnonzero((np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1)))
-        if len(jumps):
+        followed, jumped = following(group, q[:, turn], q[0, turn])
+        if jumped.any():
             raise DatasetError(
-                f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row {jumps[0]}; check "
-                "the order of the quaternion's columns, or leave these rows out."
+                f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row "
+                f"{np.argmax(jumped) - 1}; check the order of the quaternion's columns, or leave these rows out."
             )
-        if half and (cosine < 0.0).any():
-            q = q.copy()
-            q[1:, turn] *= np.cumprod(np.sign(cosine))[:, None]
+        q = q.copy()
+        q[:, turn] = followed
     return q
+
+
+def following(
+    group: Group, turn: Float[np.ndarray, "rows parts"], before: Float[np.ndarray, " parts"]
+) -> tuple[Float[np.ndarray, "rows parts"], Bool[np.ndarray, " rows"]]:
+    """Turns whose quaternions have the sign that is nearer to the row before, and rows that turn too far from it."""
+    half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
+    cosine = (turn * np.vstack([before, turn[:-1]])).sum(axis=1)
+    if half:
+        turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
+    return turn, (np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1))
 
 
 def through(space: ConfigurationSpace, q: Positions, change: Callable[[np.ndarray], np.ndarray]) -> Positions:
@@ -82,6 +91,38 @@ def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " row
     positions = torch.tensor(q)
     moved = space.difference(positions[:, None], positions[near]).numpy()
     return np.einsum("nk,nkj->nj", weights, moved)
+
+
+def in_base(
+    group: Group,
+    q: Float[Tensor, "rows positions"],
+    values: Float[Tensor, "rows velocities"],
+    axes: tuple[str, str],
+    v: Float[Tensor, "rows velocities"] | None = None,
+    gravity: Float[Tensor, "3"] | None = None,
+) -> Float[Tensor, "rows velocities"]:
+    """v of a base at its positions q, or with `v` and `gravity` its derivative a, from what was measured in `axes`.
+
+    `axes` are those of the linear and of the angular part: "body", "world", or "imu". A Dataset has v = (R^T p', w) and
+    its plain derivative. So world axes give v' = R^T p'' - w x R^T p', and an accelerometer at the origin of the base,
+    which measures f = R^T (p'' - g), gives v' = f + R^T g - w x R^T p' (Titterton & Weston, "Strapdown inertial
+    navigation technology", 2004, section 3.5). Angular parts are alike: (R w)' = R (w' + w x w) = R w'.
+    """
+    free = list(group.motion.free)
+
+    def six(own: Tensor) -> Tensor:
+        return own.new_zeros(len(own), 6).index_copy(1, torch.tensor(free), own).unflatten(-1, (2, 3))
+
+    inverse = pose(group.kind, q)[0].mT
+    turned, found = (inverse[:, None] @ six(values)[..., None])[..., 0], six(values)
+    for part, name in enumerate(axes):
+        if name == "world":
+            found[:, part] = turned[:, part]
+    if v is not None and gravity is not None and axes[0] != "body":
+        found[:, 0] -= torch.linalg.cross(six(v)[:, 1], six(v)[:, 0])
+        if axes[0] == "imu":
+            found[:, 0] += inverse @ gravity
+    return found.flatten(1)[:, free]
 
 
 def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:

@@ -137,7 +137,7 @@ def validated_units(units: Mapping[str, str | Sequence[str]], joint_names: Seque
         )
     if units["time"] != "s":
         raise DatasetError(f"units['time'] is {units['time']!r}; only 's' is allowed. Convert the time stamps first.")
-    per_quantity = {name: _per_joint(name, units[name], len(joint_names)) for name in ROTATION}
+    per_quantity = {name: unit_of_each(name, units[name], len(joint_names)) for name in ROTATION}
     per_joint: list[dict[str, str]] = []
     for column, joint in enumerate(joint_names):
         own = {name: per_quantity[name][column] for name in ROTATION}
@@ -150,7 +150,8 @@ def validated_units(units: Mapping[str, str | Sequence[str]], joint_names: Seque
     return _per_quantity(per_joint)
 
 
-def _per_joint(name: str, unit: str | Sequence[str], nv: int) -> tuple[str, ...]:
+def unit_of_each(name: str, unit: str | Sequence[str], nv: int) -> tuple[str, ...]:
+    """One unit for each joint. Raises DatasetError."""
     if isinstance(unit, str):
         return (unit,) * nv
     texts = tuple(unit)

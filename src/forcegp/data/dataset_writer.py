@@ -53,6 +53,10 @@ class DatasetWriter:
         self.joint_names = tuple(joint_names)
         self.units = validated_units(units, self.joint_names)
         self.system = system
+        names: dict[str, tuple[str, ...]] = dict.fromkeys(TABLES, self.joint_names)
+        if system is not None:
+            names |= {"q": system.robot.position_names, "u": system.inputs}
+        self.columns = names
         self.rows = 0
         self._last: tuple[int, float] | None = None
         self._waiting: list[dict[str, np.ndarray]] = []
@@ -70,9 +74,8 @@ class DatasetWriter:
             self._pool = ThreadPoolExecutor(THREADS)
             stack.callback(self._pool.shutdown, cancel_futures=True)
             self._stack = stack.pop_all()
-        nv = len(self.joint_names)
-        for name in (*TABLES, "time", "episode"):
-            width = (nv,) if name in TABLES else ()
+        for name in self._stored:
+            width = (len(self.columns[name]),) if name in TABLES else ()
             self._file.create_dataset(
                 name,
                 shape=(0, *width),
@@ -82,6 +85,11 @@ class DatasetWriter:
                 **COMPRESSION,
             )
         return self
+
+    @property
+    def _stored(self) -> list[str]:
+        """What is written in chunks; a table without columns has none."""
+        return [*(name for name in TABLES if self.columns[name]), "time", "episode"]
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> bool | None:
         if error is None and not self._finished:
@@ -93,7 +101,7 @@ class DatasetWriter:
     def append(self, *, q: Rows, v: Rows, u: Rows, a: Rows, time: Float[np.ndarray, " rows"], episode: int) -> None:
         """Add rows of one episode after those that are there. Raises DatasetError as a Dataset does."""
         given = {"q": q, "v": v, "u": u, "a": a}
-        block = {name: finite_columns(name, values, self.joint_names, len(q)) for name, values in given.items()}
+        block = {name: finite_columns(name, values, self.columns[name], len(q)) for name, values in given.items()}
         block["time"] = finite_columns("time", time, None, len(q))
         before = [self._last[1]] if self._last is not None and self._last[0] == episode else []
         if not (np.diff(np.concatenate([before, block["time"]])) > 0).all():
@@ -112,6 +120,9 @@ class DatasetWriter:
             raise DatasetError("a Dataset has at least one row.")
         self._write(self._count)
         self._store(0)
+        for name in TABLES:
+            if not self.columns[name]:
+                self._file.create_dataset(name, data=np.zeros((self.rows, 0)))
         fields = {"time_ordered": True, "units": self.units, "joint_names": self.joint_names, "system": self.system}
         describe(fields | {"metadata": frozen_json(metadata)}, self._file)
         self._finished = True
@@ -119,7 +130,7 @@ class DatasetWriter:
     def _write(self, count: int) -> None:
         """Put the first `count` waiting rows into the file: whole chunks, but for the last ones of all."""
         rest: dict[str, np.ndarray] = {}
-        for name in (*TABLES, "time", "episode"):
+        for name in self._stored:
             joined = np.concatenate([block[name] for block in self._waiting])
             stored = self._file[name]
             assert isinstance(stored, h5py.Dataset)

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.interpolate import make_interp_spline
 
-from forcegp.data import differentiate
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError, MistakenUnit
+from forcegp.recordings.moving_base import Layout
 from forcegp.recordings.reading import RawRecording, Spool
 
 REPEATED = 0.05
@@ -63,9 +63,10 @@ class Stamps:
 def read_stamps(recording: RawRecording, gap: float | None, start: float | None, end: float | None) -> Stamps:
     """Stretches of a recording between gaps of more than `gap` seconds (default `GAP` median steps).
 
-    Of rows with the same stamp the first is kept: what comes after it is a sample that was sent again, or one whose
-    time is not known. `start` and `end` [s] are counted from the first row of each episode.
-    Raises DatasetError for time that runs backwards, and for rates that no robot is logged at.
+    Rows in a pause of one topic of several are left out. Of rows with the same stamp the first is kept: what comes
+    after it is a sample that was sent again, or one whose time is not known. `start` and `end` [s] are counted from the
+    first row of each episode. Raises DatasetError for time that runs backwards, and for rates that no robot is logged
+    at.
     """
     begins = recording.episodes[:, 1]
     typical = _typical_step(recording)
@@ -74,13 +75,15 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
     repeated = len(kept) - int(kept.sum())
     if start is not None or end is not None:
         kept &= _between(recording, start, end)
-    used = np.flatnonzero(kept)
+    paused = recording.source.paused(gap, GAP)
+    paused = np.zeros(len(kept), bool) if paused is None else paused
+    used = np.flatnonzero(kept & ~paused)
     number = np.searchsorted(begins, used, side="right") - 1
     same = np.diff(number) == 0
     between = np.diff(recording.time[used])
     step = float(np.median(between[same])) if same.any() else typical
     limit = GAP * step if gap is None else gap
-    inside = same & (between <= limit)
+    inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)
     bounds = [0, *(np.flatnonzero(~inside) + 1).tolist(), len(used)]
     stretches, dropped = [], 0
     for first, last in pairwise(bounds):
@@ -96,7 +99,7 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
         )
     gaps = tuple(between[same & ~inside].tolist())
     worst = float(np.abs(between[inside] / step - 1.0).max())
-    return Stamps(tuple(stretches), kept, step, worst, repeated, gaps, dropped)
+    return Stamps(tuple(stretches), kept & ~paused, step, worst, repeated, gaps, dropped)
 
 
 def _typical_step(recording: RawRecording) -> float:
@@ -177,14 +180,13 @@ DIFFERENCE_HALO = 3
 class EpisodeRows:
     """The rows of a stretch in pieces, equal to those of the whole stretch at once up to rounding.
 
-    Parameters: `kept` as in `Stamps`; `logged` signals in the order of the spool's columns, `nv` of each; `step` [s]
-    between even times, or None for the times of the log.
+    Parameters: `kept` as in `Stamps`; `layout` of the spool; `step` [s] between even times, or None for the times of
+    the log.
     """
 
     stretch: Stretch
     kept: np.ndarray
-    logged: tuple[str, ...]
-    nv: int
+    layout: Layout
     step: float | None
 
     def pieces(self, spool: Spool, rows: int = ROWS_AT_A_TIME) -> Iterator[dict[str, np.ndarray]]:
@@ -204,15 +206,17 @@ class EpisodeRows:
         def interpolated(at: np.ndarray) -> np.ndarray:
             low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
             high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
-            return make_interp_spline(stamps[low:high], logged(low, high), k=3)(at)
+            table, held = logged(low, high), list(self.layout.held)
+            between = make_interp_spline(stamps[low:high], table, k=3)(at)
+            if held:
+                before = np.searchsorted(stamps[low:high], at * (1 + 1e-12), side="right") - 1
+                between[:, held] = table[before][:, held]
+            return between
 
         for start in range(0, len(time), rows):
             end = min(start + rows, len(time))
             low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
             table = logged(low, high) if self.step is None else interpolated(time[low:high])
-            signals = {name: table[:, self.nv * i : self.nv * (i + 1)] for i, name in enumerate(self.logged)}
-            for name, source in (("v", "q"), ("a", "v")):
-                if name not in signals:
-                    signals[name] = differentiate(signals[source], time[low:high])
+            signals = self.layout.signals(table, time[low:high])
             own = slice(start - low, end - low)
             yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}

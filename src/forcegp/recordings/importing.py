@@ -15,6 +15,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 from forcegp.recordings.array_file import ArrayFile
 from forcegp.recordings.episode_rows import EpisodeRows, Stamps, Stretch, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
+from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.reading import (
     RawRecording,
@@ -38,7 +39,8 @@ class ImportOptions:
 
     Fields
     ------
-    gap: seconds between two rows that begin another episode; None for ten median steps.
+    gap: seconds without a row, or a message of one of several topics, that begin another episode; None for ten median
+        steps.
     resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
     rate: of the even times in Hz, instead of the median of the recordings' median rates.
     start, end: seconds from the first row of each episode that are kept.
@@ -98,13 +100,10 @@ def import_recordings(
     if not out.parent.is_dir():
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot = None if system is None else system.robot
-    if robot is not None and not robot.space.is_vector_space:
-        raise InvalidInput(
-            f"logs are imported by joint, and the base of {robot.name} moves; make a Dataset of its poses in Python "
-            "(docs/how-to/moving-bases.md, a log of your own), or give base='fixed' for a robot on a stand."
-        )
     sources = _sources([Path(path) for path in paths], mapping)
-    plans = [signal_plan(mapping, source, robot) for _, source in sources]
+    joined = [on_one_clock(source, signal_plan(mapping, source, system), out.parent) for _, source in sources]
+    sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
+    plans = [plan for _, plan in joined]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):
@@ -112,7 +111,7 @@ def import_recordings(
                 f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
             )
     steps = 2 * len(sources)
-    with Spool(out.parent, len(plan.signals)) as spool:
+    with Spool(out.parent, plan.layout.width) as spool:
         recordings = []
         for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
             report(index, steps, f"reading {label}")
@@ -124,8 +123,8 @@ def import_recordings(
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
         step = _even_step(stamps, options)
         episodes = [
-            EpisodeRows(stretch, own.kept, plan.logged, len(plan.joints), step)
-            for own in stamps
+            EpisodeRows(stretch, own.kept, each.layout, step)
+            for each, own in zip(plans, stamps, strict=True)
             for stretch in own.stretches
         ]
         for stretch in (rows.stretch for rows in episodes):
@@ -194,13 +193,10 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
 def _require_no_jumps(stretch: Stretch) -> None:
     """Refuse positions that jump by a turn inside an episode: derivatives would take it for motion."""
     recording = stretch.recording
-    for row, item in recording.jumps:
+    for row, seen, remedy in recording.jumps:
         if stretch.start < row < stretch.end:
-            raise DatasetError(
-                f"{recording.label}: q of joint {item.joint!r} jumps by more than half a turn at "
-                f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start); the angle wraps, or "
-                "is in degrees. Add `unwrap`, or `unit` q=deg."
-            )
+            where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
+            raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
 
 
 def _what_was_done(
@@ -213,15 +209,17 @@ def _what_was_done(
     sources: Sequence[tuple[str, Source]],
 ) -> dict[str, Any]:
     files = dict.fromkeys(file for _, source in sources for file in source.files())
-    made = {"v": "central differences of q", "a": "central differences of v"}
+    made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
+    lacking = {name for name, entries in plan.layout.derived.items() if entries}
     return {
         "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
-        "columns": {
-            name: [str(item.expression) for item in plan.signals if item.signal == name] for name in plan.logged
+        "columns": {name: [str(item) for item in plan.signals if item.signal == name] for name in plan.logged},
+        "signals": {
+            name: f"logged and {made[name]}" if name in lacking else "logged" if name in plan.logged else made[name]
+            for name in SIGNALS
         },
-        "signals": {name: "logged" if name in plan.logged else made[name] for name in SIGNALS},
         "recordings": [
             {
                 "name": recording.label,
@@ -232,7 +230,7 @@ def _what_was_done(
                 "repeated_stamps_dropped": own.repeated,
                 "gaps": list(own.gaps),
                 "rows_in_stretches_too_short": own.dropped_rows,
-                "notes": list(recording.source.notes()),
+                "notes": [*recording.source.notes(), *recording.notes],
             }
             for recording, own in zip(recordings, stamps, strict=True)
         ],

@@ -47,14 +47,20 @@ def _units(si: str, **factors: Fraction | int | float) -> dict[str, LogUnit]:
 _MILLI, _MICRO, _NANO = Fraction(1, 1000), Fraction(1, 10**6), Fraction(1, 10**9)
 _DEGREE, _TURN = math.pi / 180.0, 2.0 * math.pi
 
+ONE = LogUnit("1", "1")
+"""Of parts of a quaternion, of shares of a thrust and of switches."""
+
 UNITS: dict[str, dict[str, LogUnit]] = {
     "time": _units("s", s=1, ms=_MILLI, us=_MICRO, ns=_NANO, min=60),
     "q": _units("rad", rad=1, mrad=_MILLI, deg=_DEGREE, rev=_TURN)
-    | _units("m", m=1, cm=Fraction(1, 100), mm=_MILLI, um=_MICRO),
+    | _units("m", m=1, cm=Fraction(1, 100), mm=_MILLI, um=_MICRO)
+    | {"1": ONE},
     "v": _units("rad/s", rad_per_s=1, mrad_per_s=_MILLI, deg_per_s=_DEGREE, rev_per_s=_TURN, rpm=_TURN / 60.0)
     | _units("m/s", m_per_s=1, cm_per_s=Fraction(1, 100), mm_per_s=_MILLI),
     "u": _units("Nm", Nm=1, mNm=_MILLI, uNm=_MICRO, kNm=1000, Ncm=Fraction(1, 100))
-    | _units("N", N=1, mN=_MILLI, kN=1000),
+    | _units("N", N=1, mN=_MILLI, kN=1000)
+    | {"1": ONE}
+    | _units("rad/s", rad_per_s=1, rev_per_s=_TURN, rpm=_TURN / 60.0),
     "a": _units("rad/s^2", rad_per_ssquared=1, deg_per_ssquared=_DEGREE)
     | _units("m/s^2", m_per_ssquared=1, mm_per_ssquared=_MILLI),
 }
@@ -74,6 +80,10 @@ def log_unit(quantity: str, name: str) -> LogUnit:
 
 
 SIGNALS = ("q", "v", "u", "a")
+ORIENTATIONS = ("xyzw", "wxyz", "angles")
+"""Quaternions with w last or first; roll, pitch and yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or the yaw of a plane."""
+AXES = {"v": ("body", "world"), "a": ("body", "world", "imu")}
+"""What linear and angular velocities and accelerations may be measured in."""
 Factors = Mapping[str, tuple[float, ...]]
 
 
@@ -86,8 +96,13 @@ class ColumnMapping:
     time, step: a column or combination that is the time, or the time in s between two rows; one of both.
     q, v, u, a: per signal, its columns: patterns (`pos{1..7}`), names of vectors, combinations (`theta2 - theta1`), or
         one constant. None: v and a are differentiated, the others are looked for by the names of the joints.
-    joints: their names, in the order of the columns.
-    unit: by signal and "time", one unit for all joints or one for each. Default: SI.
+    joints: their names, in the order of the columns; columns of a base that moves stand where its robot has them.
+    orientation: of a base that moves: quaternions "xyzw" (default) or "wxyz", or "angles" roll, pitch and yaw.
+    axes: of its v and a, of the linear and the angular part: "body" (default), "world", or "imu" for what an
+        accelerometer at its origin measures.
+    ned: the log's world is north, east, down and its base forward, right, down; both are turned about x by half a turn.
+    unit: by signal and "time", one unit for all joints or one for each. Default: SI. With a base that moves, each unit
+        is for the columns of its kind.
     sign, scale, offset: by signal, one number for all joints or one for each; offset in SI, added last.
     episode: a column that numbers the episodes.
     episodes: a pattern (`piece*`) for arrays or groups of the file, each of which is an episode.
@@ -107,6 +122,9 @@ class ColumnMapping:
     u: tuple[str, ...] | None = None
     a: tuple[str, ...] | None = None
     joints: tuple[str, ...] = ()
+    orientation: str | None = None
+    axes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    ned: bool = False
     unit: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     sign: Factors = field(default_factory=dict)
     scale: Factors = field(default_factory=dict)
@@ -125,6 +143,15 @@ class ColumnMapping:
             raise InvalidInput(f"step is {self.step} s; it must be positive and finite.")
         if len(set(self.joints)) < len(self.joints) or not all(self.joints):
             raise InvalidInput(f"joints are {', '.join(self.joints)}; every joint needs a name of its own.")
+        if self.orientation not in (None, *ORIENTATIONS):
+            raise InvalidInput(f"orientation is {self.orientation!r}; give {', '.join(ORIENTATIONS)}.")
+        for signal, names in self.axes.items():
+            known = AXES.get(signal, ())
+            if not 1 <= len(names) <= 2 or not set(names) <= set(known) or names[1:] == ("imu",):
+                raise InvalidInput(
+                    f"axes of {signal} are {','.join(names)}; give v body or world, a body, world or imu, or two of "
+                    "them: of the linear and of the angular part, which no `imu` measures as an acceleration."
+                )
         for quantity, names in self.unit.items():
             if quantity not in UNITS:
                 raise InvalidInput(f"unit names {quantity!r}; it has {', '.join(UNITS)}.")
@@ -154,7 +181,7 @@ class ColumnMapping:
             for item in fields(other)
             if getattr(other, item.name) not in (None, (), {}, False)
         }
-        for name in ("unit", "sign", "scale", "offset"):
+        for name in ("axes", "unit", "sign", "scale", "offset"):
             if name in stated:
                 stated[name] = {**getattr(self, name), **stated[name]}
         if {"time", "step"} & stated.keys():
@@ -169,8 +196,8 @@ class ColumnMapping:
     ) -> "ColumnMapping":
         """The mapping after a correction that `forcegp.check` found, whose entries are in the order of `joints`.
 
-        Units replace what was stated, signs multiply it, and an order (joint k has the column of joint order[k]) needs
-        the `columns` of every signal, as `import_recordings` returns them.
+        Units, orientation and axes replace what was stated, signs multiply it, and an order (joint k has the column of
+        joint order[k]) needs the `columns` of every signal, as `import_recordings` returns them.
         """
         places = [joints.index(name) for name in self.joints or joints]
 
@@ -187,6 +214,12 @@ class ColumnMapping:
             now = now * len(places) if len(now) == 1 else now
             turned = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
             changes["sign"] = {**self.sign, **changes.get("sign", {}), signal: turned}
+        if "orientation" in correction:
+            [changes["orientation"]] = correction["orientation"]["q"]
+            if self.q is None and not self.joints:  # found by name: now their places count
+                changes["q"] = tuple(columns["q"])
+        if "axes" in correction:
+            changes["axes"] = {**self.axes, **correction["axes"]}
         for signal, order in correction.get("order", {}).items():
             if signal in columns:
                 changes[signal] = tuple(columns[signal][order[place]] for place in places)
@@ -283,10 +316,10 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
             continue
         if key in SIGNALS or key == "joints":
             values[key] = _texts(key, value)
-        elif key == "unit":
-            quantities = f"name the quantity, for example {_EXAMPLES[key]} ({', '.join(UNITS)})"
-            _require(isinstance(value, dict), key, value, quantities)
-            values[key] = {str(name): _texts(f"unit of {name}", entry) for name, entry in value.items()}
+        elif key in ("unit", "axes"):
+            quantities = ", ".join(UNITS if key == "unit" else AXES)
+            _require(isinstance(value, dict), key, value, f"name the quantity, as {_EXAMPLES[key]} ({quantities})")
+            values[key] = {str(name): _texts(f"{key} of {name}", entry) for name, entry in value.items()}
         elif key in ("sign", "scale", "offset"):
             entries = {signal: _listed(entry) for signal, entry in _by_signal(key, value).items()}
             values[key] = {name: tuple(_number(f"{key} of {name}", x) for x in own) for name, own in entries.items()}
@@ -297,7 +330,7 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
                 _require(whole, key, entry, "give the number of columns")
         elif key == "step":
             values[key] = _number(key, value)
-        elif key == "side_by_side":
+        elif key in ("side_by_side", "ned"):
             _require(isinstance(value, bool), key, value, "give true or false")
             values[key] = value
         else:
@@ -333,7 +366,13 @@ def by_quantity(flag: str, text: str) -> dict[str, list[str]]:
     return found
 
 
-_EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "scale": "u=0.001", "offset": "q=0,1.5708"}
+_EXAMPLES = {
+    "unit": "q=deg,time=ms",
+    "sign": "u=-1,1",
+    "scale": "u=0.001",
+    "offset": "q=0,1.5708",
+    "axes": "v=world,body",
+}
 
 
 def factors_of(flag: str, text: str) -> Any:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 import forcegp.robots
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, MistakenUnit
+from forcegp.recordings.moving_base import MOST_JUMPS, Poses
 from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
 
@@ -49,8 +50,6 @@ class Spool:
 
 ROWS_AT_A_TIME = 16384
 TURN = 2.0 * np.pi
-MOST_JUMPS = 1000
-"""That are remembered of one piece: the first one that matters is reported."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,9 @@ class RawRecording:
     begin: the stamp of the log at the first row, in s.
     episodes: (n, 2) episode number of the log and row at which it begins; one row if the log numbers none.
     lowest, highest: (signals,) of each signal of the plan, in SI.
-    jumps: rows before which a turning joint moves by more than half a turn, with the signal.
+    jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
+        seen, and what to do.
+    notes: on the orientations of a base.
     """
 
     label: str
@@ -76,7 +77,8 @@ class RawRecording:
     episodes: Int[np.ndarray, "n 2"]
     lowest: Float[np.ndarray, " signals"]
     highest: Float[np.ndarray, " signals"]
-    jumps: tuple[tuple[int, JointSignal], ...]
+    jumps: tuple[tuple[int, str, str], ...]
+    notes: tuple[str, ...] = ()
 
 
 def read_recording(
@@ -86,6 +88,8 @@ def read_recording(
     first = spool.rows
     clock = _Clock(plan, source)
     turns = _Turns(plan, unwrap)
+    poses = Poses(plan.layout.space, plan.orientation, source)
+    positions = sum(item.signal == "q" for item in plan.signals)
     times: list[np.ndarray] = []
     episodes: list[tuple[int, int]] = []
     lowest = np.full(len(plan.signals), np.inf)
@@ -102,16 +106,18 @@ def read_recording(
         _require_finite(table, columns, plan, source, rows, times[-1])
         if plan.episode is not None:
             _note_episodes(columns[plan.episode], episodes, source, rows)
-        turns.follow(table, rows, restarts=[row - rows for _, row in episodes if row >= rows])
+        restarts = [row - rows for _, row in episodes if row >= rows]
+        turns.follow(table, rows, restarts)
         lowest, highest = np.minimum(lowest, table.min(axis=0)), np.maximum(highest, table.max(axis=0))
-        spool.append(table)
+        q = poses.read(table[:, :positions], rows, restarts)
+        spool.append(np.hstack([q, table[:, positions:]]))
         rows += count
     if rows == 0:
         raise FileFormatError(f"{label} has no rows; give a log with rows.")
     begins = np.asarray(episodes or [(0, 0)], dtype=np.int64)
-    return RawRecording(
-        label, source, first, np.concatenate(times), clock.begin, begins, lowest, highest, tuple(turns.jumps)
-    )
+    jumps = tuple(turns.jumps + poses.jumps)
+    time = np.concatenate(times)
+    return RawRecording(label, source, first, time, clock.begin, begins, lowest, highest, jumps, poses.note())
 
 
 class _Clock:
@@ -148,10 +154,11 @@ class _Turns:
     def __init__(self, plan: SignalPlan, unwrap: bool) -> None:
         self.plan = plan
         self.unwrap = unwrap
-        self.columns = [i for i, item in enumerate(plan.signals) if item.signal == "q" and item.unit.si == "rad"]
+        angles = [item.signal == "q" and item.unit.si == "rad" for item in plan.signals]
+        self.columns = [i for i, turns in enumerate(angles) if turns and plan.signals[i].joint in plan.joints]
         self.last: np.ndarray | None = None
         self.added = np.zeros(len(self.columns))
-        self.jumps: list[tuple[int, JointSignal]] = []
+        self.jumps: list[tuple[int, str, str]] = []
 
     def follow(self, table: np.ndarray, rows: int, restarts: list[int]) -> None:
         """Note jumps, or add whole turns to the positions in place; rows in `restarts` begin another episode."""
@@ -163,7 +170,12 @@ class _Turns:
         jumps = np.abs(steps) > np.pi
         if not self.unwrap:
             found = np.argwhere(jumps)[:MOST_JUMPS]
-            self.jumps += [(rows + int(row), self.plan.signals[self.columns[index]]) for row, index in found]
+            joints = [self.plan.signals[column].joint for column in self.columns]
+            remedy = "the angle wraps, or is in degrees. Add `unwrap`, or `unit` q=deg."
+            self.jumps += [
+                (rows + int(row), f"q of joint {joints[index]!r} jumps by more than half a turn", remedy)
+                for row, index in found
+            ]
         elif jumps.any() or self.added.any():
             added = np.cumsum(-np.round(steps / TURN) * jumps, axis=0) + self.added
             self.added = added[-1].copy()

@@ -1,5 +1,6 @@
 """ROS 1 bags, ROS 2 bags and bare .mcap and .db3 files, read with `rosbags` (extra "logs"), without ROS."""
 
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -19,6 +20,7 @@ LOOKED_AT = 100
 """Messages of each topic that decide which columns there are: publishers may share a topic."""
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
+TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 OF_JOINTS = ("position", "velocity", "effort")
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 NANOSECONDS = 10**9
@@ -30,7 +32,8 @@ class RosBag(Source):
 
     Fields are `/wrench:wrench.force.x`, `/commands:data[3]`; those of a sensor_msgs/JointState go by joint name,
     `/joint_states:position.elbow`. Times are `TOPIC:header.stamp` (when it was measured) and `TOPIC:log_time` (when the
-    recorder got it), in ns. One table is one topic, with a row for every message that has all columns asked for.
+    recorder got it), in ns. One table is one topic, with a row for every message that has all columns asked for;
+    `JoinedTopics` puts several on one clock.
 
     Raises MissingExtra without `rosbags`.
     """
@@ -81,21 +84,33 @@ class RosBag(Source):
     @property
     @override
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
-        """`TOPIC:position` for all joints of a JointState, in the order of the messages."""
+        """`TOPIC:position` for all joints of a JointState, in the order of the messages, and vectors of geometry.
+
+        A pose is x, y, z of its place and x, y, z, w of its turn, a twist its linear and its angular part.
+        """
         found = dict(super().vectors)
+        known = set(self.columns())
         for name in self.columns():
             for kind in OF_JOINTS:
                 topic, found_kind, joint = name.partition(f":{kind}.")
                 if found_kind and joint:
                     found[f"{topic}:{kind}"] = (*found.get(f"{topic}:{kind}", ()), name)
+            axes = tuple(f"{name[:-1]}{axis}" for axis in "xyzw")
+            if name.endswith(".x") and known.issuperset(axes[:3]):
+                found[name[:-2]] = axes[: 4 if axes[3] in known else 3]
+        for first, second in (("position", "orientation"), ("translation", "rotation"), ("linear", "angular")):
+            for name in [name for name in found if name.endswith((f".{first}", f":{first}"))]:
+                whole, other = name[: -len(first) - 1], f"{name[: -len(first)]}{second}"
+                if other in found:
+                    for short in (whole, TWICE.sub(r"\1", whole)):  # pose.pose of a message with covariance
+                        found[short] = found[name] + found[other]
         return found
 
     @override
     def time_beside(self, names: Sequence[str]) -> str | None:
-        topics = {self._topic_of(name) for name in names}
-        if len(topics) != 1:
+        if not names:
             return None
-        [topic] = topics
+        topic = self.topic_of(names[0])
         stamp = f"{topic}:{STAMP}"
         return stamp if stamp in self._topics[topic] else f"{topic}:{LOG_TIME}"
 
@@ -111,17 +126,18 @@ class RosBag(Source):
             return ()
         return (f"messages left out because they lack a column, as those of another publisher do: {self._left_out}",)
 
-    def _topic_of(self, name: str) -> str:
+    def topic_of(self, name: str) -> str:
+        """The topic that has a column."""
         return next(topic for topic, names in self._topics.items() if name in names)
 
     @override
     def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
         self.require(names)
-        topics = sorted({self._topic_of(name) for name in names})
+        topics = sorted({self.topic_of(name) for name in names})
         if len(topics) != 1:
             raise InvalidInput(
                 f"{self.path}: the columns come from the topics {', '.join(topics)}, whose messages have times of "
-                "their own; map columns of one topic, or record them in one message."
+                "their own; read them one by one."
             )
         wanted = [name[len(topics[0]) + 1 :] for name in names]
         self._left_out = 0

@@ -1,18 +1,25 @@
 """A mapping applied to a table: which combination of its columns each joint's signals are."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+import forcegp.mechanics
 import forcegp.robots
 from forcegp.data import FrozenDict
-from forcegp.data.dataset_fields import ROTATION, TRANSLATION, validated_units
+from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, units_for, validated_units
 from forcegp.errors import InvalidInput
 from forcegp.recordings.column_names import LinearExpression, expanded, guessed_columns, guessed_time, parse_expression
-from forcegp.recordings.mapping import SIGNALS, ColumnMapping, LogUnit, log_unit
+from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping, LogUnit, log_unit
+from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, layout_of, singles
 from forcegp.recordings.source import Columns, Source
+
+LACKING = LinearExpression({}, 0.0)
+"""This very object: an entry of v or a that the log lacks, which is differentiated."""
+LACKS = re.compile(r"derive\d*")
 
 
 @dataclass(frozen=True)
@@ -25,6 +32,9 @@ class JointSignal:
     unit: LogUnit
     factor: float
     offset: float
+
+    def __str__(self) -> str:
+        return "derive" if self.expression is LACKING else str(self.expression)
 
     def value(self, columns: Columns, rows: int) -> np.ndarray:
         """(rows,) in SI; a column in SI without factor and offset comes out to the last bit."""
@@ -41,6 +51,8 @@ class SignalPlan:
     joints: tuple[str, ...]
     units: Mapping[str, Any]
     signals: tuple[JointSignal, ...]
+    layout: Layout
+    orientation: str
     time: LinearExpression | None
     time_unit: LogUnit
     step: float | None
@@ -60,31 +72,35 @@ class SignalPlan:
         return tuple(dict.fromkeys([*needed, *([] if self.episode is None else [self.episode])]))
 
 
-def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Robot | None) -> SignalPlan:
+def signal_plan(
+    mapping: ColumnMapping, source: Source, system: forcegp.mechanics.MechanicalSystem | None
+) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot if there is one.
 
     Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
-    Raises InvalidInput for columns, joints and numbers of them that do not fit.
+    Raises InvalidInput for columns, joints and numbers of them that do not fit, FileFormatError for missing columns.
     """
+    robot = None if system is None else system.robot
     joints = _joints(mapping, robot)
+    log, order = columns_of(mapping, system, joints)
     guessed: list[str] = []
     found: dict[str, list[LinearExpression]] = {}
     for signal in SIGNALS:
         patterns = getattr(mapping, signal)
-        if patterns is None and joints:
-            patterns = guessed_columns(signal, joints, source)
+        if patterns is None and log[signal]:
+            patterns = guessed_columns(signal, tuple(log[signal]), source)
             if patterns is not None:
                 guessed.append(f"{signal} = {', '.join(patterns)}")
                 found[signal] = [LinearExpression({name: 1.0}) for name in patterns]
         elif patterns is not None:
-            found[signal] = _expressions(patterns, joints, source)
+            found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
-        if signal not in found:
+        if signal not in found and (system is None or log[signal]):
             raise InvalidInput(
                 f"no columns for {signal} ({why}); name them with --{signal}. "
                 f"{source.path} has {_some(source.columns())}"
             )
-    if not joints:
+    if system is None and not joints:
         example = ",".join(f"joint{index + 1}" for index in range(len(found["q"])))
         raise InvalidInput(f"the joints have no names; add `joints`, for example {example}, or `system`.")
     if mapping.time is None and mapping.step is None:
@@ -101,23 +117,44 @@ def signal_plan(mapping: ColumnMapping, source: Source, robot: forcegp.robots.Ro
         time = parse_expression(mapping.time, source.columns(), str(source.path)) if mapping.time is not None else None
     if time is not None and not time.weights:
         raise InvalidInput(f"time is the constant {mapping.time!r}; give a column, or `step` for the time of a row.")
-    order = range(len(joints)) if robot is None else [joints.index(name) for name in robot.joint_names]
-    types = {} if robot is None else {joint.name: joint.type for joint in robot.joints}
-    signals, units = _joint_signals(mapping, found, joints, order, types)
-    names = tuple(joints[index] for index in order)
+    units = _units(mapping, joints) if robot is None else units_for(robot)
+    if robot is None:
+        log = {name: dict(zip(joints, unit_of_each(name, units[name], len(joints)), strict=True)) for name in SIGNALS}
+    turned = {f"{x.name}.{part}" for x in (bases(robot) if robot and mapping.ned else ()) for part in TURNED}
+    signals = tuple(
+        item
+        for name, expressions in found.items()
+        for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
+    )
+    lacking = {name: [x.expression is LACKING for x in signals if x.signal == name] for name in found}
     episode = mapping.episode
     if episode is None and source.suggested_episode in source.columns():
         episode = source.suggested_episode
     if episode is not None:
         source.require([episode])
     time_unit = log_unit("time", mapping.unit["time"][0]) if "time" in mapping.unit else _default_time_unit(time)
-    return SignalPlan(names, units, signals, time, time_unit, mapping.step, episode, tuple(guessed))
+    return SignalPlan(
+        joints=tuple(order["v"]),
+        units=units,
+        signals=signals,
+        layout=layout_of(mapping, system, lacking, len(order["v"])),
+        orientation=mapping.orientation or ORIENTATIONS[0],
+        time=time,
+        time_unit=time_unit,
+        step=mapping.step,
+        episode=episode,
+        guessed=tuple(guessed),
+    )
 
 
 def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple[str, ...]:
+    """Joints of one degree of freedom, in the order of the log."""
+    stated = [name for name in ("orientation", "axes", "ned") if getattr(mapping, name)]
+    if stated and (robot is None or robot.space.is_vector_space):
+        raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     if robot is None:
         return mapping.joints
-    own = tuple(robot.joint_names)
+    own = singles(robot)
     if mapping.joints and sorted(mapping.joints) != sorted(own):
         raise InvalidInput(
             f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
@@ -126,54 +163,95 @@ def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple
     return mapping.joints or own
 
 
-def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source) -> list[LinearExpression]:
+def _expressions(
+    patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool
+) -> list[LinearExpression]:
     names: list[str] = []
+    columns = source.columns()
     for pattern in patterns:
         for text in expanded(pattern, joints):
-            names += [text] if text in source.columns() else source.vectors.get(text, (text,))
-    return [parse_expression(name, source.columns(), str(source.path)) for name in names]
-
-
-def _joint_signals(
-    mapping: ColumnMapping,
-    found: Mapping[str, list[LinearExpression]],
-    joints: Sequence[str],
-    order: Sequence[int],
-    types: Mapping[str, str],
-) -> tuple[tuple[JointSignal, ...], FrozenDict]:
-    """The signals in the order of joints that is asked for, and the units of the Dataset."""
-    given = {name: [log_unit(name, unit) for unit in units] for name, units in mapping.unit.items() if name != "time"}
-    slides = [
-        types[joint] == "prismatic" if types else _slides(given, index, joints) for index, joint in enumerate(joints)
+            names += [text] if text in columns else source.vectors.get(text, (text,))
+    return [
+        LACKING
+        if may_lack and LACKS.fullmatch(name) and name not in columns
+        else parse_expression(name, columns, str(source.path))
+        for name in names
     ]
-    signals: list[JointSignal] = []
-    units: dict[str, Any] = {"time": "s"}
-    for signal in SIGNALS:
-        si = [(TRANSLATION if slide else ROTATION)[signal] for slide in slides]
-        units[signal] = tuple(si[index] for index in order)
-        if signal not in found:
-            continue
-        expressions = found[signal]
-        if len(expressions) == 1 and len(joints) > 1 and not expressions[0].weights:
-            expressions = expressions * len(joints)
-        if len(expressions) != len(joints):
+
+
+def _units(mapping: ColumnMapping, joints: tuple[str, ...]) -> FrozenDict:
+    """Those of joints without a robot: units that are stated decide which of them slide."""
+    given = {name: [log_unit(name, unit) for unit in units] for name, units in mapping.unit.items() if name != "time"}
+    kinds = [TRANSLATION if _slides(given, index, joints) else ROTATION for index in range(len(joints))]
+    return validated_units({name: tuple(kind[name] for kind in kinds) for name in SIGNALS} | {"time": "s"}, joints)
+
+
+def _signals(
+    mapping: ColumnMapping,
+    signal: str,
+    expressions: list[LinearExpression],
+    columns: Mapping[str, str | None],
+    order: Sequence[str],
+    joints: Sequence[str],
+    turned: Collection[str],
+) -> Iterator[JointSignal]:
+    """One signal in the order of the Dataset. `columns`: name and SI unit, in the order of the log.
+
+    `turned` are entries of bases that change sign.
+    """
+    names = list(columns)
+    plain = set(names) <= set(joints)
+    if len(expressions) == 1 and len(names) > 1 and not expressions[0].weights:
+        expressions = expressions * len(names)
+    if len(expressions) != len(names):
+        what = "joints" if plain and names else {"q": "positions", "u": "inputs"}.get(signal, "velocities")
+        remedy = f"name one column per {'joint' if what == 'joints' else 'entry'}."
+        if signal == "q" and not plain:
+            remedy = f"{remedy[:-1]}; `orientation` angles has roll, pitch and yaw instead of a quaternion."
+        elif not names:
+            remedy = (
+                "leave u out, or give actuators: motors of an MJCF file, or a file that MechanicalSystem.to_json wrote "
+                "(`identified`)."
+            )
+        listed = ", ".join(names) or "none"
+        raise InvalidInput(f"{signal} has {len(expressions)} columns for {len(names)} {what} ({listed}); {remedy}")
+    given = [log_unit(signal, name) for name in mapping.unit.get(signal, ())]
+    for name in order:
+        index, si = names.index(name), columns[name]
+        unit = _unit(signal, given, index, columns, by_kind=not plain)
+        if si not in (None, unit.si):
+            kind = "is part of a turn" if si == "1" else "turns" if si in ROTATION.values() else "slides"
             raise InvalidInput(
-                f"{signal} has {len(expressions)} columns for {len(joints)} joints ({', '.join(joints)}); "
-                "name one column per joint."
+                f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}: give a unit of {si}, or one "
+                "per joint."
             )
-        for index in order:
-            unit = _at(f"unit of {signal}", given.get(signal, [log_unit(signal, name) for name in si]), index, joints)
-            if unit.si != si[index]:
-                raise InvalidInput(
-                    f"unit of {signal} of joint {joints[index]!r} is {unit.name}, but the joint "
-                    f"{'slides' if slides[index] else 'turns'}: give a unit of {si[index]}, or one per joint."
-                )
-            sign, scale, offset = (
-                _at(f"{what} of {signal}", getattr(mapping, what).get(signal, (neutral,)), index, joints)
-                for what, neutral in (("sign", 1.0), ("scale", 1.0), ("offset", 0.0))
-            )
-            signals.append(JointSignal(signal, joints[index], expressions[index], unit, sign * scale, offset))
-    return tuple(signals), validated_units(units, [joints[index] for index in order])
+        sign, scale, offset = (
+            _at(f"{what} of {signal}", getattr(mapping, what).get(signal, (neutral,)), index, names)
+            for what, neutral in (("sign", 1.0), ("scale", 1.0), ("offset", 0.0))
+        )
+        if name in turned and signal != "u":
+            sign, offset = -sign, -offset
+        yield JointSignal(signal, name, expressions[index], unit, sign * scale, offset)
+
+
+def _unit(
+    signal: str, given: Sequence[LogUnit], index: int, columns: Mapping[str, str | None], by_kind: bool
+) -> LogUnit:
+    """That of a column: one for all or one for each; of a base that moves or of actuators also one for each kind."""
+    kinds = list(columns.values())
+    if not given:
+        return log_unit(signal, kinds[index] or "1")
+    if len(given) == len(kinds) or not by_kind:
+        return _at(f"unit of {signal}", given, index, list(columns))
+    fitting = [[unit for unit in given if kind in (None, unit.si)] for kind in kinds]
+    idle = [unit.name for unit in given if not any(unit in own for own in fitting)]
+    if idle or any(len(own) > 1 for own in fitting):
+        needed = ", ".join(dict.fromkeys(kind or "the actuators" for kind in kinds))
+        raise InvalidInput(
+            f"unit of {signal} is {', '.join(unit.name for unit in given)}; give at most one of each kind ({needed}), "
+            f"or one for each of the {len(kinds)} columns."
+        )
+    return fitting[index][0] if fitting[index] else log_unit(signal, kinds[index] or "1")
 
 
 def _slides(given: Mapping[str, list[LogUnit]], index: int, joints: Sequence[str]) -> bool:

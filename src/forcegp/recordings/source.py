@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from jaxtyping import Bool
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, ForceGPError, require_known
@@ -80,6 +81,13 @@ class Source(ABC):
     def place(self, row: int) -> str:
         """Where a row stands, for messages: `row 17`, counted from 0."""
         return f"{self.row_word} {row}"
+
+    def paused(self, gap: float | None, steps: float) -> Bool[np.ndarray, " rows"] | None:
+        """Rows of the last reading for which a part of the log was silent: for `gap` seconds, or so many median steps.
+
+        None where rows come whole.
+        """
+        return None
 
     def require(self, names: Sequence[str]) -> None:
         """Raises FileFormatError for a name that is no column."""

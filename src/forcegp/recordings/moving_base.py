@@ -1,0 +1,254 @@
+"""Logs of bases that move: their orientations, velocities and accelerations, turned into those of a Dataset."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from forcegp.data import differentiate
+from forcegp.data.configurations import following, in_base
+from forcegp.data.dataset_fields import ROTATION, TRANSLATION
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.mechanics import MechanicalSystem
+from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping
+from forcegp.recordings.source import Source
+from forcegp.robots import Robot
+from forcegp.robots.layout import WORLD
+from forcegp.robots.manifold import ConfigurationSpace, Group
+
+ANGLES = ("roll", "pitch", "yaw")
+TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
+"""What changes sign by half a turn of world and base about x: north, east, down becomes north, west, up."""
+LARGEST_ERROR = 0.01
+"""Of the length of a quaternion: more is no rounding."""
+ROUNDED = 1e-9
+"""Differences from length 1 beyond this are reported."""
+
+MOST_JUMPS = 1000
+"""That are remembered of one piece: the first one that matters is reported."""
+
+
+def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
+    """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
+    names = list(joints)
+    for group, span in spans(robot.space, orientation):
+        names[span.start : span.start] = [f"{group.name}.{part}" for part in _written(group, orientation)]
+    return tuple(names)
+
+
+def spans(space: ConfigurationSpace, orientation: str) -> Iterator[tuple[Group, slice]]:
+    """Every base and its columns among those of q in a log."""
+    more = 0
+    for group in space.groups:
+        start, size = group.place + more, len(_written(group, orientation))
+        more += size - len(group.motion.positions)
+        yield group, slice(start, start + size)
+
+
+def _written(group: Group, orientation: str) -> tuple[str, ...]:
+    place, turn = group.motion.positions[: group.motion.turn.start], group.motion.positions[group.motion.turn]
+    if orientation == "angles":
+        return place + (ANGLES[2:] if group.kind == "planar" else ANGLES)
+    return place + (turn[-1:] + turn[:-1] if orientation == "wxyz" and group.kind != "planar" else turn)
+
+
+def bases(robot: Robot) -> tuple[Group, ...]:
+    """The joints of several degrees of freedom whose parent is the world: their axes are its."""
+    return tuple(group for group in robot.space.groups if robot.layout.parents[group.body] == WORLD)
+
+
+def singles(robot: Robot) -> tuple[str, ...]:
+    """Joints of one degree of freedom."""
+    of_bases = {row for group in robot.space.groups for row in range(group.rows.start, group.rows.stop)}
+    return tuple(name for row, name in enumerate(robot.joint_names) if row not in of_bases)
+
+
+def columns_of(
+    mapping: ColumnMapping, system: MechanicalSystem | None, joints: tuple[str, ...]
+) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
+    """By signal: name and SI unit of its columns in the order of the log, and names in the order of the Dataset.
+
+    Unit None: whatever the actuator takes.
+    """
+    if system is None:
+        return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
+    robot, own = system.robot, singles(system.robot)
+    kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
+    of_log = dict(zip(own, joints, strict=True))
+    driven = tuple(system.actuation.names) == own
+    switches = system.inputs[len(system.actuators) :]
+
+    def unit(signal: str, name: str) -> str | None:
+        if signal == "u" and not (driven and name in own):
+            return "1" if name in switches else None
+        return kinds[name][signal] if name in kinds else "rad" if name.endswith(ANGLES) else "1"
+
+    written = mapping.orientation or ORIENTATIONS[0]
+    velocities = tuple(of_log.get(name, name) for name in robot.joint_names)
+    inputs = tuple(of_log.get(name, name) if driven else name for name in system.inputs)
+    log = {"q": position_columns(robot, joints, written), "v": velocities, "u": inputs, "a": velocities}
+    stored = position_columns(robot, own, "angles" if written == "angles" else ORIENTATIONS[0])
+    order = {"q": stored, "v": robot.joint_names, "u": system.inputs, "a": robot.joint_names}
+    return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
+
+
+class Poses:
+    """Positions as the log writes them, piece by piece, as q: turns of length 1, quaternions whose sign never jumps.
+
+    `jumps` are rows before which a base turns by more than a quarter of a turn, what was seen, and what to do; `worst`
+    is the largest difference of a length from 1.
+    """
+
+    def __init__(self, space: ConfigurationSpace, orientation: str, source: Source) -> None:
+        self.space, self.orientation, self.source = space, orientation, source
+        self.last: dict[str, np.ndarray] = {}
+        self.jumps: list[tuple[int, str, str]] = []
+        self.worst = 0.0
+
+    def read(
+        self, table: Float[np.ndarray, "rows columns"], rows: int, restarts: Sequence[int]
+    ) -> Float[np.ndarray, "rows nq"]:
+        """q of a piece that follows `rows` others; rows in `restarts` begin another episode.
+
+        Raises DatasetError, naming the row, where a turn is more than 1 % longer or shorter than 1.
+        """
+        turned = list(spans(self.space, self.orientation))
+        q = np.delete(table, [column for _, span in turned for column in range(span.start, span.stop)], axis=1)
+        for group, span in turned:
+            pose = self._pose(group, table[:, span], rows, restarts)
+            q = np.hstack([q[:, : group.place], pose, q[:, group.place :]])
+        return q
+
+    def note(self) -> tuple[str, ...]:
+        """That orientations were divided by their length, if more than rounding."""
+        many = self.worst > ROUNDED
+        return (f"orientations divided by their length, which differs from 1 by up to {self.worst:.2g}",) * many
+
+    def _pose(self, group: Group, given: np.ndarray, rows: int, restarts: Sequence[int]) -> np.ndarray:
+        first = group.motion.turn.start
+        if self.orientation == "angles" and group.kind == "planar":
+            turn = np.hstack([np.cos(given[:, first:]), np.sin(given[:, first:])])
+        elif self.orientation == "angles":
+            turn = np.array(Rotation.from_euler("xyz", given[:, first:]).as_quat())
+        else:
+            turn = self._unit(group, given[:, first:], rows)
+        last = self.last[group.name] if group.name in self.last else turn[0]
+        turn, jumped = following(group, turn, last)
+        self.last[group.name] = turn[-1].copy()
+        jumped[list(restarts)] = False
+        seen = f"{group.name!r} turns by more than a quarter of a turn"
+        remedy = (
+            "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
+        )
+        self.jumps += [(rows + int(row), seen, remedy) for row in np.flatnonzero(jumped)[:MOST_JUMPS]]
+        return np.hstack([given[:, :first], turn])
+
+    def _unit(self, group: Group, turn: np.ndarray, rows: int) -> np.ndarray:
+        length = np.linalg.norm(turn, axis=1)
+        error = np.abs(length - 1.0)
+        if (error > LARGEST_ERROR).any():
+            row = int(np.argmax(error > LARGEST_ERROR))
+            names = ", ".join(group.motion.positions[group.motion.turn])
+            raise DatasetError(
+                f"{self.source.path}: the orientation of {group.name!r} ({names}) has the length {length[row]:.4g} at "
+                f"{self.source.place(rows + row)}; a turn has length 1. Map its columns, give `orientation` angles if "
+                "they are roll, pitch and yaw, or repair or remove these rows."
+            )
+        self.worst = max(self.worst, float(error.max(initial=0.0)))
+        return turn / length[:, None]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the signals stand in the spool, and what is left to do about those of a base.
+
+    Fields
+    ------
+    places: columns of each signal that was logged; q as a Dataset has it.
+    space: of the positions.
+    bases: joints of several degrees of freedom whose parent is the world.
+    axes: of v and a, those of the linear and of the angular part.
+    gravity: (3,) [m/s^2], for accelerometers.
+    derived: entries of v and a that the log lacks.
+    held: columns of the spool that hold from row to row.
+    """
+
+    places: Mapping[str, slice]
+    space: ConfigurationSpace
+    bases: tuple[Group, ...] = ()
+    axes: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
+    derived: Mapping[str, list[int]] = field(default_factory=dict)
+    held: tuple[int, ...] = ()
+
+    @property
+    def width(self) -> int:
+        """Columns of the spool."""
+        return max(place.stop for place in self.places.values())
+
+    def signals(self, table: np.ndarray, time: Float[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
+        """q, v, u and a of rows of the spool, with differences (second order) for what was not logged."""
+        found = {name: table[:, place] for name, place in self.places.items()}
+        if not self.space.is_vector_space:  # a spline through quaternions does not end on the sphere
+            found["q"] = self.space.normalized(torch.tensor(found["q"])).numpy()
+        for name, source in (("v", "q"), ("a", "v")):
+            lacking = self.derived.get(name, [])
+            if name in found:
+                found[name] = self._in_body(name, found[name], found["q"], found["v"])
+            if name not in found or lacking:
+                made = differentiate(found[source], time, self.space if name == "v" else None)
+                own = np.isin(np.arange(self.space.nv), lacking) | (not lacking)
+                found[name] = np.where(own, made, found.get(name, made))
+        return found
+
+    def _in_body(self, signal: str, values: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """v or a (rows, nv) as a Dataset has them; `v` in body axes where a is asked for."""
+        if signal not in self.axes:
+            return values
+        found, moving, at = (torch.tensor(x) for x in (values, v, q))
+        more = {"gravity": torch.tensor(self.gravity, dtype=torch.float64)} if signal == "a" else {}
+        for group in self.bases:
+            own = {**more, "v": moving[:, group.rows]} if more else {}
+            found[:, group.rows] = in_base(group, at[:, group.places], found[:, group.rows], self.axes[signal], **own)
+        return found.numpy()
+
+
+def layout_of(
+    mapping: ColumnMapping,
+    system: MechanicalSystem | None,
+    lacking: Mapping[str, Sequence[bool]],
+    nv: int,
+) -> Layout:
+    """Where everything stands once positions are those of a Dataset.
+
+    `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
+    there where their axes turn.
+    """
+    groups = () if system is None else bases(system.robot)
+    sizes = dict.fromkeys(SIGNALS, nv)
+    if system is not None:
+        sizes |= {"q": system.robot.nq, "u": len(system.inputs)}
+    places, end = dict[str, slice](), 0
+    for name in SIGNALS:
+        if sizes[name] == 0 or name in lacking:
+            places[name] = slice(end, end + sizes[name])
+            end += sizes[name]
+    derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
+    axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
+    for name in axes.keys() - lacking.keys():
+        raise InvalidInput(
+            f"axes of {name} are stated, but the log has no {name}; name its columns, or leave axes out."
+        )
+    for name, group in ((name, group) for name in axes for group in groups):
+        for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
+            rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
+            if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
+                raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
+    if system is None:
+        return Layout(places, ConfigurationSpace(nv), derived=derived)
+    switches = range(places["u"].start + len(system.actuators), places["u"].stop)
+    gravity = tuple(system.robot.gravity.tolist())
+    return Layout(places, system.robot.space, groups, axes, gravity, derived, tuple(switches))
