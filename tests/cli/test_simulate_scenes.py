@@ -36,6 +36,12 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     assert done.returncode == 0, done.stderr
     scored = forcegp("evaluate", "run", "log.h5", "--json", folder=tmp_path)
     assert scored.returncode == 0, scored.stderr
+    found = forcegp("prepare", "log.h5", "--stance", "auto", "--out", "found.h5", folder=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert "front_left_stands 100%" in found.stdout
+    flags = Dataset.load(tmp_path / "found.h5").u[:, 12:]
+    assert len(flags) > 200
+    assert (flags == 1.0).all()
 
 
 @SURFACES

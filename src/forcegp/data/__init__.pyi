@@ -23,4 +23,5 @@ from .spectrum import (
 from .windows import (
     WeakForm as WeakForm, Windows as Windows,
 )
+from .stance import Stance as Stance, estimate_stance as estimate_stance
 from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag
