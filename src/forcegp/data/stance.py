@@ -54,8 +54,8 @@ class Stance:
     def written(self, dataset: Dataset) -> Dataset:
         """The rows that are decided, with these flags in the last columns of u. Raises DatasetError where none is."""
         u = np.concatenate([dataset.u[:, : -len(self.names)], self.flags], axis=1)
-        decided = np.isfinite(u).all(axis=1)
-        if not decided.any():
+        decided = np.flatnonzero(np.isfinite(u).all(axis=1))
+        if not len(decided):
             raise DatasetError(
                 f"motion and forces leave the stance open in all {len(u)} rows; give the flags "
                 f"{', '.join(self.names)} in the last columns of u, or filter the velocities first."

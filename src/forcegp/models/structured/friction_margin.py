@@ -1,0 +1,183 @@
+"""How far feet and tools are from slipping: the margin to the friction cone, with the uncertainty of the forces.
+
+With the force F on the robot at a foot, its part N along the normal and T across it, a foot holds while
+
+    margin = mu N - |T| >= 0    (Coulomb).
+
+The posterior makes F normal with a full covariance, F = F_0 + D z with independent z. P(slip) is one integral along
+the z that changes the margin most, where the cone cuts every line in one piece, and a trapezoidal sum over the
+other two. Mean and variance are sums over T, given which N is normal.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import ContactError, InvalidInput, usable_arguments
+from forcegp.mechanics import ConstrainedDynamics, Held, LoopClosure, surface_axes
+from forcegp.models.prediction import Gaussian
+from forcegp.models.protocol import Array, Posterior
+from forcegp.models.structured.components import term_slices
+from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.priors.contact_friction import ContactFriction
+from forcegp.robots.arguments import finite_vector
+
+NODES, WIDEST = 41, 5.5
+"""Nodes of the trapezoidal rule, which is nearly exact for smooth functions, and standard deviations that they span."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionMargins:
+    """Margins to slipping (..., feet) of the feet called `names`, in N; NaN where a foot does not stand.
+
+    `mean` and `std` of mu N - |T|; `slip` the probability that it is negative; `force` (..., 3) is that on the foot
+    along two tangents and the normal, by foot.
+    """
+
+    names: tuple[str, ...]
+    coefficient: tuple[float, ...]
+    mean: Float[Tensor, "*batch feet"]
+    std: Float[Tensor, "*batch feet"]
+    slip: Float[Tensor, "*batch feet"]
+    force: Mapping[str, Gaussian]
+
+
+@usable_arguments("friction_margins")
+def friction_margins(
+    posterior: Posterior,
+    q: Array,
+    v: Array,
+    u: Array,
+    coefficient: float | Sequence[float],
+    normal: Sequence[float] = (0.0, 0.0, 1.0),
+) -> FrictionMargins:
+    """Margins of all feet at states as for `predict`: contacts of one link that act together are one foot.
+
+    `coefficient` is the friction coefficient mu of the ground, one or one per foot; `normal` its normal at points that
+    are held, world axes (surfaces have their own). Friction that a `ContactFriction` of the prior adds at a contact
+    counts to its force. Raises ContactError without contacts with the world, InvalidInput for models without forces,
+    and for coefficients that are negative or not one per foot.
+    """
+    if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
+        raise InvalidInput(f"{posterior.description} predicts no contact forces; fit one with an analytical mean.")
+    contacts = posterior.system.contacts
+    feet: dict[tuple[str, str | None], list[int]] = {}
+    for index, contact in enumerate(contacts):
+        if not isinstance(contact, LoopClosure):
+            feet.setdefault((contact.frame, contact.switch), []).append(index)
+    if not feet:
+        raise ContactError("the system has no contact with the world, so nothing can slip; list its contacts.")
+    try:
+        given = np.broadcast_to(np.asarray(coefficient, dtype=float), (len(feet),))
+    except (TypeError, ValueError):
+        given = np.array([np.nan])
+    if not (np.isfinite(given) & (given >= 0.0)).all():
+        raise InvalidInput(
+            f"the friction coefficient is {coefficient!r}; give a number of at least 0, or {len(feet)} of them, for "
+            f"{', '.join(frame for frame, _ in feet)}."
+        )
+    states, batch = posterior.checked_states(q, v, u)
+    with torch.no_grad():
+        dynamics = posterior.dynamics(*(x.reshape(*batch, -1) for x in states))
+        forces = _forces(posterior, dynamics, feet.values(), finite_vector("normal", normal, 3, " x, y, z"))
+        moments = [margin_moments(force, float(mu)) for force, mu in zip(forces, given, strict=True)]
+        stands = torch.stack([_acts(dynamics, rows[0]) for rows in feet.values()], dim=-1)
+        mean, std, slip = (torch.stack(part, -1).masked_fill(~stands, torch.nan) for part in zip(*moments, strict=True))
+    names = tuple(frame for frame, _ in feet)
+    return FrictionMargins(names, tuple(given.tolist()), mean, std, slip, dict(zip(names, forces, strict=True)))
+
+
+def margin_moments(force: Gaussian, mu: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and standard deviation of mu N - |T|, and P(mu N < |T|), of forces (..., 3) along T_1, T_2 and N."""
+    assert force.covariance is not None, "margins need the covariance"
+    grid, weight = _nodes(force.mean)
+    across, along = force.covariance[..., :2, :2], force.covariance[..., 2, :2]
+    root, inverse = _root(across)
+    slope = (inverse @ along[..., None])[..., 0]
+    rest = (force.covariance[..., 2, 2] - slope.square().sum(-1)).clamp_min(0.0)
+    T = (force.mean[..., None, :2] + grid @ root.mT).norm(dim=-1)
+    margin = mu * (force.mean[..., 2, None] + (grid @ slope[..., None])[..., 0]) - T
+    mean = margin @ weight
+    variance = (margin - mean[..., None]).square() @ weight + mu**2 * rest
+    return mean, variance.sqrt(), 1.0 - _inside(force, mu)
+
+
+def _inside(force: Gaussian, mu: float) -> Float[Tensor, "*batch"]:
+    """P(mu N >= |T|)."""
+    grid, weight = _nodes(force.mean)
+    assert force.covariance is not None, "margins need the covariance"
+    root = _root(force.covariance)[0]
+    size = force.mean[..., :2].norm(dim=-1, keepdim=True)
+    gradient = torch.cat([-force.mean[..., :2] / size.clamp_min(1e-300), torch.full_like(size, mu)], -1)
+    first = torch.zeros_like(gradient)
+    first[..., 0] = 1.0
+    towards = (root.mT @ gradient[..., None])[..., 0]
+    length = towards.norm(dim=-1, keepdim=True)
+    mirror = torch.where(length > 0.0, towards / length.clamp_min(1e-300), first) - first
+    mirror = mirror / mirror.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+    root = root - 2.0 * (root @ mirror[..., None]) @ mirror[..., None, :]  # Householder: z_1 changes the margin most
+    d = root[..., None, :, 0]
+    p = force.mean[..., None, :] + grid @ root[..., 1:].mT
+    scale = torch.tensor([-1.0, -1.0, mu**2]).to(p)
+    A, B, C = (d * d * scale).sum(-1), (p * d * scale).sum(-1), (p * p * scale).sum(-1)  # A z^2 + 2 B z + C >= 0
+    A = A.expand_as(C)
+    disc = (B.square() - A * C).clamp_min(0.0).sqrt()
+    far = -(B + torch.where(B < 0.0, -disc, disc))  # without cancellation
+    roots = torch.stack([far / A, C / far], -1).nan_to_num(torch.inf, torch.inf, -torch.inf).sort(-1).values
+    low, high = roots.unbind(-1)
+    crossing = B.square() > A * C
+    middle = p[..., 2] + d[..., 2] * torch.where(crossing, 0.5 * (low + high), torch.zeros_like(low))
+    rises = d[..., 2].expand_as(C) > 0.0
+    beyond = torch.where(rises, torch.special.ndtr(-high), torch.special.ndtr(low))  # the ray in the upper cone
+    within = torch.where(crossing & (middle >= 0.0), torch.special.ndtr(high) - torch.special.ndtr(low), 0.0)
+    still = ((C >= 0.0) & (p[..., 2] >= 0.0)).to(C)
+    fixed = (d.abs().amax(-1) <= 1e-12 * (1.0 + p.abs().amax(-1))).expand_as(C)
+    return torch.where(fixed, still, torch.where(A > 0.0, beyond, within)) @ weight
+
+
+def _nodes(like: Tensor) -> tuple[Tensor, Tensor]:
+    """Nodes (n, 2) and weights of two independent standard normal numbers."""
+    points = torch.linspace(-WIDEST, WIDEST, NODES).to(like)
+    weights = (-0.5 * points.square()).exp()
+    return torch.cartesian_prod(points, points), torch.outer(weights, weights).flatten() / weights.sum() ** 2
+
+
+def _root(covariance: Float[Tensor, "*batch k k"]) -> tuple[Tensor, Tensor]:
+    """R with R R^T = covariance, and its pseudo-inverse."""
+    values, vectors = torch.linalg.eigh(covariance)
+    sizes = values.clamp_min(0.0).sqrt()[..., None, :]
+    inverse = torch.where(sizes > 1e-8 * sizes.amax(-1, keepdim=True), 1.0 / sizes.clamp_min(1e-300), 0.0)
+    return vectors * sizes, (vectors * inverse).mT
+
+
+def _forces(
+    posterior: StructuredPosterior, dynamics: ConstrainedDynamics, feet: Collection[list[int]], normal: Tensor
+) -> list[Gaussian]:
+    """Force (..., 3) on every foot along t1, t2 and n, friction of the prior at its contacts included."""
+    prior, system = posterior.model.prior, posterior.system
+    affine = dynamics.contact_force_map()
+    offset = affine.offset.unflatten(-1, (-1, 3))  # (..., m, 3)
+    effect = (affine.matrix @ prior.mixing(dynamics)).unflatten(-2, (-1, 3))  # (..., m, 3, C)
+    for _, term, which in term_slices(prior, system.robot):
+        if isinstance(term, ContactFriction) and term.contact < len(system.contacts):
+            point = term.point_force(dynamics)
+            effect = effect.clone()
+            effect[..., term.contact, :, which] += point
+    latents, forces = posterior.latents(dynamics, True), []
+    for rows in feet:
+        gradient = dynamics.normals[..., rows[0], :]
+        if isinstance(system.contacts[rows[0]].surface, Held):
+            gradient = normal.to(gradient).expand_as(gradient)
+        turn = surface_axes(gradient).mT
+        known = (turn @ offset[..., rows, :].sum(-2)[..., None])[..., 0]
+        forces.append(latents.through(turn @ effect[..., rows, :, :].sum(-3), known))
+    return forces
+
+
+def _acts(dynamics: ConstrainedDynamics, contact: int) -> Tensor:
+    """Whether a contact acts at every state: one that does not has a row of zeros."""
+    return dynamics.A[..., contact, :].abs().amax(-1) > 0.0
