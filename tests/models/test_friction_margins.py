@@ -106,11 +106,10 @@ def test_friction_of_the_prior_counts_and_surfaces_have_their_normals(log):
     posterior = StructuredGP(system, foot_friction((0,))).fit(data, points=6, restarts=1)
     found = friction_margins(posterior, data.q, data.v, data.u, 0.5)
     parts = posterior.components(data.q, data.v, data.u)
-    torch.testing.assert_close(
-        found.force["front_left_foot"].mean[:, 2], parts.multiplier.mean[:, 0], rtol=1e-9, atol=1e-9
-    )
+    force = found.force["front_left_foot"].mean
+    torch.testing.assert_close(force[:, 2], parts.multiplier.mean[:, 0], rtol=1e-9, atol=1e-9)
     friction = next(iter(parts.values())).point_force.mean
-    across = found.force["front_left_foot"].mean[:, :2].norm(dim=-1)
+    across = force[:, :2].norm(dim=-1)
     torch.testing.assert_close(across, friction.norm(dim=-1), rtol=1e-6, atol=1e-9)
     assert float(across.max()) > 0.0
 

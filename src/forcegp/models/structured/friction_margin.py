@@ -24,7 +24,6 @@ from forcegp.models.protocol import Array, Posterior
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.priors.contact_friction import ContactFriction
-from forcegp.robots.arguments import finite_vector
 
 NODES, WIDEST = 41, 5.5
 """Nodes of the trapezoidal rule, which is nearly exact for smooth functions, and standard deviations that they span."""
@@ -53,7 +52,7 @@ def friction_margins(
     v: Array,
     u: Array,
     coefficient: float | Sequence[float],
-    normal: Sequence[float] = (0.0, 0.0, 1.0),
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> FrictionMargins:
     """Margins of all feet at states as for `predict`: contacts of one link that act together are one foot.
 
@@ -83,7 +82,7 @@ def friction_margins(
     states, batch = posterior.checked_states(q, v, u)
     with torch.no_grad():
         dynamics = posterior.dynamics(*(x.reshape(*batch, -1) for x in states))
-        forces = _forces(posterior, dynamics, feet.values(), finite_vector("normal", normal, 3, " x, y, z"))
+        forces = _forces(posterior, dynamics, feet.values(), torch.tensor(Held(normal).normal))
         moments = [margin_moments(force, float(mu)) for force, mu in zip(forces, given, strict=True)]
         stands = torch.stack([_acts(dynamics, rows[0]) for rows in feet.values()], dim=-1)
         mean, std, slip = (torch.stack(part, -1).masked_fill(~stands, torch.nan) for part in zip(*moments, strict=True))
