@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import ContactError, InvalidInput, usable_arguments
-from forcegp.mechanics import ConstrainedDynamics, Held, LoopClosure, surface_axes
+from forcegp.mechanics import ConstrainedDynamics, Held, LoopClosure, RollingContact, surface_axes
 from forcegp.models.prediction import Gaussian
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.structured.components import term_slices
@@ -169,7 +169,8 @@ def _forces(
     latents, forces = posterior.latents(dynamics, True), []
     for rows in feet:
         gradient = dynamics.normals[..., rows[0], :]
-        if isinstance(system.contacts[rows[0]].surface, Held):
+        first = system.contacts[rows[0]]  # of a wheel, that along its normal
+        if isinstance(first.surface, Held) and not isinstance(first, RollingContact):
             gradient = normal.to(gradient).expand_as(gradient)
         turn = surface_axes(gradient).mT
         known = (turn @ offset[..., rows, :].sum(-2)[..., None])[..., 0]
