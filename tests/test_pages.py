@@ -31,8 +31,9 @@ def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
 
 def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "moving-bases.md").read_text(encoding="utf-8")
-    example, poses = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert run_example(poses, tmp_path).split() == ["True", "True"]
+    example, poses, wheels = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for part in (poses, wheels):
+        assert run_example(part, tmp_path).split() == ["True", "True"]
     sizes, step, inputs, force = run_example(example, tmp_path).splitlines()
     assert sizes.startswith("8 7 ('base.x', ")
     assert [round(float(x), 6) for x in re.findall(r"-?\d\.\d+(?:e-\d+)?", step)] == [0.1, 0, 0, 0, 0, 0.3, 0.2]

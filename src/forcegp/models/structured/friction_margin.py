@@ -179,5 +179,5 @@ def _forces(
 
 
 def _acts(dynamics: ConstrainedDynamics, contact: int) -> Tensor:
-    """Whether a contact acts at every state: one that does not has a row of zeros."""
-    return dynamics.A[..., contact, :].abs().amax(-1) > 0.0
+    """Whether a contact acts at every state: one that does not, or that a plane base holds, has a row of zeros."""
+    return dynamics.A[..., contact, :].abs().amax(-1) > 1e-9
