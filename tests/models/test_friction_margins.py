@@ -62,12 +62,12 @@ def dog(log):
 
 def test_margins_of_feet_are_those_of_the_true_forces(dog, log):
     rows = log.rows(slice(0, 600, 10))
-    found = friction_margins(dog, rows.q, rows.v, rows.u, [0.6, 0.6, 0.6, 0.5])
+    found = friction_margins(dog, rows.q, rows.v, rows.u, 0.6)
     true = rows.truth["lambda"].reshape(len(rows), 4, 3)
     stands = rows.u[:, -4:] > 0.5
     assert found.names == tuple(f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right"))
     assert not stands.all()
-    margin = np.array([0.6, 0.6, 0.6, 0.5]) * true[..., 2] - np.linalg.norm(true[..., :2], axis=-1)
+    margin = 0.6 * true[..., 2] - np.linalg.norm(true[..., :2], axis=-1)
     errors = (found.mean.numpy() - margin)[stands] / found.std.numpy()[stands]
     assert (np.abs(errors) < 4.0).mean() > 0.9
     assert np.isnan(found.slip.numpy()[~stands]).all()
@@ -114,8 +114,8 @@ def test_friction_of_the_prior_counts_and_surfaces_have_their_normals(log):
 
 def test_what_margins_need_is_named(dog, log):
     row = (log.q[:1], log.v[:1], log.u[:1])
-    for wrong in (-0.1, [0.5, 0.5], "ice", float("nan")):
-        with pytest.raises(InvalidInput, match=r"give a number of at least 0, or 4 of them, for front_left_foot"):
+    for wrong in (-0.1, "ice", float("nan")):
+        with pytest.raises(InvalidInput, match="give a number of at least 0"):
             friction_margins(dog, *row, wrong)
     with pytest.raises(ContactError, match="nothing can slip"):
         friction_margins(dog.with_contacts([]), log.q[:1], log.v[:1], log.u[:1, :12], 0.5)

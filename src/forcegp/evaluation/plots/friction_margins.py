@@ -1,6 +1,5 @@
 """How far feet are from slipping in the rows of a Dataset: numbers, and a plot over time."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,7 @@ from forcegp.models.protocol import Posterior
 from forcegp.models.structured.friction_margin import friction_margins
 
 
-def slip_scores(
-    posterior: Posterior, dataset: Dataset, coefficient: float | Sequence[float]
-) -> dict[str, dict[str, float]]:
+def slip_scores(posterior: Posterior, dataset: Dataset, coefficient: float) -> dict[str, dict[str, float]]:
     """Of every foot: its least margin [N] with standard deviation and row, and how likely it slips.
 
     "slipping" is the share of the rows in which it stands where P(slip) > 1/2, "expected" the mean of P(slip) over
@@ -39,7 +36,7 @@ def slip_scores(
 def friction_margins_figure(
     posterior: Posterior,
     dataset: Dataset,
-    coefficient: float | Sequence[float],
+    coefficient: float,
     *,
     start: float = 0.0,
     seconds: float = 4.0,
@@ -55,13 +52,12 @@ def friction_margins_figure(
         style.draw_line(axes, rows.time, mean[:, foot], style.PREDICTION, 1.3, "margin to slipping")
         axes.margins(x=0)
         style.quiet(axes, title=names[foot], x="time [s]" if foot == len(names) - 1 else "", y="margin [N]")
-    mu = f"{coefficient:g}" if isinstance(coefficient, int | float) else ", ".join(f"{each:g}" for each in coefficient)
-    style.legend_above(figure, f"Friction coefficient {mu}", grid[0])
+    style.legend_above(figure, f"Friction coefficient {coefficient:g}", grid[0])
     return figure
 
 
 def _margins(
-    posterior: Posterior, dataset: Dataset, coefficient: float | Sequence[float]
+    posterior: Posterior, dataset: Dataset, coefficient: float
 ) -> tuple[tuple[str, ...], list[Float[np.ndarray, "rows feet"]]]:
     """Names of the feet; mean, standard deviation and probability of slip in every row."""
     blocks = in_blocks(

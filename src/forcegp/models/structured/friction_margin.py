@@ -4,14 +4,14 @@ With the force F on the robot at a foot, its part N along the normal and T acros
 
     margin = mu N - |T| >= 0    (Coulomb).
 
-The posterior makes F normal with a full covariance. |T| is not, so moments and P(margin < 0) are those of `POINTS` draws
-of F at low-discrepancy points (Sobol, scrambled), the same for all states.
+The posterior makes F normal with a full covariance. |T| is not, so moments and P(margin < 0) are those of `POINTS`
+draws of F at low-discrepancy points (Sobol, scrambled), the same for all states.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -37,7 +37,6 @@ class FrictionMargins:
     """
 
     names: tuple[str, ...]
-    coefficient: tuple[float, ...]
     mean: Float[Tensor, "*batch feet"]
     std: Float[Tensor, "*batch feet"]
     slip: Float[Tensor, "*batch feet"]
@@ -50,15 +49,14 @@ def friction_margins(
     q: Array,
     v: Array,
     u: Array,
-    coefficient: float | Sequence[float],
+    coefficient: float,
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> FrictionMargins:
     """Margins of all feet at states as for `predict`: contacts of one link that act together are one foot.
 
-    `coefficient` is the friction coefficient mu of the ground, one or one per foot; `normal` its normal at points that
-    are held, world axes (surfaces have their own). Friction that a `ContactFriction` of the prior adds at a contact
-    counts to its force. Raises ContactError without contacts with the world, InvalidInput for models without forces,
-    and for coefficients that are negative or not one per foot.
+    `coefficient` is the friction coefficient mu of the ground; `normal` its normal at points that are held, world axes
+    (surfaces have their own). Friction that a `ContactFriction` of the prior adds at a contact counts to its force.
+    Raises ContactError without contacts with the world, InvalidInput for models without forces and a negative mu.
     """
     if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
         raise InvalidInput(f"{posterior.description} predicts no contact forces; fit one with an analytical mean.")
@@ -69,24 +67,17 @@ def friction_margins(
             feet.setdefault((contact.frame, contact.switch), []).append(index)
     if not feet:
         raise ContactError("the system has no contact with the world, so nothing can slip; list its contacts.")
-    try:
-        given = np.broadcast_to(np.asarray(coefficient, dtype=float), (len(feet),))
-    except (TypeError, ValueError):
-        given = np.array([np.nan])
-    if not (np.isfinite(given) & (given >= 0.0)).all():
-        raise InvalidInput(
-            f"the friction coefficient is {coefficient!r}; give a number of at least 0, or {len(feet)} of them, for "
-            f"{', '.join(frame for frame, _ in feet)}."
-        )
+    if isinstance(coefficient, bool) or not isinstance(coefficient, int | float) or not 0.0 <= coefficient < math.inf:
+        raise InvalidInput(f"the friction coefficient is {coefficient!r}; give a number of at least 0.")
     states, batch = posterior.checked_states(q, v, u)
     with torch.no_grad():
         dynamics = posterior.dynamics(*(x.reshape(*batch, -1) for x in states))
         forces = _forces(posterior, dynamics, feet.values(), torch.tensor(Held(normal).normal))
-        moments = [margin_moments(force, float(mu)) for force, mu in zip(forces, given, strict=True)]
+        moments = [margin_moments(force, coefficient) for force in forces]
         stands = torch.stack([_acts(dynamics, rows[0]) for rows in feet.values()], dim=-1)
         mean, std, slip = (torch.stack(part, -1).masked_fill(~stands, torch.nan) for part in zip(*moments, strict=True))
     names = tuple(frame for frame, _ in feet)
-    return FrictionMargins(names, tuple(given.tolist()), mean, std, slip, dict(zip(names, forces, strict=True)))
+    return FrictionMargins(names, mean, std, slip, dict(zip(names, forces, strict=True)))
 
 
 def margin_moments(force: Gaussian, mu: float) -> tuple[Tensor, Tensor, Tensor]:
