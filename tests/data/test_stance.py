@@ -29,10 +29,10 @@ def test_flags_are_those_of_the_simulation(seed, noise):
     found = estimate_stance(log)
     decided = np.isfinite(found.flags)
     assert found.names == log.system.inputs[SWITCHES]
-    assert (found.flags == flags)[decided].mean() > 0.998
-    assert decided.all(axis=1).mean() > 0.94
+    assert (found.flags == flags)[decided].all()
+    assert decided.all(axis=1).mean() > 0.85
     swing = flags == 0.0
-    assert (found.flags[swing] == 0.0).mean() > 0.9
+    assert (found.flags[swing] == 0.0).mean() > 0.8
 
 
 def test_what_noise_hides_stays_open():

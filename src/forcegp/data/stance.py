@@ -21,7 +21,8 @@ from forcegp.data.contact_residual import tensors
 from forcegp.data.dataset import Dataset
 from forcegp.errors import ContactError, DatasetError
 
-WINDOW, OPEN = 0.04, 0.1  # s: of the averages, and of open rows that follow those around them
+WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
+"""s: of the averages; of open rows that follow those around them; and on either side of what is not sure, such as a change."""
 SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
 """m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves."""
 FREE, LEAST, BEARS = 0.99, 0.02, 0.4
@@ -68,8 +69,8 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
 
     1. What clearly moves is free if it does not bear.
     2. What rests stands if it bears, and is free if it bears nothing. Without forces, rest is stance.
-    3. Up to 0.1 s in between follow the decided rows around them where both agree. All else is open (NaN), also where
-       something clearly moves and bears.
+    3. Up to 0.1 s in between follow the decided rows around them where both agree. All else is open (NaN), with 30 ms
+       on either side and on those of a change, and where something clearly moves and bears.
 
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
@@ -154,7 +155,7 @@ def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[n
 
 
 def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
-    """Open rows with what was decided before and after them, where that is the same."""
+    """Open rows with what was decided before and after them, where that is the same; what is near the others is open."""
     rows = np.arange(len(flags))
     filled = flags.copy()
     for own, out in zip(flags.T, filled.T, strict=True):
@@ -164,4 +165,10 @@ def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
             before = decided[np.maximum(np.searchsorted(decided, rows, side="right") - 1, 0)]
             same = (own[before] == own[after]) & (time[after] - time[before] <= OPEN)
             out[same] = own[before[same]]
+        unsure = np.isnan(out)
+        unsure[:-1] |= np.diff(out) != 0.0
+        if unsure.any():
+            at = time[unsure]
+            near = np.searchsorted(at, time).clip(1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), int)
+            out[np.minimum(np.abs(time - at[near - 1]), np.abs(time - at[near])) <= EDGE] = np.nan
     return filled
