@@ -22,7 +22,7 @@ from forcegp.data.dataset import Dataset
 from forcegp.errors import ContactError, DatasetError
 
 WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
-"""s: of the averages; of open rows that follow those around them; and on either side of what is not sure, such as a change."""
+"""s: of the averages; of open rows that follow those around them; on either side of what is not sure."""
 SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
 """m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves."""
 FREE, LEAST, BEARS = 0.99, 0.02, 0.4
@@ -155,7 +155,7 @@ def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[n
 
 
 def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
-    """Open rows with what was decided before and after them, where that is the same; what is near the others is open."""
+    """Open rows with what was decided before and after them, where that is the same; rows near others are open."""
     rows = np.arange(len(flags))
     filled = flags.copy()
     for own, out in zip(flags.T, filled.T, strict=True):
