@@ -21,9 +21,9 @@ from forcegp.mechanics.known_forces import (
     known_force_to_dict,
 )
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
-from forcegp.mechanics.rolling import WHEEL, RollingContact
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import ObservedWrench, Thrusters
+from forcegp.mechanics.wheels import WHEEL, RollingContact
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
 from forcegp.robots.mjcf import is_mjcf
