@@ -11,8 +11,8 @@ from forcegp.errors import ContactError
 from forcegp.mechanics import MechanicalSystem
 
 MOST_ROWS = 4000
-FEW, MANY = 0.05, 0.2
-"""Shares of rows that may contradict flags of stance, those at touch-down and lift-off, and flags of swing."""
+FEW, RARE, RESTING = 0.05, 0.002, 0.02
+"""Shares of rows of stance that the motion contradicts and that are wrong, or worth a look; the same of swing."""
 
 
 def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
@@ -42,22 +42,22 @@ def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Find
                 remedy="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
                 numbers={"rows": odd},
             )
-        lifted, resting = stands & (shown == 0.0), ~stands & (shown == 1.0)
+        lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), ~stands & (shown == 1.0)
         sliding, rests = (float(x.sum() / max(y.sum(), 1)) for x, y in ((lifted, stands), (resting, ~stands)))
         numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "resting while free": rests}
         numbers |= {"limit": float(found.slow[k]), "open": float(np.isnan(shown).mean())}
-        if sliding > FEW:
+        if sliding > RARE:
             worst = int(np.flatnonzero(lifted)[speed[lifted].argmax()])
-            yield wrong(
+            yield (wrong if sliding > FEW else look)(
                 subject="contact flag",
-                seen=f"{name!r} holds {frame!r} in rows in which it moves or bears nothing: {sliding:.0%} of them, row "
+                seen=f"{name!r} holds {frame!r} in rows in which it moves or bears nothing: {sliding:.1%} of them, row "
                 f"{every * worst} with {speed[worst]:.2g} m/s and {found.force[worst, k]:.2g} N.",
                 remedy="Set the flag to 0 where the foot slides or is lifted (forcegp prepare --stance auto finds such "
                 "rows), and compare its time with that of the joints; a wrong foot point or joint offset shows the "
                 "same.",
                 numbers=numbers,
             )
-        elif rests > MANY:
+        elif rests > RESTING:
             row = every * int(np.flatnonzero(resting)[0])
             yield look(
                 subject="contact flag",

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 import forcegp.mechanics
 from forcegp.data.contact_residual import tensors
@@ -46,6 +46,11 @@ class Stance:
     slow: Float[np.ndarray, " switches"]
     force: Float[np.ndarray, "rows switches"]
     bearing: Float[np.ndarray, " 2"]
+
+    @property
+    def moves(self) -> Bool[np.ndarray, "rows switches"]:
+        """Where a foot clearly moves."""
+        return self.speed >= CLEARLY * self.slow
 
     def rows(self, index: Int[np.ndarray, " kept"]) -> Stance:
         """The same for some of the rows."""
