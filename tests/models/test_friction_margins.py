@@ -1,5 +1,7 @@
 """Margins to slipping against Monte Carlo, closed forms and the forces of the model."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -117,6 +119,9 @@ def test_what_margins_need_is_named(dog, log):
     for wrong in (-0.1, "ice", float("nan")):
         with pytest.raises(InvalidInput, match="give a number of at least 0"):
             friction_margins(dog, *row, wrong)
+    lifted = dataclasses.replace(log.rows(slice(0, 3)), u=np.zeros((3, 16)), truth={})
+    with pytest.raises(ContactError, match="no foot stands in any of the rows"):
+        slip_scores(dog, lifted, 0.5)
     with pytest.raises(ContactError, match="nothing can slip"):
         friction_margins(dog.with_contacts([]), log.q[:1], log.v[:1], log.u[:1, :12], 0.5)
     zero = StructuredGP(log.system, NoForces()).fit(log, points=5)

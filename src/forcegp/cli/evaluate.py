@@ -52,7 +52,7 @@ class Evaluate(Command):
     """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
     contact: Annotated[tuple[str, ...], listed(CONTACTS, "those of --system", goes_on=NUMBERS)] = ()
     """Predict under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
-    friction_coefficient: Annotated[float | None, unless_given("MU", "no margins", float)] = None
+    friction_coefficient: Annotated[float | None, unless_given("F", "no margins", float)] = None
     """Also show how far feet are from slipping on ground of this friction coefficient."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""

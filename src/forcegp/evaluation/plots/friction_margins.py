@@ -7,6 +7,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from forcegp.data import Dataset
+from forcegp.errors import ContactError
 from forcegp.evaluation.plots import style
 from forcegp.evaluation.plots.style import QUANTILE
 from forcegp.evaluation.predicted_rows import in_blocks
@@ -18,7 +19,8 @@ def slip_scores(posterior: Posterior, dataset: Dataset, coefficient: float) -> d
     """Of every foot: its least margin [N] with standard deviation and row, and how likely it slips.
 
     "slipping" is the share of the rows in which it stands where P(slip) > 1/2, "expected" the mean of P(slip) over
-    them, "most_likely" its largest. Feet that never stand have none. Raises as `friction_margins`.
+    them, "most_likely" its largest. Feet that never stand have none. Raises as
+    `friction_margins`, and ContactError where none stands.
     """
     names, parts = _margins(posterior, dataset, coefficient)
     scores = {}
@@ -30,6 +32,11 @@ def slip_scores(posterior: Posterior, dataset: Dataset, coefficient: float) -> d
         scores[name] = {"least_margin": float(mean[row]), "std": float(std[row]), "row": row}
         scores[name] |= {"slipping": float((slip[stands] > 0.5).mean()), "expected": float(slip[stands].mean())}
         scores[name] |= {"most_likely": float(slip[stands].max())}
+    if not scores:
+        raise ContactError(
+            "no foot stands in any of the rows, or a planar base bears its weight: there is no normal force to slip "
+            "under. Check the flags of the contacts, or use base='floating'."
+        )
     return scores
 
 
