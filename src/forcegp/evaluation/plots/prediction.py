@@ -164,7 +164,9 @@ def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: b
 def _draw_errors(axes: Axes, forces: _Forces, index: int, unit: str) -> str:
     """The histogram of errors; returns what their root mean square is, for its title."""
     assert forces.truth is not None, "errors are drawn where the truth is known"
-    errors = (forces.mean - forces.truth)[:, index] / np.maximum(forces.std[:, index], np.finfo(float).tiny)
+    std = forces.std[:, index]
+    acts = std >= 1e-9 * std.max()  # a foot that is lifted has no force, and no error but rounding
+    errors = (forces.mean - forces.truth)[acts, index] / np.maximum(std[acts], np.finfo(float).tiny)
     bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
     # half a bin inside of the ends, so that the errors beyond them are seen
     kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
