@@ -43,6 +43,23 @@ def test_a_foot_that_moves_while_it_stands_is_named(log):
     assert "Set the flag to 0" in finding.remedy
 
 
+def test_flags_that_are_a_little_late_are_a_suspicion(log):
+    u = log.u.copy()
+    u[:, 12:] = np.roll(u[:, 12:], 24, axis=0)  # 0.1 s
+    findings = of(replace(log, u=u, truth={}))
+    assert findings
+    assert {each.severity for each in findings} == {"look"}
+    assert "bears nothing" in findings[0].seen
+
+
+def test_a_wrong_foot_point_moves_while_it_bears(log):
+    moved = replace(log.system.contacts[0], point=(0.0, 0.0, 0.3))
+    wrong = [replace(each, point=moved.point) if each.frame == moved.frame else each for each in log.system.contacts]
+    findings = of(replace(log, system=log.system.with_contacts(wrong), truth={}))
+    assert repr(moved.frame) in findings[0].seen
+    assert findings[0].severity == "wrong"
+
+
 def test_a_foot_that_rests_while_it_is_free_is_a_suspicion(log):
     (finding,) = of(flagged(log, log.system.inputs[12], np.zeros_like))
     assert finding.severity == "look"

@@ -89,7 +89,12 @@ def test_prepare_writes_what_it_says(forcegp, folder):
 
 
 REFUSALS = {
-    ("prepare", "noisy.h5", "--out", "x.h5"): "nothing to do: give --cutoff, --delay, --lag, --every or --trim",
+    (
+        "prepare",
+        "noisy.h5",
+        "--out",
+        "x.h5",
+    ): "nothing to do: give --cutoff, --delay, --lag, --stance",
     ("prepare", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
     ("prepare", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
     ("prepare", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",

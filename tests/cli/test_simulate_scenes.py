@@ -34,8 +34,18 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     words = ("identify", "log.h5", "--learn", "trunk:mass", "--prior", "joint-friction", "--points", 25, "--out", "run")
     done = forcegp(*words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    scored = forcegp("evaluate", "run", "log.h5", "--json", folder=tmp_path)
+    words = ("evaluate", "run", "log.h5", "--every", 20, "--friction-coefficient", 0.6, "--plots", "plots")
+    scored = forcegp(*words, folder=tmp_path)
     assert scored.returncode == 0, scored.stderr
+    assert "margin of rear_left_foot to slipping" in scored.stdout
+    assert json.loads((tmp_path / "plots" / "evaluation.json").read_text())["slip"]["rear_left_foot"]["slipping"] == 0.0
+    assert (tmp_path / "plots" / "friction_margins.png").exists()
+    found = forcegp("prepare", "log.h5", "--stance", "auto", "--out", "found.h5", folder=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert "front_left_stands 100%" in found.stdout
+    flags = Dataset.load(tmp_path / "found.h5").u[:, 12:]
+    assert len(flags) > 200
+    assert (flags == 1.0).all()
 
 
 @SURFACES

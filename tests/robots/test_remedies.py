@@ -100,6 +100,20 @@ def test_an_undefined_parent_is_offered_as_the_root():
         Robot.from_urdf_text(SMALL, root="base")
 
 
+@pytest.mark.parametrize("kind", ["fixed", "floating"])
+def test_a_world_that_drake_knows_and_the_file_does_not_define_is_offered_as_the_root(kind):
+    weld = f'<joint name="weld" type="{kind}"><parent link="world"/><child link="trunk"/></joint></robot>'
+    text = LOOSE["legs"].replace("</robot>", weld)
+    with pytest.raises(
+        RobotModelError, match="the link 'world' is a parent, and the file does not define it"
+    ) as caught:
+        Robot.from_urdf_text(text)
+    assert caught.value.remedy == {"root": "world"}  # whether it is bolted is not asked: the joint answers
+    robot = Robot.from_urdf_text(text, **caught.value.remedy)
+    assert robot.base == kind
+    assert robot.nv == (2 if kind == "fixed" else 8)
+
+
 def test_a_misspelt_parent_is_no_root():
     with pytest.raises(RobotModelError, match="did you mean 'base'") as caught:
         Robot.from_urdf_text(changed('parent link="base"', 'parent link="bsae"'))

@@ -6,22 +6,17 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import Finding, look, ok, wrong
-from forcegp.data import Dataset
+from forcegp.data import Dataset, estimate_stance
 from forcegp.errors import ContactError
 from forcegp.mechanics import MechanicalSystem
 
-RESTING, MOVING = 0.02, 0.1
-"""m/s: slower than the first stands, whatever noise; parts of the rms speed while free, above which it slides."""
 MOST_ROWS = 4000
-FEW = 0.05
-"""Share of rows that may contradict their flag: those at touch-down and lift-off."""
+FEW, RARE, RESTING = 0.05, 0.002, 0.02
+"""Shares of rows of stance that the motion contradicts and that are wrong, or worth a look; the same of swing."""
 
 
 def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """Contacts that contradict each other; flags that are no flags; feet that move while standing, or rest while free.
-
-    A foot that stands has A v = 0 in all directions that its contacts hold.
-    """
+    """Contacts that contradict each other; flags that are no flags, or that `estimate_stance` contradicts."""
     if not system.contacts:
         return
     every = -(-len(dataset) // MOST_ROWS)
@@ -34,49 +29,44 @@ def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Find
     names = dict.fromkeys(contact.switch for contact in system.contacts if contact.switch is not None)
     if not names:
         return
-    q, v, u = (torch.tensor(x, device=system.robot.device) for x in (dataset.q, dataset.v, dataset.u))
-    places = {name: system.inputs.index(name) for name in names}
-    held = u.clone()
-    held[:, list(places.values())] = 1.0
-    with torch.no_grad():
-        motion = (system.dynamics(q, v, held).A @ v[..., None])[..., 0].cpu().numpy()
-    for name, place in places.items():
-        flags = dataset.u[:, place]
-        rows = [index for index, contact in enumerate(system.contacts) if contact.switch == name]
-        speed, stands = np.linalg.norm(motion[:, rows], axis=1), flags > 0.5
-        odd = int(((flags != 0.0) & (flags != 1.0)).sum())
+    found = estimate_stance(dataset, system)
+    for k, name in enumerate(found.names):
+        logged, shown, speed = dataset.u[:, system.inputs.index(name)], found.flags[:, k], found.speed[:, k]
+        frame = next(contact.frame for contact in system.contacts if contact.switch == name)
+        stands = logged > 0.5
+        odd = int(((logged != 0.0) & (logged != 1.0)).sum())
         if odd:
             yield wrong(
                 subject="contact flag",
-                seen=f"{name!r} is neither 0 nor 1 in {odd} of {len(flags)} rows; above .5 it counts as 1.",
+                seen=f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1.",
                 remedy="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
                 numbers={"rows": odd},
             )
-        free = float(np.sqrt(np.square(speed[~stands]).mean())) if (~stands).any() else 0.0
-        limit = max(RESTING, MOVING * free)
-        sliding = float((speed[stands] > limit).mean()) if stands.any() else 0.0
-        resting = float((speed[~stands] < 0.1 * limit).mean()) if (~stands).any() else 0.0
-        numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "limit": limit}
-        if sliding > FEW:
-            worst = int(np.flatnonzero(stands)[speed[stands].argmax()])
-            row = every * worst
-            yield wrong(
+        lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), ~stands & (shown == 1.0)
+        sliding, rests = (float(x.sum() / max(y.sum(), 1)) for x, y in ((lifted, stands), (resting, ~stands)))
+        numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "resting while free": rests}
+        numbers |= {"limit": float(found.slow[k]), "open": float(np.isnan(shown).mean())}
+        if sliding > RARE:
+            worst = int(np.flatnonzero(lifted)[speed[lifted].argmax()])
+            yield (wrong if sliding > FEW else look)(
                 subject="contact flag",
-                seen=f"{name!r} holds {system.contacts[rows[0]].frame!r} in rows in which it moves: {sliding:.0%} of "
-                f"them are faster than {limit:.2g} m/s, row {row} with {speed[worst]:.2g} m/s.",
-                remedy="Set the flag to 0 where the foot slides or is lifted, and compare its time with that of the "
-                "joints; a wrong foot point or joint offset shows the same.",
+                seen=f"{name!r} holds {frame!r} in rows in which it moves or bears nothing: {sliding:.1%} of them, row "
+                f"{every * worst} with {speed[worst]:.2g} m/s and {found.force[worst, k]:.2g} N.",
+                remedy="Set the flag to 0 where the foot slides or is lifted (forcegp prepare --stance auto finds such "
+                "rows), and compare its time with that of the joints; a wrong foot point or joint offset shows the "
+                "same.",
                 numbers=numbers,
             )
-        elif resting > 0.5:
+        elif rests > RESTING:
+            row = every * int(np.flatnonzero(resting)[0])
             yield look(
                 subject="contact flag",
-                seen=f"{name!r} is 0 in rows of which {resting:.0%} show {system.contacts[rows[0]].frame!r} at rest.",
+                seen=f"{name!r} is 0 in rows of which {rests:.0%} show {frame!r} at rest, row {row} for example.",
                 remedy="A foot at rest may stand: compare the flag with contact forces or heights.",
-                numbers={**numbers, "resting": resting},
+                numbers=numbers,
             )
         elif not odd:
-            yield ok(subject="contact flag", seen=f"{name!r} agrees with the motion.", numbers=numbers)
+            yield ok(subject="contact flag", seen=f"{name!r} agrees with motion and forces.", numbers=numbers)
 
 
 def unmeasured_base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:

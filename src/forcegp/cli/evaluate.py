@@ -26,6 +26,7 @@ from forcegp.cli.terminal import (
     facts,
     force_facts,
     number,
+    slip_facts,
 )
 from forcegp.errors import InvalidInput
 
@@ -51,6 +52,8 @@ class Evaluate(Command):
     """Robot and contacts to predict for: model, those that it was trained with; data, those of the dataset."""
     contact: Annotated[tuple[str, ...], listed(CONTACTS, "those of --system", goes_on=NUMBERS)] = ()
     """Predict under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
+    friction_coefficient: Annotated[float | None, unless_given("F", "no margins", float)] = None
+    """Also show how far feet are from slipping on ground of this friction coefficient."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots")] = None
     """Also draw predictions, forces, tool path and training into this folder, with the scores as evaluation.json."""
     report: Annotated[Path | None, unless_given("FILE.html", "no report")] = None
@@ -93,17 +96,20 @@ class Evaluate(Command):
             "forces": forces.to_dict(),
             "normal_force_rests_on_prior": rests_on_prior,
         }
+        mu = self.friction_coefficient
+        if mu is not None:
+            scores["slip"] = forcegp.evaluation.slip_scores(posterior, dataset, mu)
         if self.plots is not None:
             options = {name: scores[name] for name in ("run", "data", "every", "system", "contact")}
             with self.folder(self.plots, {"options": options}) as folder:
-                draw(terminal, folder, posterior, dataset)
+                draw(terminal, folder, posterior, dataset, mu)
                 write_json(folder / "evaluation.json", scores)
             terminal.note(f"plots: {self.plots}")
         if self.report is not None:
             self._write_report(terminal, posterior, dataset, evaluation, scores)
         known = isinstance(posterior, forcegp.models.StructuredPosterior) and not posterior.latent_names
         why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
-        forces_table = force_facts(forces, why)
+        forces_table = force_facts(forces, why) | slip_facts(scores.get("slip", {}))
         terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
         return scores
 
@@ -125,12 +131,20 @@ class Evaluate(Command):
                 best=forcegp.report.evaluation_sentence(evaluation, unit),
                 findings=[forcegp.report.Finding("warning", each) for each in scores["warnings"]],
                 tables=[forcegp.report.evaluation_table(evaluation)],
+                pictures=self._pictures(posterior, dataset),
                 details={**scores, "forcegp": forcegp.__version__},
                 shapes=self.shapes,
                 progress=progress,
             )
             forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
         terminal.note(f"report: {self.report}")
+
+    def _pictures(self, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[forcegp.report.Picture]:
+        mu = self.friction_coefficient
+        if mu is None:
+            return []
+        figure = forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
+        return [forcegp.report.Picture("How much more force along the ground every foot could bear.", figure)]
 
 
 def evaluate_with_progress(
@@ -144,11 +158,19 @@ def evaluate_with_progress(
     return evaluation
 
 
-def draw(terminal: Terminal, folder: Path, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[str]:
+def draw(
+    terminal: Terminal,
+    folder: Path,
+    posterior: forcegp.models.Posterior,
+    dataset: forcegp.Dataset,
+    mu: float | None = None,
+) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
     figures = {"prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset)}
     if posterior.system.contacts and posterior.predicts_forces:
         figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
+    if mu is not None:
+        figures["friction_margins.png"] = lambda: forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
     if forcegp.evaluation.curve_panels(posterior):
         figures["forces.png"] = lambda: forcegp.evaluation.friction_curves_figure(posterior, dataset)
     with terminal.progress("drawing") as report:

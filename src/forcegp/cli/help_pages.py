@@ -23,7 +23,7 @@ GROUPS: Mapping[str, str] = {
     "Input": "baseline test task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
     "Columns": "time q v u a step joints orientation axes ned unit sign scale offset episode unwrap",
     "Timing": "start end gap resample rate",
-    "Preparation": "cutoff differentiate delay lag every trim",
+    "Preparation": "cutoff differentiate delay lag stance every trim",
     "Robot": "robot shapes inertias base root identified "
     "lock armature gravity beyond_limits link system contact known_force",
     "Scene": "surface contact_model tool_friction friction_coefficient joint_friction patch wind",

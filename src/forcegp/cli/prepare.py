@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -27,6 +27,7 @@ class Prepare(PreparationOptions, RobotOptions):
 
     For example:
       forcegp prepare log.h5 --cutoff auto --every 10 --out data.h5 --plots spectra
+      forcegp prepare dog.h5 --stance auto --out data.h5
       forcegp prepare log.h5 --cutoff 20 --delay auto --robot arm.urdf --trim 0.1 --out data.h5
     """
 
@@ -34,6 +35,8 @@ class Prepare(PreparationOptions, RobotOptions):
     """The dataset to prepare (HDF5), as forcegp import wrote it."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write."""
+    stance: Literal["log", "auto"] = "log"
+    """auto: set the switches of contacts to what motion and forces show, and leave out rows that leave one open."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
     """Also draw the spectra before and after, with the cut-off, into this folder."""
     overwrite: bool = False
@@ -41,12 +44,12 @@ class Prepare(PreparationOptions, RobotOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, save, draw if asked to, and show."""
-        if not self.words("cutoff", "delay", "lag", "every", "trim"):
-            raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --every or --trim.")
+        if not self.words("cutoff", "delay", "lag", "stance", "every", "trim"):
+            raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --stance, --every or --trim.")
         require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
         self.require_free(self.plots)
 
-        preparation = self._preparation()
+        preparation = replace(self._preparation(), stance=self.stance)
         dataset = forcegp.Dataset.load(self.data)
         if self.robot is not None or self.identified is not None or dataset.system is not None:
             dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
@@ -81,6 +84,9 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
                 f"{1e3 * each:.1f}" for each in (seconds if len(set(seconds)) > 1 else seconds[:1])
             )
             values[f"{name} of u"] = f"{milliseconds} ms{'' if why is None else f'; {why}'}"
+    if "stance" in report:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in report["stance"]["standing"].items())
+        values["stance"] = f"{shares}; {report['stance']['open_rows']} rows left out, which leave one open"
     tables: list[Any] = [facts(f"{out}: prepared", values)]
     if cutoff is None:
         return tables

@@ -313,6 +313,16 @@ def force_facts(scores: forcegp.evaluation.ForceScores, normal_forces: str) -> d
     return values
 
 
+def slip_facts(scores: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    """One line per foot: its least margin to slipping, and in how many rows it rather slips."""
+    return {
+        f"margin of {foot} to slipping": f"{each['least_margin']:.3g} ± {each['std']:.2g} N at least (row "
+        f"{each['row']}); slips in {percent(each['slipping'])} of the rows, "
+        f"with probability {each['most_likely']:.2g} at most"
+        for foot, each in scores.items()
+    }
+
+
 def _force_scores(score: forcegp.evaluation.ForceScore) -> str:
     """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
     if score.relative_rmse is None:

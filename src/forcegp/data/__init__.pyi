@@ -23,5 +23,6 @@ from .spectrum import (
 from .windows import (
     WeakForm as WeakForm, Windows as Windows,
 )
+from .stance import Stance as Stance, estimate_stance as estimate_stance
 from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag
 from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind

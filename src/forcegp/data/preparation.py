@@ -16,6 +16,7 @@ from forcegp.data.delay import estimate_delay, shifted, torques_of_joints
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
 from forcegp.data.held_out_cutoff import held_out_cutoff
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
+from forcegp.data.stance import estimate_stance
 from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 
@@ -41,6 +42,8 @@ class Preparation:
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
+    stance: "auto" sets the switches of contacts in u to what motion and forces show (`estimate_stance`), after the
+        filter, and drops rows that leave one open; "log" keeps them.
 
     Raises InvalidInput for values that are not allowed.
     """
@@ -54,6 +57,7 @@ class Preparation:
     every: int = 1
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
+    stance: Literal["log", "auto"] = "log"
 
     @usable_arguments("Preparation")
     def __post_init__(self) -> None:
@@ -78,6 +82,8 @@ class Preparation:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
         if self.differentiate not in ("q", "v"):
             raise InvalidInput(f"differentiate is {self.differentiate!r}; allowed: 'q' or 'v'.")
+        if self.stance not in ("log", "auto"):
+            raise InvalidInput(f"stance is {self.stance!r}; allowed: 'log' or 'auto'.")
 
     def thinning(self, dataset: Dataset) -> int:
         """N, so that every N-th row of the log holds what the filter leaves: `PASSED` rows per period, `FEW` in all."""
@@ -98,7 +104,7 @@ class Preparation:
     def rows(self, dataset: Dataset) -> Dataset:
         """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
         chosen = self.resolved(dataset)
-        return _filtered(chosen, dataset).rows(_kept(chosen, dataset))
+        return _chosen_rows(chosen, dataset, _filtered(chosen, dataset))[0]
 
     def apply(self, dataset: Dataset) -> "Prepared":
         """The prepared Dataset and its price.
@@ -108,9 +114,8 @@ class Preparation:
         """
         chosen, reasons = _resolve(self, dataset)
         filtered = _filtered(chosen, dataset)
-        kept = _kept(chosen, dataset)
-        prepared = filtered.rows(kept)
-        report = _report(chosen, reasons, dataset, filtered, prepared)
+        prepared, found = _chosen_rows(chosen, dataset, filtered)
+        report = _report(chosen, reasons, dataset, filtered, prepared) | found
         metadata = {**dataset.metadata, "preparation": report}
         if "preparation" in dataset.metadata:
             metadata["preparation"] = {**report, "earlier": dataset.metadata["preparation"]}
@@ -252,6 +257,17 @@ def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
                 stacklevel=3,
             )
     return np.sort(np.concatenate(kept))
+
+
+def _chosen_rows(chosen: Preparation, raw: Dataset, filtered: Dataset) -> tuple[Dataset, dict[str, Any]]:
+    """The rows that stay, with flags of stance where they are to be found, and shares of what was found."""
+    kept = _kept(chosen, raw)
+    if chosen.stance == "log":
+        return filtered.rows(kept), {}
+    found = estimate_stance(filtered)
+    rows = found.rows(kept).written(filtered.rows(kept))
+    stands = {name: float(share) for name, share in zip(found.names, np.nanmean(found.flags, axis=0), strict=True)}
+    return rows, {"stance": {"standing": stands, "open_rows": len(kept) - len(rows)}}
 
 
 def _report(

@@ -9,6 +9,9 @@ from .force_errors import (
 )
 from .plots.excitation import excitation_figure as excitation_figure
 from .plots.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
+from .plots.friction_margins import (
+    friction_margins_figure as friction_margins_figure, slip_scores as slip_scores,
+)
 from .plots.log import check_figure as check_figure, preparation_figure as preparation_figure
 from .plots.prediction import (
     normal_force_figure as normal_force_figure, prediction_figure as

@@ -10,6 +10,7 @@ from .known_forces import (
     LoadJointFriction, RigidBodyBias as RigidBodyBias, RotorInertia as RotorInertia, StribeckJointFriction as
     StribeckJointFriction, ViscousJointFriction as ViscousJointFriction,
 )
+from .wheels import RollingContact as RollingContact, rolling as rolling
 from .surfaces import (
     Cylinder as Cylinder, Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
     Surface as Surface, surface_axes as surface_axes,

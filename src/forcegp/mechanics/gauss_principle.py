@@ -71,6 +71,10 @@ class Contact:
         point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")
         object.__setattr__(self, "point", tuple(point.tolist()))
 
+    def more(self) -> dict[str, object]:
+        """The fields that other contacts lack, as plain JSON values."""
+        return {}
+
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:
         """World position p(q) of the contact point (..., 3) in m."""
         pose = kinematics.frame_pose(self.frame)

@@ -53,8 +53,8 @@ class LoopClosure(Contact):
         point = finite_vector("LoopClosure second_point", self.second_point, 3, meaning)
         object.__setattr__(self, "second_point", tuple(point.tolist()))
 
-    def second(self) -> dict[str, object]:
-        """The fields that other contacts lack, as plain JSON values."""
+    @override
+    def more(self) -> dict[str, object]:
         return dict(zip(SECOND, (self.second_frame, list(self.second_point), self.turning), strict=True))
 
     @override

@@ -88,7 +88,7 @@ class Plane(_Flat):
     offset: float
 
     def __post_init__(self) -> None:
-        normal, length = _direction("Plane normal", self.normal)
+        normal, length = direction("Plane normal", self.normal)
         object.__setattr__(self, "normal", normal)
         object.__setattr__(self, "offset", _number("Plane offset", self.offset) / length)
 
@@ -107,7 +107,7 @@ class Held(_Flat):
     normal: Vector
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "normal", _direction("Held normal", self.normal)[0])
+        object.__setattr__(self, "normal", direction("Held normal", self.normal)[0])
 
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -149,7 +149,7 @@ class Sphere(_Round):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("Sphere center", self.center))
-        object.__setattr__(self, "radius", _positive("Sphere radius", self.radius))
+        object.__setattr__(self, "radius", positive("Sphere radius", self.radius))
 
     @override
     def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,9 +165,9 @@ class Cylinder(_Round):
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", _direction("Cylinder axis", self.axis)[0])
+        object.__setattr__(self, "axis", direction("Cylinder axis", self.axis)[0])
         object.__setattr__(self, "point", _vector("Cylinder point", self.point))
-        object.__setattr__(self, "radius", _positive("Cylinder radius", self.radius))
+        object.__setattr__(self, "radius", positive("Cylinder radius", self.radius))
 
     @override
     def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -231,7 +231,8 @@ def _number(name: str, value: object) -> float:
     return number
 
 
-def _positive(name: str, value: object) -> float:
+def positive(name: str, value: object) -> float:
+    """A finite number above 0, in m."""
     number = _number(name, value)
     if number <= 0.0:
         raise InvalidInput(f"{name} is {number}; it must be positive (m).")
@@ -242,7 +243,7 @@ def _vector(name: str, values: object) -> Vector:
     return tuple(finite_vector(name, values, 3, " x, y, z").tolist())  # type: ignore[return-value]  # three of them
 
 
-def _direction(name: str, values: object) -> tuple[Vector, float]:
+def direction(name: str, values: object) -> tuple[Vector, float]:
     """The unit vector along three numbers, and their length.
 
     The length is 1 where it is so already up to rounding, so that storing changes nothing.

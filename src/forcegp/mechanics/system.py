@@ -21,8 +21,9 @@ from forcegp.mechanics.known_forces import (
     known_force_to_dict,
 )
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
-from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import OBSERVED, Thrusters
+from forcegp.mechanics.wheels import WHEEL, RollingContact
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues
 from forcegp.robots.mjcf import is_mjcf
@@ -239,7 +240,7 @@ class MechanicalSystem(Summary):
         A, b, _ = self._constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         for index, contact in enumerate(self.contacts):
-            if isinstance(contact, LoopClosure):  # in a plane some of its rows constrain nothing
+            if isinstance(contact, LoopClosure | RollingContact):  # in a plane some of its rows constrain nothing
                 size[..., index] = 1.0 + 0.0 * size[..., index]
             if contact.switch is not None:  # where it does not act it needs no direction
                 size[..., index] += 1.0 - (u[..., self.inputs.index(contact.switch)] > 0.5).to(size.dtype)
@@ -332,7 +333,7 @@ class MechanicalSystem(Summary):
                     **{"frame": contact.frame, "point": list(contact.point)},
                     **({} if contact.switch is None else {"switch": contact.switch}),
                     "surface": surface_to_dict(contact.surface),
-                    **(contact.second() if isinstance(contact, LoopClosure) else {}),
+                    **contact.more(),
                 }
                 for contact in self.contacts
             ],
@@ -383,7 +384,8 @@ class MechanicalSystem(Summary):
 
 def _stored_contact(entry: Mapping[str, Any]) -> Contact:
     place, switch = (entry["frame"], tuple(entry["point"])), entry.get("switch")
-    if "second_frame" not in entry:
-        return Contact(*place, object_from_dict("surface", SURFACES, entry["surface"]), switch)
-    held = object_from_dict("surface", {"held": Held}, entry["surface"])
-    return LoopClosure(*place, held, switch, **{name: entry[name] for name in SECOND if name in entry})
+    surface = object_from_dict("surface", SURFACES, entry["surface"])
+    for kind, names in ((LoopClosure, SECOND), (RollingContact, WHEEL)):
+        if names[0] in entry:
+            return kind(*place, surface, switch, **{name: entry[name] for name in names if name in entry})  # type: ignore[arg-type]  # the constructors check
+    return Contact(*place, surface, switch)

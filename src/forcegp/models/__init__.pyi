@@ -14,6 +14,7 @@ from .protocol import Model as Model, Posterior as Posterior
 from .rollout import Rollout as Rollout, StepLinearization as StepLinearization
 from .search import ALL_ROWS as ALL_ROWS, default_options as default_options, default_restarts as default_restarts
 from .storage import load_posterior as load_posterior, save_posterior as save_posterior
+from .structured.friction_margin import FrictionMargins as FrictionMargins, friction_margins as friction_margins
 from .structured.gp import StructuredGP as StructuredGP
 from .structured.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .structured.posterior import StructuredPosterior as StructuredPosterior

@@ -21,8 +21,9 @@ class Payload(ForcePrior):
 
     J_p and J_w are the linear and angular Jacobians at the origin of `frame`, R its orientation. The four latents are
     constants: m (kg) and the first moments m c (kg m), normal about zero, so the posterior has mass and place with
-    their covariance. It is the gravity of the load alone, which is what slow motions show; for its inertia, learn the
-    parameters of the link (`StructuredGP.identify`). With `moments=False` the load
+    their covariance. It is the gravity of the load alone, which is what slow motions show. Its inertia adds to M and
+    so acts on the acceleration itself, which no force over (q, v, u) does: learn the ten parameters of the link instead
+    (`StructuredGP.identify`). With `moments=False` the load
     is a point mass at the origin of the frame.
     """
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, usable_arguments
-from forcegp.mechanics import ConstrainedDynamics, LoopClosure, MechanicalSystem, surface_axes
+from forcegp.mechanics import ConstrainedDynamics, LoopClosure, MechanicalSystem, RollingContact, surface_axes
 from forcegp.priors.force_prior import ExpressedKernels, Scaling
 from forcegp.priors.joint_forces import chosen_inputs, driven, state_labels
 from forcegp.priors.kernels import check_kernel
@@ -74,9 +74,10 @@ def is_contact_number(value: object) -> bool:
 
 def require_contact(prior: str, contact: int, system: MechanicalSystem) -> None:
     """Raise InvalidInput if the system has no such contact."""
-    numbers = [index for index, each in enumerate(system.contacts) if not isinstance(each, LoopClosure)]
+    sliding = (not isinstance(each, LoopClosure | RollingContact) for each in system.contacts)
+    numbers = [index for index, slides in enumerate(sliding) if slides]
     if contact not in numbers:
-        have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface"
+        have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
         raise InvalidInput(
             f"{prior} acts at contact {contact}, but the system has {have}; give the contact (`contacts`), or use a "
             "prior that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."

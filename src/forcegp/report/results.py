@@ -63,7 +63,7 @@ def model_page(
     )
     if posterior.system.contacts and posterior.predicts_forces:
         steps["normal force"] = lambda: (
-            "The force between tool and surface, which no sensor measured.",
+            "The forces of contacts, which no sensor measured.",
             normal_force_figure(posterior, dataset),
         )
     steps["accelerations"] = lambda: (

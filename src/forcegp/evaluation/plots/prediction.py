@@ -14,6 +14,7 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation.plots import style
 from forcegp.evaluation.plots.style import QUANTILE
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
+from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.models.protocol import Posterior
 
 
@@ -77,7 +78,8 @@ ERROR_ROWS = 2000
 def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
     """One row per contact: force over `seconds` of the first episode; errors in standard deviations beside it.
 
-    The force is |s_p| lambda in N, positive where the surface pushes along its gradient. Where the Dataset holds
+    The force is |s_p| lambda in N, positive where the surface pushes along its gradient; where a point is held, the
+    part along each axis of the world. Where the Dataset holds
     "lambda", it is drawn, with a histogram of (prediction - truth) / standard deviation over up to ERROR_ROWS rows of
     the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
     Raises InvalidInput without contacts, and for models without forces.
@@ -98,16 +100,29 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         spread = np.unique(np.linspace(0, len(dataset) - 1, ERROR_ROWS).astype(int))
         every = _normal_forces(posterior, dataset.rows(spread))
     for index, contact in enumerate(posterior.system.contacts):
-        name = f"{type(contact.surface).__name__.lower()} at {contact.frame}"
+        name, label = _contact_labels(contact)
         title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
         _draw_force(grid[index, 0], rows, forces, index, known)
-        style.quiet(grid[index, 0], title=title, x="time [s]", y="normal force [N]")
+        style.quiet(grid[index, 0], title=title, x="time [s]", y=label)
         if every is not None:
-            title = _draw_errors(grid[index, 1], every, index)
+            title = _draw_errors(grid[index, 1], every, index, label.split()[-1].strip("[]"))
             style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")
     style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
-    style.heading(figure, f"Normal force after {len(posterior.training)} training points")
+    held = any(isinstance(contact.surface, Held) for contact in posterior.system.contacts)
+    style.heading(figure, f"{'Contact' if held else 'Normal'} force after {len(posterior.training)} training points")
     return figure
+
+
+def _contact_labels(contact: Contact) -> tuple[str, str]:
+    """What a contact is, and what its multiplier is."""
+    if not isinstance(contact.surface, Held):
+        return f"{type(contact.surface).__name__.lower()} at {contact.frame}", "normal force [N]"
+    n = contact.surface.normal
+    axis = "xyz"[n.index(1.0)] if sorted(n) == [0.0, 0.0, 1.0] else "({:.2g}, {:.2g}, {:.2g})".format(*n)
+    if isinstance(contact, LoopClosure):
+        where = f"{contact.frame} with {contact.second_frame}"
+        return (f"{where} about {axis}", "torque [Nm]") if contact.turning else (f"{where} along {axis}", "force [N]")
+    return f"{contact.frame} along {axis}", "force [N]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +161,12 @@ def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: b
     axes.margins(x=0)
 
 
-def _draw_errors(axes: Axes, forces: _Forces, index: int) -> str:
+def _draw_errors(axes: Axes, forces: _Forces, index: int, unit: str) -> str:
     """The histogram of errors; returns what their root mean square is, for its title."""
     assert forces.truth is not None, "errors are drawn where the truth is known"
-    errors = (forces.mean - forces.truth)[:, index] / np.maximum(forces.std[:, index], np.finfo(float).tiny)
+    std = forces.std[:, index]
+    acts = std >= 1e-9 * std.max()  # a foot that is lifted has no force, and no error but rounding
+    errors = (forces.mean - forces.truth)[acts, index] / np.maximum(std[acts], np.finfo(float).tiny)
     bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
     # half a bin inside of the ends, so that the errors beyond them are seen
     kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
@@ -163,4 +180,4 @@ def _draw_errors(axes: Axes, forces: _Forces, index: int) -> str:
     truth = forces.truth[:, index]
     error, size = (float(np.sqrt(np.square(x).mean())) for x in (forces.mean[:, index] - truth, truth))
     relative = f" ({100.0 * error / size:.2g} %)" if size else ""
-    return f"Errors: root mean square {error:.2g} N{relative}"
+    return f"Errors: root mean square {error:.2g} {unit}{relative}"

@@ -1,0 +1,179 @@
+"""Which contacts with a switch act in which rows: from the motion of what they hold, and from the forces that it needs.
+
+A contact that acts holds `A v = 0`. The force that the rows ask of all contacts together is that of least squares,
+
+    lambda = argmin |L^-1 (M a - Q_K - A^T lambda)|,    M = L L^T,
+
+Gauss' principle turned round: where the base has no actuator, only feet explain its acceleration. Forces of feet that
+clearly move show what friction, loads and noise make of zero; feet at rest show what standing is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+import forcegp.mechanics
+from forcegp.data.contact_residual import tensors
+from forcegp.data.dataset import Dataset
+from forcegp.errors import ContactError, DatasetError
+
+WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
+"""s: of the averages; of open rows that follow those around them; on either side of what is not sure."""
+SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
+"""m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves."""
+FREE, LEAST, BEARS = 0.99, 0.02, 0.4
+"""Quantile of the forces on feet that clearly move; shares of the median force at rest: nothing, and surely bearing."""
+FEW = 10
+CHUNK = 4000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stance:
+    """Flags (rows, switches) of the contacts called `names`: 1 acts, 0 does not, NaN where the rows leave it open.
+
+    `speed` [m/s] is that of what the contact holds, averaged over 40 ms, `slow` (switches,) below which it rests;
+    `force` [N] what the rows ask of it, `bearing` (2,) up to which nothing bears and from which the foot stands; NaN
+    where forces decide nothing.
+    """
+
+    names: tuple[str, ...]
+    flags: Float[np.ndarray, "rows switches"]
+    speed: Float[np.ndarray, "rows switches"]
+    slow: Float[np.ndarray, " switches"]
+    force: Float[np.ndarray, "rows switches"]
+    bearing: Float[np.ndarray, " 2"]
+
+    @property
+    def moves(self) -> Bool[np.ndarray, "rows switches"]:
+        """Where a foot clearly moves."""
+        return self.speed >= CLEARLY * self.slow
+
+    def rows(self, index: Int[np.ndarray, " kept"]) -> Stance:
+        """The same for some of the rows."""
+        rows = {name: getattr(self, name)[index] for name in ("flags", "speed", "force")}
+        return replace(self, **rows)
+
+    def written(self, dataset: Dataset) -> Dataset:
+        """The rows that are decided, with these flags in the last columns of u. Raises DatasetError where none is."""
+        u = np.concatenate([dataset.u[:, : -len(self.names)], self.flags], axis=1)
+        decided = np.flatnonzero(np.isfinite(u).all(axis=1))
+        if not len(decided):
+            raise DatasetError(
+                f"motion and forces leave the stance open in all {len(u)} rows; give the flags "
+                f"{', '.join(self.names)} in the last columns of u, or filter the velocities first."
+            )
+        return replace(dataset, u=np.where(np.isfinite(u), u, 0.0)).rows(decided)
+
+
+def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem | None = None) -> Stance:
+    """Flags of all contacts with a switch from q, v, u and a; those that u holds are not looked at.
+
+    1. What clearly moves is free if it does not bear.
+    2. What rests stands if it bears, and is free if it bears nothing. Without forces, rest is stance.
+    3. Up to 0.1 s in between follow the decided rows around them where both agree. All else is open (NaN), with 30 ms
+       on either side and on those of a change, and where something clearly moves and bears.
+
+    Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
+    up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
+    the median at rest. Forces decide nothing where moving feet show more than these 40 %. Raises ContactError
+    without contacts that have a switch.
+    """
+    system = dataset.system if system is None else system
+    names = () if system is None else tuple(dict.fromkeys(each.switch for each in system.contacts if each.switch))
+    if system is None or not names:
+        raise ContactError(
+            "no contact of the system has a switch, so there is no stance to find; give one, for example "
+            "fixed_point('foot', switch='foot_stands')."
+        )
+    order = np.argsort(dataset.time, kind="stable")
+    episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
+    motion, asked = _motion_and_force(dataset, system, names)
+    speed, force = (np.empty((len(dataset), len(names))) for _ in range(2))
+    noise = np.empty(len(names))
+    widths = [_width(dataset.time[rows]) for rows in episodes]
+    for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
+        for rows, width in zip(episodes, widths, strict=True):
+            for size, values in ((speed, own), (force, needed)):
+                size[rows, k] = np.linalg.norm(_averaged(values[rows], width), axis=1)
+        differences = np.concatenate([np.diff(own[rows], n=3, axis=0) for rows in episodes])
+        white = 1.4826 / 20.0**0.5 * np.median(np.abs(differences), axis=0) if len(differences) else np.zeros(1)
+        noise[k] = np.linalg.norm(white) / min(widths) ** 0.5
+    slow = np.maximum(SLOW, DEVIATIONS * noise)
+    rests, moves = speed <= slow, speed >= CLEARLY * slow
+    bearing = _bearing(force, rests, moves)
+    bears, unloaded = (force >= bearing[1], force <= bearing[0]) if np.isfinite(bearing).all() else (rests, moves)
+    flags = np.full(force.shape, np.nan)
+    flags[rests & bears], flags[(rests | moves) & unloaded] = 1.0, 0.0
+    for rows in episodes:
+        flags[rows] = _between(flags[rows], dataset.time[rows])
+    flags[moves & bears] = np.nan
+    return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
+
+
+def _motion_and_force(
+    dataset: Dataset, system: forcegp.mechanics.MechanicalSystem, names: tuple[str, ...]
+) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]]]:
+    """A v of the contacts of every switch, and the force that the rows ask of them."""
+    of = [[k for k, contact in enumerate(system.contacts) if contact.switch == name] for name in names]
+    places = [system.inputs.index(name) for name in names]
+    motion: list[list[np.ndarray]] = [[] for _ in names]
+    asked: list[list[np.ndarray]] = [[] for _ in names]
+    for first in range(0, len(dataset), CHUNK):
+        q, v, u, a = (x.to(system.robot.device) for x in tensors(dataset.rows(slice(first, first + CHUNK))))
+        u[:, places] = 1.0
+        with torch.no_grad():
+            found = system.dynamics(q, v, u)
+            white = found.inverse_lower @ (found.M @ a[..., None] - found.Q_K[..., None])
+            forces = found.normals * (found.pseudo_inverse.mT @ white)
+            rates = (found.A @ v[..., None])[..., 0]
+        for k, rows in enumerate(of):
+            motion[k].append(rates[:, rows].cpu().numpy())
+            asked[k].append(forces[:, rows].sum(1).cpu().numpy())
+    return [np.concatenate(own) for own in motion], [np.concatenate(own) for own in asked]
+
+
+def _width(time: Float[np.ndarray, " rows"]) -> int:
+    """Rows of a window."""
+    return 2 * int(0.5 * WINDOW / np.median(np.diff(time))) + 1 if len(time) > 1 else 1
+
+
+def _averaged(values: Float[np.ndarray, "rows m"], width: int) -> Float[np.ndarray, "rows m"]:
+    """Means over windows of so many rows, which are shorter at the ends."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    rows: Int[np.ndarray, " rows"] = np.arange(len(values))
+    first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
+    return (total[last] - total[first]) / (last - first)[:, None]
+
+
+def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
+    """Forces up to which nothing bears, and from which a foot stands [N]; NaN where they do not differ."""
+    standing = float(np.median(force[rests])) if rests.any() else 0.0
+    free, bears = LEAST * standing, BEARS * standing
+    if moves.sum() >= FEW:
+        free = max(free, float(np.quantile(force[moves], FREE)))
+        bears = 2.0 * free
+    return np.array([free, bears]) if 0.0 < free <= BEARS * standing else np.full(2, np.nan)
+
+
+def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
+    """Open rows with what was decided before and after them, where that is the same; rows near others are open."""
+    rows = np.arange(len(flags))
+    filled = flags.copy()
+    for own, out in zip(flags.T, filled.T, strict=True):
+        decided = np.flatnonzero(np.isfinite(own))
+        if len(decided):
+            after = decided[np.minimum(np.searchsorted(decided, rows), len(decided) - 1)]
+            before = decided[np.maximum(np.searchsorted(decided, rows, side="right") - 1, 0)]
+            same = (own[before] == own[after]) & (time[after] - time[before] <= OPEN)
+            out[same] = own[before[same]]
+        unsure = np.isnan(out)
+        unsure[:-1] |= np.diff(out) != 0.0
+        if unsure.any():
+            at = time[unsure]
+            near = np.searchsorted(at, time).clip(1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), int)
+            out[np.minimum(np.abs(time - at[near - 1]), np.abs(time - at[near])) <= EDGE] = np.nan
+    return filled

@@ -1,0 +1,104 @@
+"""Flags of feet from motion and forces, against those of the simulation that made the rows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forcegp import Preparation
+from forcegp.data import estimate_stance
+from forcegp.errors import ContactError, DatasetError, InvalidInput
+from forcegp.mechanics import fixed_frame
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+SWITCHES = slice(-4, None)
+
+
+def walk(seed: int, noise: float = 0.0, **config):
+    """Rows without their flags, with white noise on all velocities, and the flags."""
+    log = simulate_quadruped(QuadrupedConfig(**{"seconds": 6.0, "seed": seed, "noise": 0.1, **config}))
+    v = log.v + noise * np.random.default_rng(seed).normal(size=log.v.shape)
+    u = log.u.copy()
+    u[:, SWITCHES] = 0.0
+    return replace(log, v=v, u=u, truth={}), log.u[:, SWITCHES]
+
+
+@pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (1, 0.0), (2, 0.02), (3, 0.02)])
+def test_flags_are_those_of_the_simulation(seed, noise):
+    log, flags = walk(seed, noise)
+    found = estimate_stance(log)
+    decided = np.isfinite(found.flags)
+    assert found.names == log.system.inputs[SWITCHES]
+    assert (found.flags == flags)[decided].all()
+    assert decided.all(axis=1).mean() > 0.85
+    swing = flags == 0.0
+    assert (found.flags[swing] == 0.0).mean() > 0.8
+
+
+def test_what_noise_hides_stays_open():
+    """Velocities that are too noisy to show swing: rows of swing are open, not stance."""
+    log, flags = walk(4, 0.1)
+    found = estimate_stance(log)
+    decided = np.isfinite(found.flags)
+    assert (found.flags == flags)[decided].mean() > 0.998
+    assert (flags[~decided] == 0.0).mean() > 0.8
+
+
+def test_without_forces_the_motion_decides():
+    log, flags = walk(5)
+    bare = replace(log, u=0.0 * log.u, a=np.random.default_rng(0).normal(0.0, 100.0, log.a.shape))
+    found = estimate_stance(bare)
+    decided = np.isfinite(found.flags)
+    assert np.isnan(found.bearing).all()
+    assert (found.flags == flags)[decided].mean() > 0.97
+    assert decided.mean() > 0.95
+
+
+def test_forces_are_the_weight_where_nothing_moves():
+    log, _ = walk(6, lift=False, joint_friction="none", payload=0.0, noise=0.0)
+    found = estimate_stance(log)
+    robot = log.system.robot
+    weight = 9.81 * sum(robot.link(name).mass for name in robot.link_names)
+    assert (found.flags == 1.0).all()
+    assert found.force.sum(axis=1).mean() == pytest.approx(weight, rel=0.1)  # sizes of forces that also lean
+
+
+def test_the_order_of_rows_does_not_matter():
+    log, _ = walk(7)
+    order = np.random.default_rng(0).permutation(len(log))
+    np.testing.assert_array_equal(estimate_stance(log.rows(order)).flags, estimate_stance(log).flags[order])
+
+
+def test_a_flat_foot_is_one_force():
+    log, flags = walk(8)
+    contacts = [c for name in log.system.inputs[SWITCHES] for c in fixed_frame(name.replace("stands", "foot"), name)]
+    system = log.system.with_contacts(contacts)
+    found = estimate_stance(replace(log, system=system))
+    assert found.force.shape == flags.shape  # feet turn here, which a flat one must not
+    assert (found.flags[flags == 0.0] != 1.0).mean() > 0.99
+
+
+def test_prepared_rows_carry_the_flags_and_leave_open_ones_out():
+    log, flags = walk(9)
+    prepared = Preparation(stance="auto", every=2).apply(log)
+    found = estimate_stance(log).flags
+    kept = np.flatnonzero(np.isfinite(found).all(axis=1))
+    kept = kept[kept % 2 == 0]
+    np.testing.assert_array_equal(prepared.dataset.u[:, SWITCHES], found[kept])
+    np.testing.assert_array_equal(prepared.dataset.time, log.time[kept])
+    report = prepared.dataset.metadata["preparation"]["stance"]
+    assert report["open_rows"] == -(-len(log) // 2) - len(kept)
+    assert report["standing"]["front_left_stands"] == pytest.approx(flags[:, 0].mean(), abs=0.03)
+    assert Preparation(stance="auto", every=2).rows(log).u.shape == prepared.dataset.u.shape
+
+
+def test_what_stance_needs_is_named():
+    log, _ = walk(0)
+    with pytest.raises(ContactError, match="no contact of the system has a switch"):
+        estimate_stance(log, log.system.with_contacts(()))
+    with pytest.raises(InvalidInput, match="stance is 'yes'; allowed: 'log' or 'auto'"):
+        Preparation(stance="yes")
+    wild = replace(log, v=np.random.default_rng(0).normal(size=log.v.shape) * 5.0, u=0.0 * log.u, a=0.0 * log.a)
+    sliding = replace(estimate_stance(wild), flags=np.full((len(log), 4), np.nan))
+    with pytest.raises(DatasetError, match="leave the stance open in all"):
+        sliding.written(wild)
