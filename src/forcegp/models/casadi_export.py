@@ -91,7 +91,7 @@ def export_casadi(
     functions = {called: casadi_function(posterior, name=called)}
     import casadi  # it is there, or the line above has raised
 
-    q, v, u = sample_states(posterior.training, STATES, 2, STATES // 3)
+    q, v, u = sample_states(posterior.training, posterior.system.robot.space, STATES, 2, STATES // 3)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}
     if steps is not None:
         step = f"{called}_step"

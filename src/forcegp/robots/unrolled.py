@@ -6,8 +6,8 @@ scalars as objects, so that their operators write down products and sums entry b
 
 Body frames have their joint along z (:mod:`forcegp.robots.layout`), so that in body axes a joint is a rotation by q
 about z. A joint of several degrees of freedom moves one body along several of its six axes, [linear; angular]
-(:mod:`forcegp.robots.manifold`). Quantities of body i are written in its own axes about its own origin. With w, w' and a the angular velocity,
-angular acceleration and acceleration of the origin, and P the pseudo-inertia,
+(:mod:`forcegp.robots.manifold`). Quantities of body i are written in its own axes about its own origin. With w, w' and
+a the angular velocity, angular acceleration and acceleration of the origin, and P the pseudo-inertia,
 
     A = [[w']x + [w]x [w]x, a]  (3 x 4),  F = A P,  force f = F[:, 3],  moment n = (F21 - F12, F02 - F20, F10 - F01)
 
@@ -276,7 +276,7 @@ class UnrolledKinematics:
         return self._of_joints(scalars(out))
 
     def _six(self, joint: UnrolledJoint, values: Sequence[Any] | None) -> list[Scalars]:
-        """Linear and angular entries (3,) that a joint of several degrees of freedom takes of all joints' (0 if None)."""
+        """Linear and angular entries (3,) of ``values`` along the axes of a joint of several; 0 if None."""
         six = scalars([0.0] * 6)
         for k in joint.rows if values is not None else ():
             six[self.unrolled.joints[k].axis] = values[k]

@@ -170,8 +170,8 @@ class StructuredPosterior(Posterior):
     ) -> Predictor:
         self._require_commanded_torques()
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        physics = self._physics(self.system)
-        return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
+        physics, training = self._physics(self.system), self.rows_for(self.system)
+        return replace(prepared_predictor(self.latent, self.widening, training, physics, **how), posterior=self)
 
     @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
@@ -359,8 +359,11 @@ class StructuredPosterior(Posterior):
         """
         system = self.system if system is None else system
         self._require_commanded_torques()
-        example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
-        return PredictorCode.of(self._physics(system).traced, example, self.latent, compressed, self.widening)
+        rows = self.rows_for(system)
+        example = [x[:1] for x in (rows.q, rows.v, rows.u)]
+        return PredictorCode.of(
+            self._physics(system), example, system.robot.space, self.latent, compressed, self.widening
+        )
 
     def _require_commanded_torques(self) -> None:
         noise = self.model.noise
@@ -369,6 +372,18 @@ class StructuredPosterior(Posterior):
                 "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
+
+    def rows_for(self, system: MechanicalSystem) -> TrainingData:
+        """The training rows with the inputs of another system, such as one without the switches of contacts."""
+        had = self.model.system.inputs
+        if len(system.inputs) == len(had):
+            return self.training
+        new = [name for name in system.inputs if name not in had]
+        if new:
+            raise InvalidInput(
+                f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
+            )
+        return replace(self.training, u=self.training.u[..., [had.index(name) for name in system.inputs]])
 
     def _physics(self, system: MechanicalSystem) -> PredictorPhysics:
         inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None
