@@ -213,8 +213,8 @@ def test_without_contacts_their_switches_are_no_inputs(floating):
 
 
 def test_redundant_contacts_have_right_derivatives():
-    """A foot that neither moves nor turns: nine rows of rank four, which velocities contradict."""
-    robot = Robot.from_urdf_text(HOPPER, base="spherical")
+    """A foot that neither moves nor turns: nine rows of rank six, which velocities contradict."""
+    robot = Robot.from_urdf_text(HOPPER, base="floating")
     posterior, q, v, u = fitted(MechanicalSystem(robot, fixed_frame("foot")), JointFriction())
     predictor = posterior.predictor(covariance="none")
     close(predictor.mean(q, v, u), posterior.predict(q, v, u).mean)

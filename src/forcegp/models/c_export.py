@@ -28,7 +28,7 @@ from forcegp.models.fused_rollouts import steps_of
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.posterior import StructuredPosterior
-from forcegp.models.structured.predictor_preparation import sample_states
+from forcegp.models.structured.predictor_preparation import rows_for, sample_states
 
 STATES = 300
 """States at which the program is compared."""
@@ -148,7 +148,7 @@ def _named(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
     why, traced, _ = str(error).partition(", which the model's")
     if not traced:
         return error
-    rows = posterior.rows_for(posterior.system)
+    rows = rows_for(posterior.training, posterior.model.system, posterior.system)
     states = [x[:1] for x in (rows.q, rows.v, rows.u)]
 
     def holds(*terms: Any) -> bool:
@@ -173,7 +173,8 @@ def _named(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
 
 def _checks(export: CFiles) -> list[Check]:
     """Every function at states; derivatives, which may jump at training rows, and steps between these only."""
-    training, made = export.posterior.rows_for(export.posterior.system), export.reference
+    own, made = export.posterior, export.reference
+    training = rows_for(own.training, own.model.system, own.system)
     space, sizes = export.code.space, list(export.code.sizes)
     sampled = torch.cat(sample_states(training, space, STATES, 0, STATES // 3), dim=-1)
     finite = export.posterior.predict(*sampled.split(sizes, dim=-1), covariance=False).mean.isfinite().all(-1)

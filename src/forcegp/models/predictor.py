@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from typing_extensions import override
 
 from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
@@ -22,6 +21,7 @@ from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.fused_rollouts import FusedLoop, Motions, fused, steps_of
 from forcegp.models.kept_code import KeptCode
+from forcegp.models.mean_with_gradient import MeanWithGradient
 from forcegp.models.prediction import Gaussian, JointForces, Linearization
 from forcegp.models.predictor_code import TermsFunction
 from forcegp.models.rollout import (
@@ -134,7 +134,7 @@ class Predictor(Summary):
         if not compiled:
             return _finished([self._mean(*part)[0] for part in self._blocks(states)], single)
         if torch.is_grad_enabled() and any(x.requires_grad for x in states):
-            return _finished([_Mean.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
+            return _finished([MeanWithGradient.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
         return _single(self.run("mean", states)[0], single)
 
     def __call__(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor]:
@@ -432,29 +432,6 @@ NO_RESULT = (
     "the predicted acceleration is not finite: the mass matrix is singular there, or a surface has no normal; "
     "MechanicalSystem.check_states names the row and the contact."
 )
-
-
-class _Mean(torch.autograd.Function):
-    """The mean of a compiled predictor, whose backward pass takes the Jacobians of its linearisation."""
-
-    @staticmethod
-    @override
-    def forward(ctx: Any, predictor: Predictor, *states: Tensor) -> Tensor:
-        ctx.predictor = predictor
-        ctx.save_for_backward(*states)
-        return predictor.run("mean", states)[0]
-
-    @staticmethod
-    @override
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            raise InvalidInput(
-                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
-            )
-        (_, nv, nu), space = ctx.predictor.sizes, ctx.predictor.space
-        jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 2 * nv + nu)
-        in_q, in_v, in_u = (grad_outputs[0][:, None] @ jacobian)[:, 0].split([nv, nv, nu], dim=-1)
-        return None, in_q if space.is_vector_space else space.cotangent(ctx.saved_tensors[0], in_q), in_v, in_u
 
 
 def _single(values: Tensor, single: bool) -> Tensor:

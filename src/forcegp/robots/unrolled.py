@@ -150,9 +150,8 @@ class UnrolledKinematics:
             if joint.kind is not None:
                 if i == joint.rows[0]:
                     rotation, origin = _pose(joint.kind, q[joint.positions])
-                    moved = joint.rotation @ rotation, joint.origin + joint.rotation @ origin
-                self.rotations.append(moved[0])
-                self.origins.append(moved[1])
+                    self.rotations += [joint.rotation @ rotation] * len(joint.rows)
+                    self.origins += [joint.origin + joint.rotation @ origin] * len(joint.rows)
                 continue
             (position,) = q[joint.positions]
             if unrolled.coupled:
@@ -235,7 +234,7 @@ class UnrolledKinematics:
             else:
                 wi, dwi = to_body @ w[joint.parent], to_body @ dw[joint.parent]
             if joint.kind is not None:  # the terms of a single axis, along several
-                (moved, turned), own = self._six(joint, v), self._six(joint, None if a is None else a)
+                (moved, turned), own = self._six(joint, v), self._six(joint, a)
                 acceleration = acceleration + np.cross(2.0 * wi + turned, moved) + own[0]
                 w.append(wi + turned)
                 dw.append(dwi + np.cross(wi, turned) + own[1])
@@ -278,8 +277,9 @@ class UnrolledKinematics:
     def _six(self, joint: UnrolledJoint, values: Sequence[Any] | None) -> list[Scalars]:
         """Linear and angular entries (3,) of ``values`` along the axes of a joint of several; 0 if None."""
         six = scalars([0.0] * 6)
-        for k in joint.rows if values is not None else ():
-            six[self.unrolled.joints[k].axis] = values[k]
+        if values is not None:
+            for k in joint.rows:
+                six[self.unrolled.joints[k].axis] = values[k]
         return [six[:3], six[3:]]
 
     def _wrench_in_parent(self, i: int, force: Scalars, moment: Scalars) -> tuple[Scalars, Scalars]:

@@ -41,7 +41,7 @@ from forcegp.models.structured.components import Components, Curve, Latents, com
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
-from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
+from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor, rows_for
 from forcegp.models.structured.update import Keep, learn_and_forget, learn_more_rows
 from forcegp.models.training_data import ACCELERATION, FORCE, Noise, TrainingData, second_moments, shrunk
 from forcegp.priors import JointAccelerations, JointForces, NoForces
@@ -170,7 +170,7 @@ class StructuredPosterior(Posterior):
     ) -> Predictor:
         self._require_commanded_torques()
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        physics, training = self._physics(self.system), self.rows_for(self.system)
+        physics, training = self._physics(self.system), rows_for(self.training, self.model.system, self.system)
         return replace(prepared_predictor(self.latent, self.widening, training, physics, **how), posterior=self)
 
     @override
@@ -359,7 +359,7 @@ class StructuredPosterior(Posterior):
         """
         system = self.system if system is None else system
         self._require_commanded_torques()
-        rows = self.rows_for(system)
+        rows = rows_for(self.training, self.model.system, system)
         example = [x[:1] for x in (rows.q, rows.v, rows.u)]
         return PredictorCode.of(
             self._physics(system), example, system.robot.space, self.latent, compressed, self.widening
@@ -372,18 +372,6 @@ class StructuredPosterior(Posterior):
                 "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
                 "predict, or fit with Noise(..., measured_torque=False)."
             )
-
-    def rows_for(self, system: MechanicalSystem) -> TrainingData:
-        """The training rows with the inputs of another system, such as one without the switches of contacts."""
-        had = self.model.system.inputs
-        if len(system.inputs) == len(had):
-            return self.training
-        new = [name for name in system.inputs if name not in had]
-        if new:
-            raise InvalidInput(
-                f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
-            )
-        return replace(self.training, u=self.training.u[..., [had.index(name) for name in system.inputs]])
 
     def _physics(self, system: MechanicalSystem) -> PredictorPhysics:
         inertials = {name: value.detach() for name, value in inertials_of(self.parameters).items()} or None

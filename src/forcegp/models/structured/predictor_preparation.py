@@ -155,6 +155,22 @@ def prepared_predictor(
     return replace(made, prepare_seconds=time.perf_counter() - begin)
 
 
+def rows_for(training: TrainingData, trained: MechanicalSystem, system: MechanicalSystem) -> TrainingData:
+    """The training rows with the inputs of another system, such as one without the switches of contacts.
+
+    Raises InvalidInput for inputs that they lack.
+    """
+    had = trained.inputs
+    if len(system.inputs) == len(had):
+        return training
+    new = [name for name in system.inputs if name not in had]
+    if new:
+        raise InvalidInput(
+            f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
+        )
+    return replace(training, u=training.u[..., [had.index(name) for name in system.inputs]])
+
+
 def _numbers(latent: LatentPosterior, training: TrainingData, physics: PredictorPhysics) -> list[Tensor]:
     """All that decide a predictor of a described system and prior."""
     found = [training.q, training.v, training.u, *latent.features, *latent.weights]
