@@ -11,6 +11,8 @@ from forcegp import Dataset, JointFriction, MechanicalSystem, Noise, Robot, Stru
 from forcegp.codegen.branch_free_linalg import pseudo_inverse
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters, fixed_frame, fixed_point
+from forcegp.models import casadi_function
+from forcegp.models.casadi_export import export_casadi
 from forcegp.priors import JointForces
 
 HOPPER = """<robot name="hopper"><link name="trunk"><inertial><origin xyz="0.02 -0.01 0.03"/><mass value="5"/>
@@ -192,6 +194,31 @@ def test_derivatives_in_c(floating, tmp_path):
         export_c(posterior, tmp_path / "d", jacobian=True, steps=0.01)
     with pytest.raises(InvalidInput, match="not 'implicit-midpoint'; give one of 'symplectic-euler', 'rk4'"):
         export_c(posterior, tmp_path / "d", steps=0.01, integrator="implicit-midpoint")
+
+
+def test_functions_of_casadi(case, tmp_path):
+    posterior, q, v, u = case
+    casadi = pytest.importorskip("casadi")
+    robot, rows = posterior.system.robot, [x.numpy().T for x in (q, v, u)]
+    function = casadi_function(posterior)
+    a, q_dot = (torch.as_tensor(np.array(x)).T for x in function.map(ROWS)(*rows))
+    close(a, posterior.predict(q, v, u).mean)
+    size = 1e-6
+    close(q_dot, (robot.integrate(q, size * v) - robot.integrate(q, -size * v)) / (2 * size), 1e-8)
+    slope = torch.as_tensor(np.array(function.factory("j", ["q", "v", "u"], ["jac:a:q"])(*(x[:, 3] for x in rows))))
+    predictor = posterior.predictor(covariance="none")
+    close(slope @ robot.space.tangent(q[3]), predictor.linearize(q[3], v[3], u[3]).da_dq, 1e-9)
+    for integrator in ("symplectic-euler", "rk4"):
+        step = casadi_function(posterior, steps=0.01, integrator=integrator)
+        expected = predictor.step(q, v, u, 0.01, integrator)
+        for found, wanted in zip(step.map(ROWS)(*rows), expected, strict=True):
+            close(torch.as_tensor(np.array(found)).T, wanted)
+    written = export_casadi(posterior, tmp_path, steps=0.01)
+    assert len(written) == 2
+    assert max(written.values()) < 1e-10
+    with pytest.raises(InvalidInput, match="is not 'implicit-midpoint'; give one of 'symplectic-euler', 'rk4'"):
+        casadi_function(posterior, steps=0.01, integrator="implicit-midpoint")
+    assert casadi.Function.load(str(tmp_path / "hopper.casadi")).n_out() == 2
 
 
 def test_what_is_refused(floating):

@@ -24,10 +24,10 @@ INSTEAD_OF_TRANSFORMS = (
 class CompiledRobot:
     """The dynamics of a robot, compiled for it; made by ``robot.compile()``.
 
-    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, and backward passes give the
-    derivatives with respect to all arguments and inertial parameters. Results agree to rounding. Not supported, with
-    an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of ``torch.func``,
-    forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
+    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, also where a base moves, and
+    backward passes give the derivatives with respect to all arguments and inertial parameters. Results agree to
+    rounding. Not supported, with an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of
+    ``torch.func``, forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
 
     A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
     ``folder`` (``~/.cache/forcegp/compiled`` by default) holds them already; :meth:`prepare` does so ahead. Code from
@@ -46,6 +46,7 @@ class CompiledRobot:
         self.robot = robot
         self.folder = default_folder() if folder is None else Path(folder).expanduser()
         self._unrolled = UnrolledRobot(robot)
+        self._nv, self._space = robot.nv, robot.space
         self._programs: dict[Request, RowFunction] = {}
 
     def __reduce__(self) -> "tuple[type[CompiledRobot], tuple[RobotStructure, Path]]":
@@ -114,9 +115,9 @@ class CompiledRobot:
         return found
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
-        nv, given = self._unrolled.nv, list(arguments.values())
+        nv, given = self._nv, list(arguments.values())
         parameters = [*self.robot.checked_inertials(inertials).values()] if inertials else []
-        plain = are_plain(given, nv) if self.robot.space.is_vector_space else self._are_possible(arguments)
+        plain = self._are_possible(arguments) if self._space.groups else are_plain(given, nv)
         if not plain:
             given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
         require_plain((*given, *parameters), "compiled dynamics", INSTEAD_OF_TRANSFORMS)
@@ -146,9 +147,9 @@ class CompiledRobot:
     def _are_possible(self, arguments: Mapping[str, Tensor]) -> bool:
         """`are_plain` where q has more entries than v and a length to check."""
         q, *others = arguments.values()
-        plain = are_plain([q], self.robot.nq) and are_plain(others, self.robot.nv)
+        plain = are_plain([q], self._space.nq) and are_plain(others, self._nv)
         if plain and all(x.shape[:-1] == q.shape[:-1] for x in others):
-            self.robot.space.check(q)
+            self._space.check(q)
             return True
         return False
 
