@@ -122,6 +122,15 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     close(v_next, found.v[:, 1], 1e-9)
 
 
+def test_motions_under_drawn_functions(case):
+    posterior, q, v, u = case
+    u = u[:2, None].expand(-1, 6, -1).clone()
+    found = posterior.predictor(covariance="none").rollouts(q[:2], v[:2], u, 0.004, functions=3, seed=4)
+    expected = posterior.rollout(q[:2], v[:2], u, 0.004, samples=3, seed=4).samples
+    for name in "qva":
+        close(getattr(found, name), getattr(expected, name), 1e-7)  # drawn functions are tables
+
+
 def test_a_motion_that_diverges_is_the_same(floating):
     posterior, q, v, u = floating
     u = 1e3 * u[:8, None].expand(-1, 40, -1).clone()
