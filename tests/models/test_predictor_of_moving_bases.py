@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import Dataset, JointFriction, MechanicalSystem, Noise, Robot, StructuredGP, export_c
+from forcegp import Contact, Dataset, JointFriction, MechanicalSystem, Noise, Plane, Robot, StructuredGP, export_c
 from forcegp.codegen.branch_free_linalg import pseudo_inverse
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters, fixed_frame, fixed_point
@@ -22,6 +22,15 @@ HOPPER = """<robot name="hopper"><link name="trunk"><inertial><origin xyz="0.02 
   <limit lower="-2" upper="2" effort="50" velocity="20"/></joint>
 <link name="foot"><inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
   <inertia ixx="0.002" iyy="0.002" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+ARM = """<robot name="arm"><link name="base"/>
+<joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+  <limit lower="-2" upper="2" effort="50" velocity="20"/></joint>
+<link name="upper"><inertial><origin xyz="0 0 0.1"/><mass value="1.5"/>
+  <inertia ixx="0.02" iyy="0.02" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="bend" type="revolute"><origin xyz="0 0 0.2"/><parent link="upper"/><child link="hand"/><axis xyz="0 1 0"/>
+  <limit lower="-2" upper="2" effort="50" velocity="20"/></joint>
+<link name="hand"><inertial><origin xyz="0 0 0.1"/><mass value="0.5"/>
+  <inertia ixx="0.004" iyy="0.004" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
 ROWS = 24
 
 
@@ -255,6 +264,34 @@ def test_without_contacts_their_switches_are_no_inputs(floating):
     posterior, q, v, u = floating
     flying = posterior.with_contacts([])
     close(flying.predictor().mean(q, v, u[:, :-1]), flying.predict(q, v, u[:, :-1]).mean)
+
+
+@pytest.mark.filterwarnings("ignore:half of the training points:forcegp.errors.DataWarning")
+@pytest.mark.parametrize("integrator", ["rk4", "implicit-midpoint"])
+def test_an_arm_with_a_switch(integrator, tmp_path):
+    """Its base is fixed, and u has more entries than v."""
+    robot = Robot.from_urdf_text(ARM)
+    stance = Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 0.3), switch="stance")
+    posterior, q, v, u = fitted(MechanicalSystem(robot, (stance,)), JointFriction())
+    predictor, held, dt = posterior.predictor(covariance="none"), u[:3, None].expand(-1, 6, -1), 0.004
+    for found, expected in zip(
+        predictor.linearize(q, v, u),
+        posterior.predictor(covariance="none", compile=False).linearize(q, v, u),
+        strict=True,
+    ):
+        close(found, expected)
+    found = predictor.rollouts(q[:3], v[:3], held, dt, integrator=integrator)
+    expected = posterior.rollout(q[:3], v[:3], held, dt, integrator=integrator)
+    for name in "qva":
+        close(getattr(found, name), getattr(expected, name), 1e-9)
+    step, size = predictor.linearize_step(q, v, u, dt, integrator), 1e-5
+    for j in range(3):
+        change = torch.eye(3, dtype=torch.float64)[j] * size
+        ends = [torch.cat(predictor.step(q, v, u + sign * change, dt, integrator), -1) for sign in (1.0, -1.0)]
+        close(step.B[..., j], (ends[0] - ends[1]) / (2 * size), 1e-7)
+    written = export_c(posterior, tmp_path / "c", steps=dt, integrator=integrator)
+    assert max(written.differences.values()) < 1e-8
+    assert "linearize" not in (tmp_path / "c" / "arm_external.c").read_text()
 
 
 def test_redundant_contacts_have_right_derivatives():

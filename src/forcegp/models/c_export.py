@@ -102,10 +102,10 @@ def export_c(
                 f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, steps_of(space)))} as "
                 "`integrator`."
             )
-        if jacobian and not space.is_vector_space:
+        if jacobian and len({*posterior.system.sizes}) > 1:
             raise InvalidInput(
-                "derivatives of exported steps need a base that is fixed; export `jacobian` without `steps`, or take "
-                "`predictor.linearize_step`."
+                "derivatives of exported steps need a base that is fixed and one input per joint; export `jacobian` "
+                "without `steps`, or take `predictor.linearize_step`."
             )
     if covariance and not (isinstance(posterior.latent, ExactPosterior) and posterior.latent_names):
         raise InvalidInput(

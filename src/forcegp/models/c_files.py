@@ -12,7 +12,7 @@ from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import head, write_function
 from forcegp.data import units_for
 from forcegp.inference.one_input_calls import OneInputCall
-from forcegp.models.fused_rollouts import steps_of
+from forcegp.models.fused_rollouts import step_source
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -73,7 +73,8 @@ class CFiles:
         start = [", ".join(map(repr, x.tolist())) for x in self.split(checks[0].states[0])]
         program = sections(__name__, "exported_c/model.c")
         space = self.code.space
-        stepped = steps_of(space).get(self.integrator, "").replace("PROGRAM", self._stepped)
+        given = self.integrator, self._stepped, space, self.code.sizes
+        stepped = "" if self.dt is None else step_source(*given)
         words: dict[str, object] = {
             "NAME": self.name,
             "NV": nv,
@@ -102,7 +103,9 @@ class CFiles:
         }
         for form in ("external", "acados") if self.dt is not None else ("external",):
             found = sections(__name__, f"exported_c/{form}.c")
-            kinds = self.kinds if not moves else [kind for kind in self.kinds if kind != "linearize"]  # steps, not in q
+            kinds = (
+                self.kinds if nq == nv == nu else [kind for kind in self.kinds if kind != "linearize"]
+            )  # of one size
             chosen = "".join(found[kind] for kind in ("head", *kinds) if kind in found)
             files[f"{self.name}_{form}.c"] = filled(chosen, words)
         files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
@@ -120,7 +123,15 @@ class CFiles:
         words: dict[str, object] = {"ADVANCE": texts["turned" if moving else "added"], "STATE": "q, v, u", "NAMED": ""}
         if nq == nv == nu:
             words |= {"ALL": f"3 * {n}", "AT_U": f"2 * {n}", "X": f"2 * {n}", "SLOPES_SIZE": f"3 * {n} * {n}"}
-            more = {"COLUMNS": "3 NV", "POSITIONS": "", "ROWS": "3 * N", "Q": "N", "U": "N", "X_SIZE": "2 * N"}
+            more = {
+                "COLUMNS": "3 NV",
+                "POSITIONS": "",
+                "ROWS": "3 * N",
+                "Q": "N",
+                "U": "N",
+                "X_SIZE": "2 * N",
+                "Y": "3 * N * N",
+            }
             return words | more | {"MORE": "", "ZEROS": "2 * N"}
         words |= {
             "ALL": nq + nv + nu,
@@ -130,7 +141,14 @@ class CFiles:
             "ROWS": "NQ + N + NU",
         }
         words |= {"COLUMNS": columns, "POSITIONS": f"NQ = {nq}, NU = {nu}, ", "MORE": f", NQ = {nq}, NU = {nu}"}
-        words |= {"Q": "NQ", "U": "NU", "X_SIZE": "NQ + N", "ZEROS": "NQ + N + NU", "NAMED": texts["named"]}
+        words |= {
+            "Q": "NQ",
+            "U": "NU",
+            "X_SIZE": "NQ + N",
+            "ZEROS": "NQ + N + NU",
+            "Y": f"N * {columns}",
+            "NAMED": texts["named"],
+        }
         return words | ({"STATE": "step from q, v, u"} if moving else {})
 
     @property

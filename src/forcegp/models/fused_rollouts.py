@@ -29,6 +29,12 @@ STEPS = sections(__name__, "rollout_steps.c")
 ON_A_MANIFOLD = "-on-a-manifold"
 
 
+def step_source(method: str, function: str, space: ConfigurationSpace, sizes: tuple[int, int, int]) -> str:
+    """The text of a step that calls `function`, whose slopes are those in a step from q, v and u."""
+    columns = "3 * N" if len({*sizes}) == 1 else f"{2 * sizes[1] + sizes[2]}"
+    return steps_of(space)[method].replace("PROGRAM", function).replace("COLUMNS", columns)
+
+
 def steps_of(space: ConfigurationSpace) -> dict[str, str]:
     """The steps in C, by integrator, of a robot with these positions."""
     apart = {name: text for name, text in STEPS.items() if name.endswith(ON_A_MANIFOLD) != space.is_vector_space}
@@ -39,7 +45,7 @@ def loop_source(method: str, function: str, space: ConfigurationSpace, sizes: tu
     """The C function `evaluate` of a loop whose steps call `function`, which for implicit ones gives slopes, too."""
     nq, nv, nu = sizes
     outputs = nv + nv * (2 * nv + nu) if method == "implicit-midpoint" else nv
-    step = steps_of(space)[method].replace("PROGRAM", function)
+    step = step_source(method, function, space, sizes)
     text = ROWS + c_text(__name__, "rollout_loop.c").replace("STEP", step, 1)
     numbers = {"JOINTS": nv, "POSITIONS": nq, "GIVEN": nu, "OUTPUTS": outputs, "LIMIT": repr(SPEED_LIMIT)}
     for name, value in numbers.items():

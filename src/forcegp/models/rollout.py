@@ -294,7 +294,7 @@ def linearized_step(
 
     `step` gives [q, v] after it from the rows x, `linearize` gives a (n, nv), da/dq, da/dv and da/du (n, nv, nv).
     """
-    method, (q, v, u) = _method(system, dt, integrator), x.detach().chunk(3, dim=-1)
+    method, (q, v, u) = _method(system, dt, integrator), x.detach().split(system.sizes, dim=-1)
     nv, unit = q.shape[-1], torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
     def joined(value: Tensor, slopes: Tensor) -> Tensor:
@@ -317,9 +317,9 @@ def linearized_step(
     else:
         found = method.step(acceleration, start_q, start_v, dt)
         end = found.q, found.v
-    there, slopes = torch.cat([part.unflatten(1, (nv, -1)) for part in end], dim=1).split([1, 3 * nv], dim=-1)
+    there, slopes = torch.cat([part.unflatten(1, (nv, -1)) for part in end], dim=1).split([1, len(unit)], dim=-1)
     c = there[..., 0] - (slopes @ x.detach()[..., None])[..., 0]
-    (q, v), (A, B) = there[..., 0].split(nv, dim=-1), slopes.split([2 * nv, nv], dim=-1)
+    (q, v), (A, B) = there[..., 0].split(nv, dim=-1), slopes.split([2 * nv, u.shape[-1]], dim=-1)
     return StepLinearization(q, v, A, B, c)
 
 

@@ -56,7 +56,7 @@
           for (int i = 0; i < N; i++) {
             r[i] = -(AT(m[i], k) - AT(v0[i], k) - h * AT(y[i], k));
             for (int j = 0; j < N; j++)
-              J[i][j] = (i == j) - h * (AT(y[N + 3 * N * i + N + j], k) + h * AT(y[N + 3 * N * i + j], k));
+              J[i][j] = (i == j) - h * (AT(y[N + COLUMNS * i + N + j], k) + h * AT(y[N + COLUMNS * i + j], k));
           }
           for (int p = 0; p < N; p++) {
             int best = p;

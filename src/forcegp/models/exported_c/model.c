@@ -68,7 +68,7 @@ int @NAME@_step(const double q[@NQ@], const double v[@NV@], const double u[@NU@]
   const double *const *t = tables;
   const double dt = @DT@;
   const long live = 1;
-  double x[@ROWS@], y[N + 3 * N * N], q1[@Q@], v1[N], a[N], q0[@Q@], v0[N], m[N], d[N];
+  double x[@ROWS@], y[N + @Y@], q1[@Q@], v1[N], a[N], q0[@Q@], v0[N], m[N], d[N];
   (void)ROUNDS; (void)a; (void)q0; (void)v0; (void)m; (void)d;
   if (refused(q, v, u, x, q_next, @Q@) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
   { @STEP@ }
