@@ -9,7 +9,7 @@ import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,21 +28,6 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.models.fused_rollouts import FusedLoop, loop_source, steps_of
 from forcegp.robots.manifold import ConfigurationSpace
-
-
-class Terms(Protocol):
-    """What `PredictorPhysics` gives to be traced."""
-
-    def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
-        """What programs are written from."""
-        ...
-
-    def held(
-        self, q: Tensor, v: Tensor, u: Tensor, f: Tensor, a: Tensor, multiplier: Tensor, left: Tensor
-    ) -> list[Tensor]:
-        """What derivatives are made of."""
-        ...
-
 
 TermsFunction = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 """States (n, size) -> [offset (n, nv), W (n, nv, C), features of every process (n, d)], where a = offset + W f."""
@@ -73,14 +58,14 @@ class PredictorCode:
     @classmethod
     def of(
         cls,
-        terms: "Terms",
+        terms: Any,
         example: Sequence[Tensor],
         space: ConfigurationSpace,
         latent: LatentPosterior,
         compressed: CompressedCovariance | None,
         widening: float,
     ) -> "PredictorCode":
-        """Trace it at an example (1, size) of q, v and u.
+        """Trace `terms`, a PredictorPhysics, at an example (1, size) of q, v and u.
 
         Raises InvalidInput on another device, and for what no graph holds.
         """
