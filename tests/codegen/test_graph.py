@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from forcegp.codegen.branch_free_linalg import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower
-from forcegp.codegen.c_writer import Program, write_program
+from forcegp.codegen.c_writer import Program, write_function, write_program
 from forcegp.codegen.derivatives import gradients, jacobian
-from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Graph, evaluated
+from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Copier, Graph, evaluated
 from forcegp.codegen.library import (
     NOT_FINITE,
     NOT_POSITIVE,
@@ -217,3 +217,18 @@ def test_factor_and_solution_are_those_of_torch():
     with StraightLineAlgebra():
         assert torch.equal(torch.linalg.cholesky(M), cholesky(M))
     assert bool(torch.isnan(cholesky(-M)).any())
+
+
+def test_outputs_of_a_call_stand_where_it_does():
+    """Though there are more of them than statements in a part; and the same after a copy to another graph."""
+    graph = Graph(1)
+    first = graph.apply("sin", graph.inputs[0])
+    outputs = graph.call("f", [first], 11, slopes={(0, 0): 11})
+    made = Graph(1)
+    copied = Copier(made, graph, dict(zip(graph.inputs, made.inputs, strict=True)))([*outputs, first])
+    for of, nodes in ((graph, [*outputs, first]), (made, copied)):
+        text = write_function("part", of, [of.sum(nodes)], 1, ["f"], statements=3)
+        parts = [part for part in text.split("static APART void part_") if "c4[" in part]
+        assert len(parts) == 1
+        assert "real c4[12]" in parts[0]
+        assert all(f"= c4[{k}];" in parts[0] for k in range(11))

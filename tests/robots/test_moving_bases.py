@@ -121,16 +121,23 @@ def pair(request):
     return Pair(request.param)
 
 
+@pytest.fixture(scope="module")
+def compiled(pair, tmp_path_factory):
+    return pair.robot.compile(tmp_path_factory.mktemp("compiled"))
+
+
 def close(found, expected, scale=1.0):
     expected = torch.as_tensor(np.array(expected))
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * max(1.0, float(expected.abs().max())) * scale)
 
 
-def test_mass_matrix_bias_and_both_dynamics(pair):
-    M, bias = pair.robot.mass_matrix_and_bias(pair.q, pair.v)
-    tau = pair.robot.inverse_dynamics(pair.q, pair.v, pair.a)
-    a = pair.robot.forward_dynamics(pair.q, pair.v, pair.tau)
-    gravity = pair.robot.gravity_forces(pair.q)
+@pytest.mark.parametrize("how", ["by torch", "compiled"])
+def test_mass_matrix_bias_and_both_dynamics(pair, compiled, how):
+    of = pair.robot if how == "by torch" else compiled
+    M, bias = of.mass_matrix_and_bias(pair.q, pair.v)
+    tau = of.inverse_dynamics(pair.q, pair.v, pair.a)
+    a = of.forward_dynamics(pair.q, pair.v, pair.tau)
+    gravity = of.gravity_forces(pair.q)
     order = pair.to_v
     for k, q, v, acceleration, force in pair.states():
         expected = pin.crba(pair.model, pair.data, q)
@@ -185,6 +192,38 @@ def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
         pin.computeABADerivatives(pair.model, pair.data, q, v, tau)
         found = torch.func.jacrev(moved)(torch.zeros(pair.robot.nv, dtype=torch.float64), k)
         close(found, pair.data.ddq_dq[order], 100.0)
+
+
+def test_compiled_derivatives_on_the_manifold(pair, compiled):
+    """Of forward and inverse dynamics against Pinocchio, and in the inertias against torch."""
+    order, n, links = np.ix_(pair.to_v, pair.to_v), pair.robot.nv, pair.robot.layout.moving[:2]
+    for k, q, v, a, tau in pair.states():
+        for function, given in (("forward_dynamics", tau), ("inverse_dynamics", a)):
+            steps = torch.zeros(n, n, dtype=torch.float64, requires_grad=True)  # one row for each result
+            force = torch.as_tensor(given[pair.to_v])
+            found = getattr(compiled, function)(pair.robot.integrate(pair.q[k], steps), pair.v[k], force)
+            (slopes,) = torch.autograd.grad(found.diagonal().sum(), steps)
+            if function == "forward_dynamics":
+                pin.computeABADerivatives(pair.model, pair.data, q, v, tau)
+                close(slopes, pair.data.ddq_dq[order], 100.0)
+            else:
+                close(slopes, pin.computeRNEADerivatives(pair.model, pair.data, q, v, a)[0][order], 100.0)
+    inertials = {name: x.requires_grad_() for name, x in pair.robot.inertial_parameters(*links).items()}
+    ours, theirs = (
+        torch.autograd.grad(of.forward_dynamics(pair.q, pair.v, pair.tau, inertials).sum(), [*inertials.values()])
+        for of in (compiled, pair.robot)
+    )
+    for mine, expected in zip(ours, theirs, strict=True):
+        close(mine, expected.numpy(), 10.0)
+
+
+def test_a_compiled_robot_refuses_turns_of_other_length(pair, compiled):
+    if pair.robot.space.is_vector_space:
+        return
+    q = 1.01 * pair.q
+    for given in (q, q[0].contiguous(), q[0].float()):
+        with pytest.raises(InvalidInput, match="of length 1"):
+            compiled.mass_matrix(given)
 
 
 def test_the_chart_is_that_of_the_exponential(pair):

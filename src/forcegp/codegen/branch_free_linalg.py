@@ -7,10 +7,8 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from typing_extensions import override
 
-SWEEPS = {1: 0, 2: 2, 3: 5}
+SWEEPS = {1: 0, 2: 2, 3: 5, 4: 7, 5: 7, 6: 7}
 """Rounds of Jacobi rotations by the number of rows: two columns need one, for more the convergence is quadratic."""
-
-MOST_SWEEPS = 7
 
 
 class StraightLineAlgebra(TorchFunctionMode):
@@ -59,14 +57,20 @@ def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
 
     One-sided Jacobi rotations (Demmel & Veselic, SIAM J. Matrix Anal. Appl. 13, 1992): columns of A^T V become
     orthogonal, their lengths are the singular values, to high relative accuracy. What is left of their products is
-    zero but for its derivatives, and counted to first order.
+    zero but for its derivatives, and counted to first order. Of more than six rows an orthonormal basis is a fifth of
+    the work: A = L Q, where rows within the tolerance of those before have no row of Q, L^T = R U, A^+ = Q^T R^-T U.
     """
     count = matrix.shape[-2]
+    if count not in SWEEPS:
+        L, Q = _lower_and_orthonormal(matrix, tolerance)
+        R, U = _lower_and_orthonormal(L.mT, 0.0)
+        R = R + torch.diag_embed(torch.where(R.diagonal(dim1=-2, dim2=-1) > 0.0, 0.0, 1.0))
+        return (U.mT @ solve_lower(R, Q)).mT
     columns = list(matrix.unbind(-2))
     turns = list(
         torch.eye(count, dtype=matrix.dtype, device=matrix.device).expand(*matrix.shape[:-2], -1, -1).unbind(-1)
     )
-    for _ in range(SWEEPS.get(count, MOST_SWEEPS)):
+    for _ in range(SWEEPS[count]):
         for i in range(count):
             for j in range(i + 1, count):
                 c, s = _rotation(columns[i], columns[j])
@@ -83,6 +87,33 @@ def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
     apart = G - torch.diag_embed(squares)
     inner = torch.diag_embed(inverse) - inverse[..., :, None] * apart * inverse[..., None, :]
     return W @ inner @ V.mT
+
+
+def _lower_and_orthonormal(matrix: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """L (..., m, m) and Q (..., m, n) with L Q the matrix, its rows made orthogonal to those before, twice each.
+
+    What is then below the tolerance of the longest row is dropped: that row of Q is zero.
+    """
+    count, lower, basis = matrix.shape[-2], [], matrix[..., :0, :]
+    squares = (matrix * matrix).sum(-1)
+    largest = squares[..., 0]
+    for k in range(1, count):
+        largest = torch.where(squares[..., k] > largest, squares[..., k], largest)
+    for k, row in enumerate(matrix.unbind(-2)):
+        along = torch.zeros_like(matrix[..., :k, 0])
+        for _ in range(2 if k else 0):
+            share = (basis @ row[..., None])[..., 0]
+            row, along = row - (share[..., None, :] @ basis)[..., 0, :], along + share
+        square = (row * row).sum(-1)
+        kept = square > tolerance**2 * largest
+        length = torch.where(kept, torch.where(kept, square, torch.ones_like(square)).sqrt(), torch.zeros_like(square))
+        unit = torch.where(
+            kept[..., None], row / torch.where(kept, length, torch.ones_like(length))[..., None], 0.0 * row
+        )
+        basis = torch.cat([basis, unit[..., None, :]], dim=-2)
+        rest = torch.zeros_like(matrix[..., : count - k - 1, 0])
+        lower.append(torch.cat([along, length[..., None], rest], dim=-1))
+    return torch.stack(lower, dim=-2), basis
 
 
 def _rotation(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

@@ -229,9 +229,11 @@ def _order(graph: Graph, outputs: Sequence[int]) -> list[int]:
 
 def _places(graph: Graph, parts: list[list[int]]) -> tuple[dict[int, tuple[int, int]], int]:
     """Last part that uses a node and its place in the waiting array, for nodes of earlier parts; size of that array."""
-    for number in range(1, len(parts)):  # no call is cut from its outputs
+    last_part = 0
+    for number in range(1, len(parts)):  # no call is cut from its outputs, of which there may be more than statements
         while parts[number] and graph.nodes[parts[number][0]][0] == "output":
-            parts[number - 1].append(parts[number].pop(0))
+            parts[last_part].append(parts[number].pop(0))
+        last_part = number if parts[number] else last_part
     made = {node: part for part, nodes in enumerate(parts) for node in nodes}
     last: dict[int, int] = {}
     for node, part in made.items():

@@ -38,9 +38,17 @@ def gradients(
     return [adjoint.get(node, ZERO) for node in wanted]
 
 
-def jacobian(graph: Graph, outputs: Sequence[int], inputs: Sequence[int]) -> list[list[int]]:
-    """d outputs_i / d inputs_j, (outputs, inputs)."""
-    tangents: dict[int, dict[int, int]] = {node: {j: ONE} for j, node in enumerate(inputs)}
+def jacobian(
+    graph: Graph, outputs: Sequence[int], inputs: Sequence[int], seeds: Sequence[Sequence[int]] | None = None
+) -> list[list[int]]:
+    """d outputs_i / d inputs_j, (outputs, inputs); with `seeds` (inputs, directions) that matrix times this one."""
+    seeds = (
+        [[ONE if i == j else ZERO for j in range(len(inputs))] for i in range(len(inputs))] if seeds is None else seeds
+    )
+    directions = range(len(seeds[0]) if seeds else 0)
+    tangents: dict[int, dict[int, int]] = {
+        node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in zip(inputs, seeds, strict=True)
+    }
     for node in graph.needed(outputs):
         if node in tangents:
             continue
@@ -59,7 +67,7 @@ def jacobian(graph: Graph, outputs: Sequence[int], inputs: Sequence[int]) -> lis
                     found[j] = graph.apply("add", found[j], product) if j in found else product
         if found:
             tangents[node] = found
-    return [[tangents.get(output, {}).get(j, ZERO) for j in range(len(inputs))] for output in outputs]
+    return [[tangents.get(output, {}).get(j, ZERO) for j in directions] for output in outputs]
 
 
 def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:

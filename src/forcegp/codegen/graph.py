@@ -75,6 +75,14 @@ class Graph:
             self.slopes[call] = slopes
         return [self.output(call, k) for k in range(outputs)]
 
+    def call_of(self, other: "Graph", call: int, operands: Sequence[int]) -> int:
+        """The same call as in another graph."""
+        made = self._record(("call", other.nodes[call][1], *operands))
+        self.outputs_of[made] = other.outputs_of[call]
+        if call in other.slopes:
+            self.slopes[made] = other.slopes[call]
+        return made
+
     def output(self, call: int, position: int) -> int:
         """One output of a call."""
         return self._record(("output", call, position))
@@ -201,6 +209,10 @@ class Copier:
                 known[node] = graph.constant(rest[0])
             elif operation == "look up":
                 known[node] = graph.look_up(rest[0], known[rest[1]])
+            elif operation == "call":
+                known[node] = graph.call_of(self.other, node, [known[operand] for operand in rest[1:]])
+            elif operation == "output":
+                known[node] = graph.output(known[rest[0]], rest[1])
             else:
                 known[node] = graph.apply(operation, *(known[operand] for operand in rest))
         return [known[node] for node in nodes]

@@ -25,6 +25,7 @@ class Controller(Summary):
 
     def __init__(self, robot: Robot, torque_limits: Any, on_failure: OnFailure) -> None:
         require_known("on_failure", on_failure, type(self).__name__, ("raise", "hold"))
+        robot.require_vectors("controllers")
         self.robot, self.on_failure = robot, on_failure
         stated = [joint.effort_limit for joint in robot.joints]
         self.torque_limits = per_joint("torque_limits", stated if torque_limits is None else torque_limits, robot.nv)

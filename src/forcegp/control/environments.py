@@ -65,6 +65,7 @@ class RobotVectorEnv(VectorEnv):
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
         self._how = {"integrator": integrator, "seed": function_seed, "threads": threads}
         robot = self.predictor.posterior.system.robot
+        robot.require_vectors("environments")
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
         self._limits = limits = per_joint("torque_limits", limits, robot.nv).numpy()
         if not limits.any() or not np.isfinite(limits).all():

@@ -74,7 +74,7 @@ class LearnedForces:
 
     def torques(self, *states: Values) -> Values:
         """u (n, nv) in Nm or N of q, v and a."""
-        return inverse_dynamics(self.posterior, torch.as_tensor(np.hstack(states)), None, False).mean.numpy()
+        return inverse_dynamics(self.posterior, [torch.as_tensor(x) for x in states], None, False).mean.numpy()
 
     def after(self, motion: Motion, posterior: StructuredPosterior) -> StructuredPosterior:
         """`posterior` with rows of the motion, far apart, at which just what it predicts was measured."""

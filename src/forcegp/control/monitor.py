@@ -86,6 +86,7 @@ class ContactMonitor(Summary):
         covariance: Literal["noise", "noise and posterior"] | None = None,
     ) -> None:
         self.model, system = model, system_of(model)
+        system.robot.require_vectors("monitors of contacts")
         if system.contacts:
             raise InvalidInput(
                 "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "

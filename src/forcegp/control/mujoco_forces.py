@@ -68,6 +68,7 @@ class MujocoForces(Summary):
     def __init__(self, predictor: Predictor, model: Any, *, draw: int = 0, seed: int = 0) -> None:
         require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         require_type("model", model, mujoco.MjModel)
+        predictor.posterior.system.robot.require_vectors("forces in MuJoCo")
         require_actuated(predictor.posterior)
         self.predictor, self.draw = predictor, whole_number("draw", draw, 0)
         system = predictor.posterior.system

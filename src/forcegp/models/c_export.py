@@ -24,11 +24,11 @@ from forcegp.inference.posterior import ExactPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.c_files import CFiles, Check, identifier
-from forcegp.models.fused_rollouts import STEPS
+from forcegp.models.fused_rollouts import steps_of
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.posterior import StructuredPosterior
-from forcegp.models.structured.predictor_preparation import sample_states
+from forcegp.models.structured.predictor_preparation import rows_for, sample_states
 
 STATES = 300
 """States at which the program is compared."""
@@ -81,6 +81,8 @@ def export_c(
     source: what the header names as the model's origin.
     unchecked: do not compile and compare.
 
+    A robot whose base moves has NAME_integrate, too, and derivatives in a step from q.
+
     Raises InvalidInput for another kind of model, measured torques, a prior that cannot be exported, a covariance where
     the engine has none to compress, steps that are no positive number, another integrator, and a folder that has files;
     CompilerError where the compiler fails, NumericalError where the program and `predict` differ, OSError.
@@ -94,9 +96,16 @@ def export_c(
     if steps is not None:
         check_time_step(steps)
         integrator_named(integrator, posterior.system)
-        if integrator not in STEPS:
+        space = posterior.system.robot.space
+        if integrator not in steps_of(space):
             raise InvalidInput(
-                f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, STEPS))} as `integrator`."
+                f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, steps_of(space)))} as "
+                "`integrator`."
+            )
+        if jacobian and len({*posterior.system.sizes}) > 1:
+            raise InvalidInput(
+                "derivatives of exported steps need a base that is fixed and one input per joint; export `jacobian` "
+                "without `steps`, or take `predictor.linearize_step`."
             )
     if covariance and not (isinstance(posterior.latent, ExactPosterior) and posterior.latent_names):
         raise InvalidInput(
@@ -139,7 +148,8 @@ def _named(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
     why, traced, _ = str(error).partition(", which the model's")
     if not traced:
         return error
-    states = [x[:1] for x in (posterior.training.q, posterior.training.v, posterior.training.u)]
+    rows = rows_for(posterior.training, posterior.model.system, posterior.system)
+    states = [x[:1] for x in (rows.q, rows.v, rows.u)]
 
     def holds(*terms: Any) -> bool:
         def function(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
@@ -163,19 +173,23 @@ def _named(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
 
 def _checks(export: CFiles) -> list[Check]:
     """Every function at states; derivatives, which may jump at training rows, and steps between these only."""
-    training, made = export.posterior.training, export.reference
-    sampled = torch.cat(sample_states(training, STATES, 0, STATES // 3), dim=-1)
-    finite = export.posterior.predict(*sampled.chunk(3, dim=-1), covariance=False).mean.isfinite().all(-1)
+    own, made = export.posterior, export.reference
+    training = rows_for(own.training, own.model.system, own.system)
+    space, sizes = export.code.space, list(export.code.sizes)
+    sampled = torch.cat(sample_states(training, space, STATES, 0, STATES // 3), dim=-1)
+    finite = export.posterior.predict(*sampled.split(sizes, dim=-1), covariance=False).mean.isfinite().all(-1)
     rows = min(STATES // 3, len(training.q))  # of the data themselves; then as many moved ones
     away = torch.randn(len(sampled), 1, generator=torch.Generator().manual_seed(0)).double()
     moved = sampled + 1e-3 * sampled.std(0).clamp_min(1e-3) * away  # as some of these are by nothing
+    if not space.is_vector_space:
+        moved[:, : sizes[0]] = space.normalized(moved[:, : sizes[0]])
     between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
-    rounding = made.rounding(*sampled[finite].chunk(3, dim=-1))
+    rounding = made.rounding(*sampled[finite].split(sizes, dim=-1))
     tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, rounding)
     found = []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]
-        q, v, u = states.chunk(3, dim=-1)
+        q, v, u = states.split(sizes, dim=-1)
         match kind:
             case "mean":
                 wanted = [export.posterior.predict(q, v, u, covariance=False).mean]
@@ -222,7 +236,7 @@ def _difference(export: CFiles, function: Any, check: Check) -> float:
     worst = 0.0
     for row, state in enumerate(check.states):
         made = [np.full(x.shape[1], np.nan) for x in check.wanted]
-        bits = function(*(ctypes.c_void_p(x.ctypes.data) for x in (*np.split(state, 3), *made)))
+        bits = function(*(ctypes.c_void_p(x.ctypes.data) for x in (*export.split(state), *made)))
         pairs = zip(made, check.wanted, check.scales, strict=True)
         apart = float(np.max([np.abs(x - wanted[row]).max() / scale for x, wanted, scale in pairs]))
         if bits or (not apart <= check.tolerance and _solved(export, check, state, made)):
@@ -236,7 +250,7 @@ def _solved(export: CFiles, check: Check, state: np.ndarray, made: list[np.ndarr
     """Whether an implicit step ends at a solution, though at another one than torch finds."""
     if export.integrator != "implicit-midpoint" or "_step" not in check.function or export.dt is None:
         return False
-    q, v, u = (torch.tensor(x) for x in np.split(state, 3))
+    q, v, u = (torch.tensor(x) for x in export.split(state))
     m = 0.5 * (v + torch.tensor(made[1]))
     if not bool(m.isfinite().all()):
         return False

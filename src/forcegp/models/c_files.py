@@ -12,7 +12,7 @@ from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import head, write_function
 from forcegp.data import units_for
 from forcegp.inference.one_input_calls import OneInputCall
-from forcegp.models.fused_rollouts import STEPS
+from forcegp.models.fused_rollouts import step_source
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -33,7 +33,7 @@ def identifier(name: str) -> str:
 
 @dataclass(frozen=True)
 class Check:
-    """What a function of the program gives at states (n, 3 nv), and how far it may be from that, relative."""
+    """What a function of the program gives at states (n, nq + nv + nu), and how far it may be from that, relative."""
 
     function: str
     states: np.ndarray
@@ -69,19 +69,31 @@ class CFiles:
 
     def write(self, folder: Path, source: str | None, said: str, checks: Sequence[Check]) -> None:
         """All files; `said` is how good the program is."""
-        start = [", ".join(map(repr, x.tolist())) for x in np.split(checks[0].states[0], 3)]
+        nq, nv, nu = self.code.sizes
+        start = [", ".join(map(repr, x.tolist())) for x in self.split(checks[0].states[0])]
         program = sections(__name__, "exported_c/model.c")
-        stepped = STEPS[self.integrator].replace("PROGRAM", self._stepped)
-        words: dict[str, object] = {"NAME": self.name, "NV": self.code.nv, "DT": self.dt, "TITLE": self._title}
+        space = self.code.space
+        given = self.integrator, self._stepped, space, self.code.sizes
+        stepped = "" if self.dt is None else step_source(*given)
+        words: dict[str, object] = {
+            "NAME": self.name,
+            "NV": nv,
+            "NQ": nq,
+            "NU": nu,
+            "DT": self.dt,
+            "TITLE": self._title,
+        }
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
         words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
         words |= {"COMMENT": self._comment(said), "GIVEN": 0, "IMPLICIT": int(self.integrator == "implicit-midpoint")}
         words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
+        words |= self._sizes(sections(__name__, "exported_c/sizes.c"))
         if "covariance" in self.kinds:
             words["GIVEN"] = len(self.code.program("covariance").nodes)
         words = {word: filled(str(value), words) for word, value in words.items()}
-        functions = filled("".join(program[kind] for kind in self.kinds), words)
+        moves = () if space.is_vector_space else ("integrate",)
+        functions = filled("".join(program[kind] for kind in (*moves, *self.kinds)), words)
         prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
         words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
         parts = [filled(program["head"], words), *self._program(), filled(program["calls"], words), functions]
@@ -91,11 +103,53 @@ class CFiles:
         }
         for form in ("external", "acados") if self.dt is not None else ("external",):
             found = sections(__name__, f"exported_c/{form}.c")
-            chosen = "".join(found[kind] for kind in ("head", *self.kinds) if kind in found)
+            kinds = (
+                self.kinds if nq == nv == nu else [kind for kind in self.kinds if kind != "linearize"]
+            )  # of one size
+            chosen = "".join(found[kind] for kind in ("head", *kinds) if kind in found)
             files[f"{self.name}_{form}.c"] = filled(chosen, words)
         files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
         for file, content in files.items():
             (folder / file).write_text(content, encoding="ascii")
+
+    def split(self, rows: np.ndarray) -> list[np.ndarray]:
+        """q, v and u (..., size) of rows."""
+        return np.split(rows, np.cumsum(self.code.sizes)[:2], axis=-1)
+
+    def _sizes(self, texts: dict[str, str]) -> dict[str, object]:
+        """Sizes of arrays as the templates write them: by the number of joints, where all are that."""
+        nq, nv, nu = self.code.sizes
+        n, columns, moving = f"{nv}", 2 * nv + nu, not self.code.space.is_vector_space
+        words: dict[str, object] = {"ADVANCE": texts["turned" if moving else "added"], "STATE": "q, v, u", "NAMED": ""}
+        if nq == nv == nu:
+            words |= {"ALL": f"3 * {n}", "AT_U": f"2 * {n}", "X": f"2 * {n}", "SLOPES_SIZE": f"3 * {n} * {n}"}
+            more = {
+                "COLUMNS": "3 NV",
+                "POSITIONS": "",
+                "ROWS": "3 * N",
+                "Q": "N",
+                "U": "N",
+                "X_SIZE": "2 * N",
+                "Y": "3 * N * N",
+            }
+            return words | more | {"MORE": "", "ZEROS": "2 * N"}
+        words |= {
+            "ALL": nq + nv + nu,
+            "AT_U": nq + nv,
+            "X": nq + nv,
+            "SLOPES_SIZE": f"{nv} * {columns}",
+            "ROWS": "NQ + N + NU",
+        }
+        words |= {"COLUMNS": columns, "POSITIONS": f"NQ = {nq}, NU = {nu}, ", "MORE": f", NQ = {nq}, NU = {nu}"}
+        words |= {
+            "Q": "NQ",
+            "U": "NU",
+            "X_SIZE": "NQ + N",
+            "ZEROS": "NQ + N + NU",
+            "Y": f"N * {columns}",
+            "NAMED": texts["named"],
+        }
+        return words | ({"STATE": "step from q, v, u"} if moving else {})
 
     @property
     def _stepped(self) -> str:
@@ -117,6 +171,7 @@ class CFiles:
         if "covariance" in wanted:
             yield from (part.roots_source(1, code.rank) for part in code.sums)
             yield code._covariance_source().replace("void covariance(", "void covariance_of(")
+        yield from code.motion_source(1)
         for kind, function in wanted.items():
             program = code.program(kind)
             called = [part.name + ("_slopes" if kind == "linearize" else "") for part in code.sums]
@@ -130,7 +185,11 @@ class CFiles:
     def _comment(self, said: str) -> str:
         robot, units = self.posterior.system.robot, units_for(self.posterior.system.robot)
         lines = [self._title, f"contacts: {len(self.posterior.system.contacts)}"]
-        for k, name in enumerate(robot.joint_names):
+        if not self.code.space.is_vector_space:
+            lines += [f"q: {', '.join(robot.position_names)}; any length of a quaternion or of cos and sin serves"]
+            lines += [f"v, a: {', '.join(robot.joint_names)}; of a base in its own axes; m, rad, s"]
+            lines += [f"u: {', '.join(self.posterior.system.inputs)}, in the units of the model; switches are 1 or 0"]
+        for k, name in enumerate(robot.joint_names if self.code.space.is_vector_space else ()):
             own = (f"{key} in {units[key] if isinstance(units[key], str) else units[key][k]}" for key in "qvua")
             lines.append(f"joint {k}: {name}, {', '.join(own)}")
         if self.reference.inflation is not None:
@@ -154,7 +213,8 @@ class CFiles:
             rows = rows[:: max(1, len(rows) // STORED)]
             states, what = check.states[rows], check.function.removeprefix(f"{self.name}_")
             arrays.append(_array(f"{what}_states", states))
-            given = [f"{what}_states[k]{f' + {j * self.code.nv}' if j else ''}" for j in range(3)]
+            places = np.cumsum(self.code.sizes)
+            given = [f"{what}_states[k]", *(f"{what}_states[k] + {place}" for place in places[:2])]
             made = [f"r{j}" for j in range(len(check.wanted))]
             lines = [f"double {r}[{wanted.shape[1]}];" for r, wanted in zip(made, check.wanted, strict=True)]
             lines.append(f"if ({check.function}({', '.join(given + made)})) failures++;")

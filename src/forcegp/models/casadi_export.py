@@ -7,25 +7,28 @@ and only here.
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
+from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.c_export import exported_code
 from forcegp.models.c_files import identifier
+from forcegp.models.fused_rollouts import steps_of
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.posterior import StructuredPosterior
-from forcegp.models.structured.predictor_preparation import sample_states
+from forcegp.models.structured.predictor_preparation import rows_for, sample_states
 
 STATES = 100
 TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
@@ -38,10 +41,11 @@ NAMES = {"absolute": "fabs"}
 def casadi_function(
     posterior: Posterior, *, steps: float | None = None, integrator: str = "symplectic-euler", name: str | None = None
 ) -> Any:
-    """The mean acceleration as a `casadi.Function` (q, v, u) -> a, each (nv,) in the units of `predict`.
+    """The mean acceleration as a `casadi.Function` (q, v, u) -> a, (nq,), (nv,), (nu,) -> (nv,) in units of `predict`.
 
     With `steps` instead (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`:
-    "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method.
+    "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method. Where a base moves
+    steps are explicit, a second result of the acceleration is q_dot (nq,), and quaternions count as their directions.
 
     Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed. In
     `name`, that of the function, what CasADi does not take is replaced.
@@ -56,21 +60,24 @@ def casadi_function(
         ) from None
     if not isinstance(posterior, StructuredPosterior):
         raise InvalidInput(f"no program can be written of a {posterior.description}; export a StructuredGP.")
-    posterior.system.robot.require_vectors("CasADi functions")
     code = exported_code(posterior)
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
-    x = [casadi.MX.sym(symbol, code.nv) for symbol in "qvu"]
+    x = [casadi.MX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
-    acceleration = casadi.Function(name, x, [_physics(casadi, code)(*x, f)], ["q", "v", "u"], ["a"])
+    results, names, space = [_physics(casadi, code)(*x, f)], ["a"], code.space
+    acceleration = casadi.Function(name, x, results, ["q", "v", "u"], names)
     if steps is None:
-        return acceleration
+        if space.is_vector_space:
+            return acceleration
+        moved = _of_space(casadi, lambda q, v: (space.tangent(q) @ v[..., None])[..., 0], code.sizes[:2])
+        return casadi.Function(name, x, [*results, moved(*x[:2])], ["q", "v", "u"], [*names, "q_dot"])
     check_time_step(steps)
     integrator_named(integrator, posterior.system)
-    if integrator == "projected":
+    if integrator not in steps_of(space):
         raise InvalidInput(
-            "a step in CasADi is not 'projected'; give 'symplectic-euler', 'rk4' or 'implicit-midpoint'."
+            f"a step in CasADi is not {integrator!r}; give one of {', '.join(map(repr, steps_of(space)))}."
         )
-    there = _stepped(casadi, acceleration, x, float(steps), integrator)
+    there = _stepped(casadi, code, acceleration, x, float(steps), integrator)
     return casadi.Function(name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
 
 
@@ -91,7 +98,8 @@ def export_casadi(
     functions = {called: casadi_function(posterior, name=called)}
     import casadi  # it is there, or the line above has raised
 
-    q, v, u = sample_states(posterior.training, STATES, 2, STATES // 3)
+    rows = rows_for(posterior.training, posterior.model.system, posterior.system)
+    q, v, u = sample_states(rows, posterior.system.robot.space, STATES, 2, STATES // 3)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}
     if steps is not None:
         step = f"{called}_step"
@@ -101,7 +109,7 @@ def export_casadi(
     rounding, found = posterior.predictor(covariance="none", compile=False).rounding(q, v, u), {}
     for file, function in functions.items():
         try:
-            made = _evaluated(function, [x.numpy().T for x in (q, v, u)])
+            made = _evaluated(function, [x.numpy().T for x in (q, v, u)])[:, : expected[file].shape[1]]
         except RuntimeError:  # many lines
             raise NumericalError(
                 f"CasADi finds no step of {steps:g} s by {integrator} somewhere near the training data, so nothing is "
@@ -127,9 +135,31 @@ def _evaluated(function: Any, given: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.array(part) for part in (found if isinstance(found, tuple) else (found,))]).T
 
 
-def _stepped(casadi: Any, acceleration: Any, x: Sequence[Any], dt: float, integrator: str) -> list[Any]:
+def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: Sequence[int]) -> Any:
+    """A function of two vectors that torch computes, such as positions and a step, as one of scalars."""
+    examples = [torch.zeros(size, dtype=torch.float64) for size in sizes]
+    graph, (found,) = trace(lambda x, y: [function(x, y)], examples)
+    vectors = [casadi.SX.sym(symbol, size) for symbol, size in zip("xy", sizes, strict=True)]
+    scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
+    return casadi.Function("moved", vectors, [casadi.vertcat(*expressed(casadi, graph, found.tolist(), scalars))])
+
+
+def _stepped(
+    casadi: Any, code: PredictorCode, acceleration: Any, x: Sequence[Any], dt: float, integrator: str
+) -> list[Any]:
     """The formulas of `integration.integrators`."""
-    q, v, u = x
+    (q, v, u), space, (nq, nv, _) = x, code.space, code.sizes
+    if not space.is_vector_space:
+        moved, rate = _of_space(casadi, space.integrate, (nq, nv)), _of_space(casadi, space.chart_velocity, (nv, nv))
+        if integrator == "symplectic-euler":
+            v = v + dt * acceleration(q, v, u)
+            return [moved(q, dt * v), v]
+        k = [(v, acceleration(q, v, u))]
+        for share in (0.5 * dt, 0.5 * dt, dt):
+            at, step = v + share * k[-1][1], share * k[-1][0]
+            k.append((rate(step, at), acceleration(moved(q, step), at, u)))
+        step, change = (dt / 6.0 * (a + 2.0 * b + 2.0 * c + d) for a, b, c, d in zip(*k, strict=True))
+        return [moved(q, step), v + change]
     if integrator == "symplectic-euler":
         v = v + dt * acceleration(q, v, u)
         return [q + dt * v, v]
@@ -150,17 +180,17 @@ def _stepped(casadi: Any, acceleration: Any, x: Sequence[Any], dt: float, integr
 def _physics(casadi: Any, code: PredictorCode) -> Any:
     """(q, v, u, f) -> a by scalars."""
     graph = code.physics
-    vectors = [casadi.SX.sym(symbol, code.nv) for symbol in "qvu"]
-    vectors.append(casadi.SX.sym("f", len(graph.inputs) - 3 * code.nv))
+    vectors = [casadi.SX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
+    vectors.append(casadi.SX.sym("f", sum(len(part.latents) for part in code.sums)))
     scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
     return casadi.Function("physics", vectors, [casadi.vertcat(*expressed(casadi, graph, code.a, scalars))])
 
 
 def _latents(casadi: Any, code: PredictorCode, x: Sequence[Any]) -> list[Any]:
     """E f of every process in the order of their numbers."""
-    graph, found = Graph(3 * code.nv), {}
+    graph, found = Graph(sum(code.sizes)), {}
     copied = Copier(graph, code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
-    vectors = [casadi.SX.sym(symbol, code.nv) for symbol in "qvu"]
+    vectors = [casadi.SX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
     scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
     for part in code.sums:
         summed = part.summed if isinstance(part, OneInputCall) else part

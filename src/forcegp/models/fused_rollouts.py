@@ -20,16 +20,35 @@ from forcegp.codegen.library import in_threads
 from forcegp.errors import NumericalWarning
 from forcegp.integration.integrators import Integrator
 from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate, warn_of_divergence
+from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS = sections(__name__, "rollout_steps.c")
 """One step in C: from x = [q, v, u] to q1, v1, with the acceleration a at its beginning."""
 
 
-def loop_source(method: str, function: str, nv: int) -> str:
+ON_A_MANIFOLD = "-on-a-manifold"
+
+
+def step_source(method: str, function: str, space: ConfigurationSpace, sizes: tuple[int, int, int]) -> str:
+    """The text of a step that calls `function`, whose slopes are those in a step from q, v and u."""
+    columns = "3 * N" if len({*sizes}) == 1 else f"{2 * sizes[1] + sizes[2]}"
+    return steps_of(space)[method].replace("PROGRAM", function).replace("COLUMNS", columns)
+
+
+def steps_of(space: ConfigurationSpace) -> dict[str, str]:
+    """The steps in C, by integrator, of a robot with these positions."""
+    apart = {name: text for name, text in STEPS.items() if name.endswith(ON_A_MANIFOLD) != space.is_vector_space}
+    return {name.removesuffix(ON_A_MANIFOLD): text for name, text in apart.items()}
+
+
+def loop_source(method: str, function: str, space: ConfigurationSpace, sizes: tuple[int, int, int]) -> str:
     """The C function `evaluate` of a loop whose steps call `function`, which for implicit ones gives slopes, too."""
-    outputs = nv + 3 * nv**2 if method == "implicit-midpoint" else nv
-    text = ROWS + c_text(__name__, "rollout_loop.c").replace("STEP", STEPS[method].replace("PROGRAM", function), 1)
-    for name, value in (("JOINTS", nv), ("OUTPUTS", outputs), ("LIMIT", repr(SPEED_LIMIT))):
+    nq, nv, nu = sizes
+    outputs = nv + nv * (2 * nv + nu) if method == "implicit-midpoint" else nv
+    step = step_source(method, function, space, sizes)
+    text = ROWS + c_text(__name__, "rollout_loop.c").replace("STEP", step, 1)
+    numbers = {"JOINTS": nv, "POSITIONS": nq, "GIVEN": nu, "OUTPUTS": outputs, "LIMIT": repr(SPEED_LIMIT)}
+    for name, value in numbers.items():
         text = text.replace(name, str(value))
     return text
 
@@ -94,13 +113,13 @@ class FusedLoop:
     def __call__(
         self, q: Tensor, v: Tensor, u: Tensor, dt: float, threads: int
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """q, v (n, T + 1, nv), a (n, T, nv) from states (n, nv) under forces (n, T, nv), and where motions stopped.
+        """q, v (n, T + 1, size), a (n, T, nv) from states (n, size) under u (n, T, nu), and where motions stopped.
 
         (n,) -1 for those that lasted, the row from which on a motion is NaN for those that became too fast, and -2 less
         that row for those that the loop could not carry on.
         """
-        n, steps, nv = u.shape
-        Q, V = torch.empty(2, n, steps + 1, nv, dtype=torch.float64).unbind()
+        (n, steps, _), nv = u.shape, v.shape[-1]
+        Q, V = (torch.empty(n, steps + 1, x.shape[-1], dtype=torch.float64) for x in (q, v))
         A, ended = torch.empty(n, steps, nv, dtype=torch.float64), torch.empty(n, dtype=torch.int64)
         given = [x.contiguous() for x in (q, v, u)]
         pointers = [x.data_ptr() for x in (*given, Q, V, A, ended)]

@@ -35,8 +35,9 @@ from forcegp.errors import CompilerError, ForceGPError
 from forcegp.inference.one_input_calls import refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.models.fused_rollouts import STEPS, FusedLoop
+from forcegp.models.fused_rollouts import FusedLoop, steps_of
 from forcegp.models.predictor_code import PURPOSE, PredictorCode
+from forcegp.robots.manifold import ConfigurationSpace
 
 LARGEST = 2**30
 """Bytes of all records together."""
@@ -104,10 +105,11 @@ def kept_covariance(key: str | None, make: Callable[[], CompressedCovariance]) -
 class KeptCode:
     """The programs of a predictor: found, or made of the code that `trace` returns.
 
-    `nv` joints and `contacts` decide how many numbers they give.
+    `sizes` of q, v and u in this `space`, and `contacts`, decide how many numbers they give.
     """
 
-    nv: int
+    space: ConfigurationSpace
+    sizes: tuple[int, int, int]
     contacts: int
     trace: Callable[[], PredictorCode]
     key: str | None
@@ -125,18 +127,19 @@ class KeptCode:
     def refreshed(self, latent: LatentPosterior) -> "KeptCode":
         """That of another posterior with the same kernels. Raises InvalidInput as `refreshed_calls`."""
         made = replace(self.traced, sums=refreshed_calls(self.traced.sums, latent))
-        return KeptCode(self.nv, self.contacts, partial(replace, made), None)
+        return KeptCode(self.space, self.sizes, self.contacts, partial(replace, made), None)
 
     def function(self, kind: str) -> RowFunction:
         """As `PredictorCode.function`."""
-        nv, m = self.nv, self.contacts
-        sizes = {"linearize": [3 * nv**2], "covariance": [nv**2], "forces": [2 * nv**2 + m * nv + m]}.get(kind, [])
+        (_, nv, nu), m = self.sizes, self.contacts
+        around = nv * nu + nv**2 + m * nv + m
+        sizes = {"linearize": [nv * (2 * nv + nu)], "covariance": [nv**2], "forces": [around]}.get(kind, [])
         library, tables = self._program(kind)
-        return RowFunction(library, [nv] * 3, [nv, *sizes], tables)
+        return RowFunction(library, self.sizes, [nv, *sizes], tables)
 
     def loops(self, integrator: str, latent: LatentPosterior, samples: int, seed: int) -> list[FusedLoop] | None:
         """As `PredictorCode.loops`."""
-        if samples or integrator not in STEPS:
+        if samples or integrator not in steps_of(self.space):
             return self.traced.loops(integrator, latent, samples, seed)
         return [FusedLoop(*self._program(integrator))]
 

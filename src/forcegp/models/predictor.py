@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from typing_extensions import override
 
 from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
@@ -20,13 +19,22 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.models.fused_rollouts import STEPS, FusedLoop, Motions, fused
+from forcegp.models.fused_rollouts import FusedLoop, Motions, fused, steps_of
 from forcegp.models.kept_code import KeptCode
+from forcegp.models.mean_with_gradient import MeanWithGradient
 from forcegp.models.prediction import Gaussian, JointForces, Linearization
 from forcegp.models.predictor_code import TermsFunction
-from forcegp.models.rollout import StepLinearization, by_sample, checked_start, linearized_step, stepped
+from forcegp.models.rollout import (
+    StepLinearization,
+    by_sample,
+    checked_start,
+    linearized_on_manifold,
+    linearized_step,
+    stepped,
+)
 from forcegp.models.structured.components import Components, forces_around, inverse_dynamics
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
+from forcegp.robots.manifold import ConfigurationSpace
 from forcegp.summary import Summary
 
 INSTEAD_OF_TRANSFORMS = (
@@ -42,10 +50,11 @@ BLOCK_NUMBERS = 2**18
 class Predictor(Summary):
     """The acceleration that a posterior predicts, fast; made by `posterior.predictor()`.
 
-    States are float64 tensors or arrays (nv,) or (n, nv) in the units of `posterior.predict`; results are tensors with
-    the same leading dimension. They are those of `predict`: means to rounding, covariances exactly or never below, as
-    `kind` says. Differentiable once in q, v and u where these are tensors that require gradients; with `compile=False`
-    any number of times, also forward and by `torch.func`, but for `vmap`: give it all states as rows.
+    States are float64 tensors or arrays (size,) or (n, size) in the units of `posterior.predict`, with the `sizes` of
+    q, v and u; results are tensors with the same leading dimension. They are those of `predict`: means to rounding,
+    covariances exactly or never below, as `kind` says. Differentiable once in q, v and u where these are tensors that
+    require gradients; with `compile=False` any number of times, also forward and by `torch.func`, but for `vmap`: give
+    it all states as rows.
 
     `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
     compressed; `prepare_seconds` is what preparing took, the C compiler included where its work is not kept yet.
@@ -57,7 +66,8 @@ class Predictor(Summary):
 
     __no_type_check__: ClassVar[bool] = True
 
-    nv: int
+    space: ConfigurationSpace
+    sizes: tuple[int, int, int]  # of q, v and u
     device: torch.device
     latent: LatentPosterior
     terms: TermsFunction
@@ -101,6 +111,11 @@ class Predictor(Summary):
         return replace(self, latent=latent, code=code, posterior=posterior, **made)
 
     @property
+    def nv(self) -> int:
+        """Number of degrees of freedom."""
+        return self.sizes[1]
+
+    @property
     def rank(self) -> int | None:
         """How many combinations of the data the covariance uses; None unless it is compressed."""
         return None if self.compressed is None else self.compressed.rank
@@ -113,13 +128,13 @@ class Predictor(Summary):
     def mean(self, q: Any, v: Any, u: Any) -> Tensor:
         """The mean acceleration (nv,) or (n, nv) in rad/s^2 or m/s^2."""
         compiled = self.compiled("mean")
-        if compiled and _is_one_state((q, v, u), self.nv):
+        if compiled and self._is_one_state(q, v, u):
             return self._at_one("mean", compiled, q, v, u)[0]
         states, single = self._states(q, v, u)
         if not compiled:
             return _finished([self._mean(*part)[0] for part in self._blocks(states)], single)
         if torch.is_grad_enabled() and any(x.requires_grad for x in states):
-            return _finished([_Mean.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
+            return _finished([MeanWithGradient.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
         return _single(self.run("mean", states)[0], single)
 
     def __call__(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor]:
@@ -130,7 +145,7 @@ class Predictor(Summary):
         if self.kind == "none":
             raise InvalidInput("this predictor has no covariance; make it with covariance='compressed' or 'exact'.")
         nv, compiled = self.nv, self.compiled("covariance") if self.compressed is not None else None
-        if compiled and _is_one_state((q, v, u), nv):
+        if compiled and self._is_one_state(q, v, u):
             a, covariance = self._at_one("covariance", compiled, q, v, u)
             return a, covariance.view(nv, nv)
         states, single = self._states(q, v, u)
@@ -145,19 +160,22 @@ class Predictor(Summary):
         return _finished(means, single), _finished(covariances, single)
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
-        """The mean acceleration and its Jacobians in q, v and u, without a graph."""
-        nv, compiled = self.nv, self.compiled("linearize")
-        if compiled and _is_one_state((q, v, u), nv):
+        """The mean acceleration and its Jacobians in q, v and u, without a graph.
+
+        Where a base moves, da_dq (..., nv, nv) is that in a step d from q: q moves to `robot.integrate(q, d)`.
+        """
+        (_, nv, nu), compiled = self.sizes, self.compiled("linearize")
+        if compiled and self._is_one_state(q, v, u):
             a, jacobian = self._at_one("linearize", compiled, q, v, u)
-            return Linearization(a, *jacobian.view(nv, 3 * nv).split(nv, dim=-1))
+            return Linearization(a, *jacobian.view(nv, -1).split([nv, nv, nu], dim=-1))
         states, single = self._states(q, v, u)
         require_plain(states, "linearize", "take derivatives of `mean` instead, of a predictor with compile=False")
         a, jacobian = self.run("linearize", states)
-        jacobian = _single(jacobian.view(-1, nv, 3 * nv), single)
-        return Linearization(_single(a, single), *jacobian.split(nv, dim=-1))
+        jacobian = _single(jacobian.view(-1, nv, 2 * nv + nu), single)
+        return Linearization(_single(a, single), *jacobian.split([nv, nv, nu], dim=-1))
 
     def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
-        """The state (q, v) `dt` seconds later under constant u, each (nv,) or (n, nv); differentiable as `mean`.
+        """The state (q, v) `dt` seconds later under constant u, (size,) or (n, size); differentiable as `mean`.
 
         `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/how-to/rollouts.md), which is
         differentiable once. Raises InvalidInput for "projected", other names and a dt that is no positive number,
@@ -165,13 +183,14 @@ class Predictor(Summary):
         """
         states, single = self._states(q, v, u)
         state = self._stepped(torch.cat(states, dim=-1), dt, integrator)
-        q, v = (state[0] if single else state).split(self.nv, dim=-1)
+        q, v = (state[0] if single else state).split(self.sizes[:2], dim=-1)
         return q, v
 
     def _stepped(self, x: Tensor, dt: float, integrator: str) -> Tensor:
         """[q, v] after a step from the rows x = [q, v, u]; implicit ones by the compiled loop where that finds it."""
-        if integrator == "implicit-midpoint" and self.code is not None and not x.requires_grad and len(x):
-            q, v, u = x.chunk(3, dim=-1)
+        implicit = integrator == "implicit-midpoint" and integrator in steps_of(self.space)
+        if implicit and self.code is not None and not x.requires_grad and len(x):
+            q, v, u = x.split(self.sizes, dim=-1)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NumericalWarning)  # of a step that is not found, which is an error here
                 motion = self.rollouts(q, v, u[:, None], dt, integrator=integrator)
@@ -182,10 +201,16 @@ class Predictor(Summary):
     def linearize_step(
         self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
     ) -> StepLinearization:
-        """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph."""
+        """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph.
+
+        Where a base moves, x = (d, v) and x+ = (d+, v+) with the steps d from q, and d+ from the q after the step.
+        """
         states, single = self._states(q, v, u)
         system, rows = self.posterior.system, torch.cat(states, dim=-1)
-        linear = linearized_step(self._stepped, self.linearize, system, rows, dt, integrator)
+        if self.space.is_vector_space:
+            linear = linearized_step(self._stepped, self.linearize, system, rows, dt, integrator)
+        else:
+            linear = linearized_on_manifold(self.mean, system, rows, dt, integrator)
         return StepLinearization(*(part[0] for part in linear)) if single else linear
 
     def rollouts(
@@ -201,7 +226,7 @@ class Predictor(Summary):
         seed: int = 0,
         threads: int | None = None,
     ) -> Motions:
-        """Motions from q0, v0 (..., nv) under forces u (..., T, nv), with batches that broadcast.
+        """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast.
 
         As `posterior.rollout` with the predictor's own system: rad, rad/s, Nm and s (m, m/s, N); what diverges is NaN
         from the row `diverged_at` on. Under the mean, or with `functions` once under each of so many functions drawn
@@ -213,13 +238,13 @@ class Predictor(Summary):
         most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(
-            (self.nv, self.nv, self.nv), self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
+            self.sizes, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
         )
         method = integrator_named(integrator, self.posterior.system)
         check_time_step(dt)
         how = integrator, functions, seed
         loops, acceleration = self._loops.get(how), self.mean
-        if loops is None and integrator in STEPS:
+        if loops is None and integrator in steps_of(self.space):
             loops = self._loops[how] = self._made(lambda code: code.loops(integrator, self.latent, functions, seed))
         if functions:
             model = self.posterior.accelerations(self.posterior.system.baumgarte)
@@ -237,7 +262,7 @@ class Predictor(Summary):
                 motion = integrate(method, acceleration, start, v, forces, dt)
             else:
                 motion = fused(loops, method, acceleration, start, v, forces, dt, most)
-        q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), self.nv) for x in (motion.q, motion.v, motion.a))
+        q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (motion.q, motion.v, motion.a))
         return Motions(q, v, a, motion.diverged_at.reshape(batch))
 
     def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
@@ -247,14 +272,14 @@ class Predictor(Summary):
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""
-        program, nv, m = self.compiled("forces"), self.nv, len(self.posterior.system.contacts)
-        if program and _is_one_state((q, v, u), nv):
+        program, (_, nv, nu), m = self.compiled("forces"), self.sizes, len(self.posterior.system.contacts)
+        if program and self._is_one_state(q, v, u):
             Q, around = self._at_one("forces", program, q, v, u)
         else:
             states, single = self._states(q, v, u)
             Q, around = (_single(x, single) for x in self.run("forces", states))
-        slope, M, A, b = around.split([nv**2, nv**2, m * nv, m], dim=-1)
-        return JointForces(Q, slope.unflatten(-1, (nv, nv)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b)
+        slope, M, A, b = around.split([nv * nu, nv**2, m * nv, m], dim=-1)
+        return JointForces(Q, slope.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b)
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
@@ -266,7 +291,7 @@ class Predictor(Summary):
         Raises InvalidInput for models without analytical mean or actuation, NumericalError where no u is found.
         """
         states, single = self._states(q, v, a, "qva")
-        found = inverse_dynamics(self.posterior, torch.cat(states, dim=-1), normal_force, self.kind != "none")
+        found = inverse_dynamics(self.posterior, states, normal_force, self.kind != "none")
         return found[0] if single else found
 
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
@@ -360,25 +385,43 @@ class Predictor(Summary):
                 torch.autograd.grad(a[:, i].sum(), leaves, retain_graph=True, materialize_grads=True)
                 for i in range(self.nv)
             ]
-        return a.detach(), torch.stack([torch.cat(row, dim=-1) for row in rows], dim=1)
+        in_q, in_v, in_u = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
+        if not self.space.is_vector_space:
+            in_q = in_q @ self.space.tangent(states[0])
+        return a.detach(), torch.cat([in_q, in_v, in_u], dim=-1)
 
     def _states(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[list[Tensor], bool]:
-        """q, v and u as rows (n, nv), and whether it was a single state."""
+        """q, v and u, or a, as rows (n, size), and whether it was a single state."""
         states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
         shape, named = states[0].shape, f"q, v or {names[2]}"
-        if shape[-1:] != (self.nv,) or len(shape) > 2 or any(x.shape != shape for x in states):
+        sizes = self.sizes if names[2] == "u" else (*self.sizes[:2], self.nv)
+        fit = (x.shape == (*shape[:-1], size) for x, size in zip(states, sizes, strict=True))
+        if not shape or len(shape) > 2 or not all(fit):
             shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
-            raise InvalidInput(
-                f"a predictor was given {shapes}; give all three ({self.nv},) for one state or (n, {self.nv})."
-            )
+            wanted = f"all three ({self.nv},) for one state or (n, {self.nv})"
+            if len({*sizes}) > 1:
+                wanted = ", ".join(f"{name} (..., {size})" for name, size in zip(names, sizes, strict=True))
+            raise InvalidInput(f"a predictor was given {shapes}; give {wanted}.")
         if any(x.device.type != self.device.type for x in states):
             raise InvalidInput(f"{named} is on another device than the predictor; move all three to {self.device}.")
         if self.code is not None:
             require_plain(states, "a compiled predictor", INSTEAD_OF_TRANSFORMS)
         for x in states:
             require_finite(named, x)
+        self.space.check(states[0])
         single = len(shape) == 1
         return [x[None] if single else x for x in states], single
+
+    def _is_one_state(self, q: Any, v: Any, u: Any) -> bool:
+        """Whether these are tensors (size,) that need no conversion. Raises InvalidInput for turns of other lengths."""
+        nq, nv, nu = self.sizes
+        if nq == nv == nu:
+            return are_plain((q, v, u), nv) and q.dim() == 1
+        plain = are_plain((q,), nq) and are_plain((v,), nv) and are_plain((u,), nu)
+        if not plain or not q.dim() == v.dim() == u.dim() == 1:
+            return False
+        self.space.check(q)
+        return True
 
     def _blocks(self, states: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
         rows = max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
@@ -389,32 +432,6 @@ NO_RESULT = (
     "the predicted acceleration is not finite: the mass matrix is singular there, or a surface has no normal; "
     "MechanicalSystem.check_states names the row and the contact."
 )
-
-
-class _Mean(torch.autograd.Function):
-    """The mean of a compiled predictor, whose backward pass takes the Jacobians of its linearisation."""
-
-    @staticmethod
-    @override
-    def forward(ctx: Any, predictor: Predictor, *states: Tensor) -> Tensor:
-        ctx.predictor = predictor
-        ctx.save_for_backward(*states)
-        return predictor.run("mean", states)[0]
-
-    @staticmethod
-    @override
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            raise InvalidInput(
-                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
-            )
-        nv = ctx.predictor.nv
-        jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 3 * nv)
-        return None, *(grad_outputs[0][:, None] @ jacobian)[:, 0].split(nv, dim=-1)
-
-
-def _is_one_state(given: Sequence[object], nv: int) -> bool:
-    return are_plain(given, nv) and given[0].dim() == 1  # type: ignore[attr-defined]  # they are tensors then
 
 
 def _single(values: Tensor, single: bool) -> Tensor:

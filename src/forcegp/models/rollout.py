@@ -12,9 +12,9 @@ from torch import Tensor
 
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
-from forcegp.integration.integrators import ImplicitMidpoint, Integrator, check_time_step
+from forcegp.integration.integrators import ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
 from forcegp.mechanics import Baumgarte, MechanicalSystem
-from forcegp.models.fused_rollouts import STEPS, FusedLoop, fused
+from forcegp.models.fused_rollouts import FusedLoop, fused, steps_of
 from forcegp.models.motion_intervals import MotionIntervals
 from forcegp.models.search import blas_threads
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
@@ -184,7 +184,8 @@ def roll_out(
 
 def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, seed: int) -> list[FusedLoop] | None:
     """Compiled loops, where motions are long enough to be worth compiling them."""
-    if model.compiled is None or integrator not in STEPS or steps * max(1, samples) < STEPS_TO_COMPILE:
+    space = model.system.robot.space
+    if model.compiled is None or integrator not in steps_of(space) or steps * max(1, samples) < STEPS_TO_COMPILE:
         return None
     try:
         return model.compiled(integrator, samples, seed)
@@ -256,8 +257,9 @@ def checked_start(
 class StepLinearization(NamedTuple):
     """The state (q, v) after a step from x = (q, v) under u, and the affine model of the step: x+ = A x + B u + c.
 
-    `q`, `v` (nv,); `A` (2 nv, 2 nv) and `B` (2 nv, nv) are the derivatives in x and u, and `c` (2 nv,) = x+ - A x - B u
-    makes the model exact at this x and u. All with the leading dimension of states.
+    `q`, `v` (nv,); `A` (2 nv, 2 nv) and `B` (2 nv, nu) are the derivatives in x and u, and `c` (2 nv,) = x+ - A x - B u
+    makes the model exact at this x and u. All with the leading dimension of states. Where a base moves, q in x and x+
+    is a step (nv,) from the given q and from the `q` (nq,) here, at which both are 0.
     """
 
     q: Tensor
@@ -292,7 +294,7 @@ def linearized_step(
 
     `step` gives [q, v] after it from the rows x, `linearize` gives a (n, nv), da/dq, da/dv and da/du (n, nv, nv).
     """
-    method, (q, v, u) = _method(system, dt, integrator), x.detach().chunk(3, dim=-1)
+    method, (q, v, u) = _method(system, dt, integrator), x.detach().split(system.sizes, dim=-1)
     nv, unit = q.shape[-1], torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
     def joined(value: Tensor, slopes: Tensor) -> Tensor:
@@ -315,10 +317,29 @@ def linearized_step(
     else:
         found = method.step(acceleration, start_q, start_v, dt)
         end = found.q, found.v
-    there, slopes = torch.cat([part.unflatten(1, (nv, -1)) for part in end], dim=1).split([1, 3 * nv], dim=-1)
+    there, slopes = torch.cat([part.unflatten(1, (nv, -1)) for part in end], dim=1).split([1, len(unit)], dim=-1)
     c = there[..., 0] - (slopes @ x.detach()[..., None])[..., 0]
-    (q, v), (A, B) = there[..., 0].split(nv, dim=-1), slopes.split([2 * nv, nv], dim=-1)
+    (q, v), (A, B) = there[..., 0].split(nv, dim=-1), slopes.split([2 * nv, u.shape[-1]], dim=-1)
     return StepLinearization(q, v, A, B, c)
+
+
+def linearized_on_manifold(
+    mean: AccelerationFunction, system: MechanicalSystem, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
+) -> StepLinearization:
+    """The same where positions do not add up, in steps from q and from the q after it; by backward passes of `mean`."""
+    space, (nq, nv, _) = system.robot.space, system.sizes
+    q, rest = x.detach().split([nq, x.shape[-1] - nq], dim=-1)
+    there = stepped(mean, system, x.detach(), dt, integrator)[:, :nq]
+
+    def moved(z: Tensor) -> Tensor:
+        start = torch.cat([space.integrate(q, z[:, :nv]), z[:, nv:]], dim=-1)
+        end = stepped(mean, system, start, dt, integrator)
+        return torch.cat([space.difference(there, end[:, :nq]), end[:, nq:]], dim=-1)
+
+    end, slopes = rows_jacobian(moved, torch.cat([torch.zeros_like(rest[:, :nv]), rest], dim=-1))
+    A, B = slopes.split([2 * nv, slopes.shape[-1] - 2 * nv], dim=-1)
+    c = end - (A[..., nv:] @ rest[:, :nv, None] + B @ rest[:, nv:, None])[..., 0]
+    return StepLinearization(there, end[:, nv:], A, B, c)
 
 
 def _method(system: MechanicalSystem, dt: Any, integrator: Any) -> Integrator:

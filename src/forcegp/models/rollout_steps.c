@@ -2,6 +2,30 @@
 
       PROGRAM(t, live, x, y);
       for (int j = 0; j < N; j++) { a[j] = y[j]; v1[j] = x[N + j] + dt * y[j]; q1[j] = x[j] + dt * v1[j]; }
+//// symplectic-euler-on-a-manifold
+
+      real z[NQ + N];
+      PROGRAM(t, live, x, y);
+      for (int j = 0; j < NQ; j++) z[j] = x[j];
+      for (int j = 0; j < N; j++) { a[j] = y[j]; v1[j] = x[NQ + j] + dt * y[j]; z[NQ + j] = dt * v1[j]; }
+      moved(t, live, z, q1);
+//// rk4-on-a-manifold
+
+      const double c[4] = {0.0, 0.5 * dt, 0.5 * dt, dt}, b[4] = {dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0};
+      real z[NQ + N], p[2 * N], r[N], sum[N]; /* r is the rate of the step from q that z holds */
+      for (int j = 0; j < NQ; j++) z[j] = x[j];
+      for (int j = 0; j < N; j++) { v0[j] = v1[j] = r[j] = x[NQ + j]; sum[j] = y[j] = R(0.0); }
+      for (int s = 0; s < 4; s++) {
+        for (int j = 0; j < N; j++) { p[j] = z[NQ + j] = c[s] * r[j]; p[N + j] = x[NQ + j] = v0[j] + c[s] * y[j]; }
+        if (s) { moved(t, live, z, x); step_rate(t, live, p, r); }
+        PROGRAM(t, live, x, y);
+        for (int j = 0; j < N; j++) {
+          if (!s) a[j] = y[j];
+          sum[j] += b[s] * r[j]; v1[j] += b[s] * y[j];
+        }
+      }
+      for (int j = 0; j < N; j++) z[NQ + j] = sum[j];
+      moved(t, live, z, q1);
 //// rk4
 
       const double c[4] = {0.0, 0.5 * dt, 0.5 * dt, dt}, b[4] = {dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0};
@@ -32,7 +56,7 @@
           for (int i = 0; i < N; i++) {
             r[i] = -(AT(m[i], k) - AT(v0[i], k) - h * AT(y[i], k));
             for (int j = 0; j < N; j++)
-              J[i][j] = (i == j) - h * (AT(y[N + 3 * N * i + N + j], k) + h * AT(y[N + 3 * N * i + j], k));
+              J[i][j] = (i == j) - h * (AT(y[N + COLUMNS * i + N + j], k) + h * AT(y[N + COLUMNS * i + j], k));
           }
           for (int p = 0; p < N; p++) {
             int best = p;

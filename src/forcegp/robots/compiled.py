@@ -1,6 +1,6 @@
 """`CompiledRobot`: the dynamics of one robot as machine code made for it, with first derivatives."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,10 +24,10 @@ INSTEAD_OF_TRANSFORMS = (
 class CompiledRobot:
     """The dynamics of a robot, compiled for it; made by ``robot.compile()``.
 
-    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, and backward passes give the
-    derivatives with respect to all arguments and inertial parameters. Results agree to rounding. Not supported, with
-    an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of ``torch.func``,
-    forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
+    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, also where a base moves, and
+    backward passes give the derivatives with respect to all arguments and inertial parameters. Results agree to
+    rounding. Not supported, with an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of
+    ``torch.func``, forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
 
     A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
     ``folder`` (``~/.cache/forcegp/compiled`` by default) holds them already; :meth:`prepare` does so ahead. Code from
@@ -46,6 +46,7 @@ class CompiledRobot:
         self.robot = robot
         self.folder = default_folder() if folder is None else Path(folder).expanduser()
         self._unrolled = UnrolledRobot(robot)
+        self._nv, self._space = robot.nv, robot.space
         self._programs: dict[Request, RowFunction] = {}
 
     def __reduce__(self) -> "tuple[type[CompiledRobot], tuple[RobotStructure, Path]]":
@@ -114,9 +115,9 @@ class CompiledRobot:
         return found
 
     def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
-        nv, given = self.robot.nv, list(arguments.values())
+        nv, given = self._nv, list(arguments.values())
         parameters = [*self.robot.checked_inertials(inertials).values()] if inertials else []
-        plain = are_plain(given, nv)
+        plain = self._are_possible(arguments) if self._space.groups else are_plain(given, nv)
         if not plain:
             given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
         require_plain((*given, *parameters), "compiled dynamics", INSTEAD_OF_TRANSFORMS)
@@ -133,15 +134,24 @@ class CompiledRobot:
             parameters = [values.expand(*own, 10) for values in parameters]
             shapes = {name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)}
             batch = broadcast_batch(shapes | ({"inertials": own} if parameters else {}))
-            given = [value.expand(*batch, nv) for value in given]
+            given = [value.expand(*batch, value.shape[-1]) for value in given]
         if not simple or len(batch) != 1:
-            given = [value.reshape(batch.numel(), nv).contiguous() for value in given]
+            given = [value.reshape(batch.numel(), value.shape[-1]).contiguous() for value in given]
         call, tensors = _Call(function, tuple(inertials or ()), batch, own), (*given, *parameters)
         if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
             results = _Value.apply(self, call, *tensors)
         else:
             results, _ = values_of(self, call, tensors)
         return _shaped(results, batch, function, nv)  # type: ignore[arg-type]  # torch does not type `apply`
+
+    def _are_possible(self, arguments: Mapping[str, Tensor]) -> bool:
+        """`are_plain` where q has more entries than v and a length to check."""
+        q, *others = arguments.values()
+        plain = are_plain([q], self._space.nq) and are_plain(others, self._nv)
+        if plain and all(x.shape[:-1] == q.shape[:-1] for x in others):
+            self._space.check(q)
+            return True
+        return False
 
 
 def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:

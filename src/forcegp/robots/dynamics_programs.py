@@ -28,6 +28,7 @@ from forcegp.robots.unrolled import (
     Scalars,
     UnrolledKinematics,
     UnrolledRobot,
+    expressions,
     factorize,
     scalars,
     solve_factorized,
@@ -117,6 +118,7 @@ class Request(NamedTuple):
         results = [merged] if self.function == MERGED else [nv**d for d in DIMENSIONS.get(self.function, (1,))]
         given = {"inertias": merged, "parameters": 10 * len(self.links)}
         kept = dict.fromkeys(KEPT, len(unrolled.pairs) + 2 * nv)
+        given |= {"q": unrolled.robot.nq}
         arguments = {name: given.get(name, nv) for name in self.arguments}
         return arguments | kept | dict(zip(self.results, results, strict=True))
 
@@ -185,7 +187,7 @@ def _merged(unrolled: UnrolledRobot, request: Request, graph: Graph, parameters:
 
     example = torch.zeros(len(request.links), 10, dtype=torch.float64)
     _, (found,) = trace(entries, [example], graph, parameters)
-    return scalars([Expression(graph, node) for node in found.flatten().tolist()])
+    return expressions(graph, found).ravel()
 
 
 def _results(
@@ -211,7 +213,7 @@ def compiled_program(unrolled: UnrolledRobot, request: Request, folder: Path) ->
     def write(unit: VectorUnit) -> str:
         return write_program(trace_dynamics(unrolled, request), unit.lanes)
 
-    constants: list[object] = [(joint.parent, joint.revolute, *joint.drive) for joint in unrolled.joints]
+    constants: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in unrolled.joints]
     constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
     constants += [unrolled.gravity.tolist(), unrolled.armature.tolist()]
     if request.links:

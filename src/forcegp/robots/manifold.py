@@ -129,6 +129,20 @@ class ConfigurationSpace:
             lambda group: difference(group.kind, start[..., group.places], end[..., group.places]),
         )
 
+    def tangent(self, q: Tensor) -> Tensor:
+        """dq/dt = tangent v (..., nq, nv): the derivative of `integrate` at the step 0, for turns of any length."""
+        unit = torch.eye(self.nv, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], -1, -1)
+
+        def moved(group: Group) -> Tensor:
+            return velocity_of(group.kind, q[..., None, group.places], unit[..., group.rows])
+
+        return self._joined(lambda rows, _: unit[..., rows], moved).mT
+
+    def cotangent(self, q: Tensor, slope: Tensor) -> Tensor:
+        """The gradient (..., nq) in q of what does not depend on lengths of turns, from its `slope` (..., nv)."""
+        tangent = self.tangent(q)  # whose columns are orthogonal
+        return (tangent @ (slope / (tangent * tangent).sum(-2))[..., None])[..., 0]
+
     def chart_velocity(self, step: Tensor, v: Tensor) -> Tensor:
         """Rate (..., nv) of the `step` from a fixed position where the robot there moves with velocity `v`."""
         if not self.groups:
@@ -188,14 +202,15 @@ class ConfigurationSpace:
     def check(self, q: Float[Tensor, "*batch nq"]) -> None:
         """Raise InvalidInput, naming the entries, where a quaternion, or cos and sin, is far from length 1.
 
-        Inside `torch.func.vmap` no number can be looked at; there only the direction counts (:func:`pose`).
+        Inside `torch.func.vmap`, and where code is written, no number can be looked at; there only the direction counts
+        (:func:`pose`).
         """
         for group in self.groups:
             turn = group.motion.turn
             length = torch.linalg.vector_norm(q.detach()[..., group.places][..., turn], dim=-1).flatten()
             try:
                 worst = float((length - 1.0).abs().max()) if len(length) else 0.0
-            except RuntimeError:
+            except (RuntimeError, InvalidInput):
                 return
             if not worst <= LARGEST_NORM_ERROR:
                 names = ", ".join(f"{group.name}.{name}" for name in group.motion.positions[turn])
@@ -260,6 +275,19 @@ def integrated(kind: str, q: Float[Tensor, "*batch positions"], step: Float[Tens
     quarter = 0.25 * square  # quaternions turn by half the angle
     half = torch.cat([0.5 * _sine(quarter) * angular, 1.0 - quarter * _versine(quarter)], -1)
     turned = quaternion_product(_unit(q[..., motion.turn]), half)
+    return torch.cat([origin, turned], -1) if kind == "floating" else turned
+
+
+def velocity_of(kind: str, q: Float[Tensor, "*batch positions"], v: Float[Tensor, "*batch velocities"]) -> Tensor:
+    """dq/dt under the body velocity v."""
+    motion = MOTIONS[kind]
+    linear, angular = _parts(motion, v)
+    turn = q[..., motion.turn].expand(*v.shape[:-1], -1)
+    origin = (pose(kind, q)[0] @ linear[..., None])[..., 0]
+    if kind == "planar":
+        turned = torch.stack([-turn[..., 1] * angular[..., 2], turn[..., 0] * angular[..., 2]], -1)
+        return torch.cat([origin[..., :2], turned], -1)
+    turned = quaternion_product(turn, torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1))
     return torch.cat([origin, turned], -1) if kind == "floating" else turned
 
 

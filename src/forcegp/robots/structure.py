@@ -265,7 +265,7 @@ class RobotStructure(Summary):
             group = self.layout.groups[0]
             raise InvalidInput(
                 f"{what} need a base that is fixed; {self.name} has the {group.kind} joint {group.name!r}. Fitting, "
-                "prediction, identification and `posterior.rollout` work without."
+                "prediction, identification, predictors and `posterior.rollout` work without."
             )
 
     def checked_parameters(self, link: str, parameters: object) -> Tensor:

@@ -5,8 +5,9 @@ What the robot's structure makes zero or one vanishes while the computation is w
 scalars as objects, so that their operators write down products and sums entry by entry.
 
 Body frames have their joint along z (:mod:`forcegp.robots.layout`), so that in body axes a joint is a rotation by q
-about z. Quantities of body i are written in its own axes about its own origin. With w, w' and a the angular velocity,
-angular acceleration and acceleration of the origin, and P the pseudo-inertia,
+about z. A joint of several degrees of freedom moves one body along several of its six axes, [linear; angular]
+(:mod:`forcegp.robots.manifold`). Quantities of body i are written in its own axes about its own origin. With w, w' and
+a the angular velocity, angular acceleration and acceleration of the origin, and P the pseudo-inertia,
 
     A = [[w']x + [w]x [w]x, a]  (3 x 4),  F = A P,  force f = F[:, 3],  moment n = (F21 - F12, F02 - F20, F10 - F01)
 
@@ -24,7 +25,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
+from forcegp.codegen.graph import Expression, Graph
+from forcegp.codegen.tracing import trace
 from forcegp.robots.layout import WORLD
+from forcegp.robots.manifold import MOTIONS, pose
 from forcegp.robots.mimic import Drive
 from forcegp.robots.structure import RobotStructure
 
@@ -37,13 +41,25 @@ ROUNDING = 1e-15
 
 @dataclass(frozen=True)
 class UnrolledJoint:
-    """Constants of a body and the joint that moves it: where it is at q = 0, in the axes of its parent body."""
+    """Constants of a degree of freedom and the body that it moves: where that is at q = 0, in the axes of its parent.
+
+    It is velocity number `axis` of the body's six. `rows` are all of that body's, the last of which is its number, and
+    `positions` its entries of q; `kind` is that of a joint of several.
+    """
 
     parent: int
-    revolute: bool
+    axis: int
     rotation: Scalars
     origin: Scalars
     drive: Drive
+    rows: range
+    positions: slice
+    kind: str | None
+
+    @property
+    def revolute(self) -> bool:
+        """Whether it turns the body."""
+        return self.axis >= 3
 
 
 class UnrolledRobot:
@@ -55,20 +71,25 @@ class UnrolledRobot:
 
     def __init__(self, robot: RobotStructure, *, rounding: float = ROUNDING) -> None:
         layout, tree = robot.layout, robot.tree
-        robot.require_vectors("compiled programs")
         self.robot, self.rounding = robot, rounding
-        self.joints: tuple[UnrolledJoint, ...] = tuple(
-            UnrolledJoint(
-                parent,
-                joint.type != "prismatic",
-                self._scalars(torch.as_tensor(origin[:3, :3])),
-                self._scalars(torch.as_tensor(origin[:3, 3])),
-                drive,
-            )
-            for parent, joint, origin, drive in zip(
-                layout.parents, layout.bodies, layout.origins, layout.drives, strict=True
-            )
-        )
+        places = range(robot.nv) if tree.positions is None else tree.positions.tolist()
+        whole = {body: group for group in layout.groups for body in range(*group.bodies.indices(len(layout.bodies)))}
+        joints = []
+        for body, (parent, joint, origin, drive) in enumerate(
+            zip(layout.parents, layout.bodies, layout.origins, layout.drives, strict=True)
+        ):
+            group = whole.get(body)
+            if group is None:
+                place = places[drive.joint]
+                axis, rows = 2 if joint.type == "prismatic" else 5, range(body, body + 1)
+                positions = slice(place, place + 1)
+            else:
+                axis, rows = group.motion.free[body - group.body], range(group.bodies.start, group.bodies.stop)
+                positions = group.places
+            rotation, offset = (self._scalars(torch.as_tensor(part)) for part in (origin[:3, :3], origin[:3, 3]))
+            kind = None if group is None else group.kind
+            joints.append(UnrolledJoint(parent, axis, rotation, offset, drive, rows, positions, kind))
+        self.joints: tuple[UnrolledJoint, ...] = tuple(joints)
         self.coupled = layout.coupled
         merged = tree.inertias[..., 0]
         self.inertias = [self._scalars(body, float(body.abs().max())) for body in merged]
@@ -89,8 +110,9 @@ class UnrolledRobot:
         if self.coupled:
             return [(k, i) for k in range(self.nv) for i in range(k)]
         above: list[list[int]] = []
-        for joint in self.joints:
-            above.append([] if joint.parent == WORLD else [*above[joint.parent], joint.parent])
+        for k, joint in enumerate(self.joints):
+            parent = joint.parent if k == joint.rows[0] else k - 1  # that of a chain of single degrees of freedom
+            above.append([] if parent == WORLD else [*above[parent], parent])
         return [(k, i) for k, found in enumerate(above) for i in found]
 
     def _scalars(self, values: torch.Tensor, scale: float = 1.0) -> Scalars:
@@ -104,6 +126,13 @@ def scalars(values: list) -> Scalars:
     return np.array(values, dtype=object)
 
 
+def expressions(graph: Graph, nodes: torch.Tensor) -> Scalars:
+    """Nodes as scalars of the same shape; what is known as floats."""
+    known = [graph.value(node) for node in nodes.flatten().tolist()]
+    pairs = zip(known, nodes.flatten().tolist(), strict=True)
+    return scalars([Expression(graph, node) if x is None else x for x, node in pairs]).reshape(nodes.shape)
+
+
 class UnrolledKinematics:
     """The rigid-body algorithms at given states; one scalar per joint; ``v`` only if they are needed.
 
@@ -115,11 +144,18 @@ class UnrolledKinematics:
     def __init__(self, unrolled: UnrolledRobot, q: Sequence[Any], v: Sequence[Any] | None = None) -> None:
         self.unrolled = unrolled
         self.v = None if v is None else self._of_bodies(v)
-        if unrolled.coupled:
-            q = [q[k] * multiplier + offset for k, multiplier, offset in (joint.drive for joint in unrolled.joints)]
         self.rotations: list[Scalars] = []  # body axes -> parent's axes
         self.origins: list[Scalars] = []  # body's origin in the parent's frame
-        for joint, position in zip(unrolled.joints, q, strict=True):
+        for i, joint in enumerate(unrolled.joints):
+            if joint.kind is not None:
+                if i == joint.rows[0]:
+                    rotation, origin = _pose(joint.kind, q[joint.positions])
+                    self.rotations += [joint.rotation @ rotation] * len(joint.rows)
+                    self.origins += [joint.origin + joint.rotation @ origin] * len(joint.rows)
+                continue
+            (position,) = q[joint.positions]
+            if unrolled.coupled:
+                position = position * joint.drive.multiplier + joint.drive.offset
             if joint.revolute:
                 known = isinstance(position, float)
                 c, s = (math.cos(position), math.sin(position)) if known else (position.cos(), position.sin())
@@ -134,19 +170,16 @@ class UnrolledKinematics:
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
         composite = list(self.unrolled.inertias if inertias is None else inertias)
         for i in reversed(range(n)):
-            if joints[i].parent != WORLD:
+            if joints[i].parent != WORLD and i == joints[i].rows[-1]:
                 composite[joints[i].parent] = composite[joints[i].parent] + self._inertia_in_parent(i, composite[i])
         M = scalars([[0.0] * n for _ in range(n)])
         for j in range(n):
-            P = composite[j]
-            hx, hy = P[0, 3], P[1, 3]
-            if joints[j].revolute:
-                force, moment = scalars([-hy, hx, 0.0]), scalars([-P[0, 2], -P[1, 2], P[0, 0] + P[1, 1]])
-            else:
-                force, moment = scalars([0.0, 0.0, P[3, 3]]), scalars([hy, -hx, 0.0])
-            i = j
+            i = joints[j].rows[-1]
+            force, moment = _momentum(composite[i], joints[j].axis)
             while True:
-                M[i, j] = M[j, i] = moment[2] if joints[i].revolute else force[2]
+                for k in joints[i].rows:
+                    if k <= j:
+                        M[k, j] = M[j, k] = _along(joints[k], force, moment)
                 if joints[i].parent == WORLD:
                     break
                 force, moment = self._wrench_in_parent(i, force, moment)
@@ -189,6 +222,10 @@ class UnrolledKinematics:
         dw: list[Scalars] = []
         A: list[Scalars] = []
         for i, joint in enumerate(self.unrolled.joints):
+            if i != joint.rows[-1]:
+                for of_bodies in (w, dw, A):
+                    of_bodies.append(scalars([]))
+                continue
             to_body = self.rotations[i].T
             above = base if joint.parent == WORLD else A[joint.parent]
             acceleration = to_body @ (above[:, :3] @ self.origins[i] + above[:, 3])
@@ -196,6 +233,13 @@ class UnrolledKinematics:
                 wi = dwi = scalars([0.0] * 3)
             else:
                 wi, dwi = to_body @ w[joint.parent], to_body @ dw[joint.parent]
+            if joint.kind is not None:  # the terms of a single axis, along several
+                (moved, turned), own = self._six(joint, v), self._six(joint, a)
+                acceleration = acceleration + np.cross(2.0 * wi + turned, moved) + own[0]
+                w.append(wi + turned)
+                dw.append(dwi + np.cross(wi, turned) + own[1])
+                A.append(np.column_stack([_turning(w[i], dw[i]), acceleration]))
+                continue
             own = 0.0 if a is None else a[i]
             x, y = wi[1] * v[i], -(wi[0] * v[i])  # w x (z v), whose z is zero
             if joint.revolute:
@@ -217,15 +261,26 @@ class UnrolledKinematics:
         out = [0.0] * n
         accelerations = self._accelerations(v, a)
         for i in reversed(range(n)):
+            if i != joints[i].rows[-1]:
+                continue
             F = accelerations[i] @ (self.unrolled.inertias if inertias is None else inertias)[i]
             force = forces[i] + F[:, 3]
             moment = moments[i] + scalars([F[x, y] - F[y, x] for x, y in ((2, 1), (0, 2), (1, 0))])
-            out[i] = moment[2] if joints[i].revolute else force[2]
+            for k in joints[i].rows:
+                out[k] = _along(joints[k], force, moment)
             parent = joints[i].parent
             if parent != WORLD:
                 force, moment = self._wrench_in_parent(i, force, moment)
                 forces[parent], moments[parent] = forces[parent] + force, moments[parent] + moment
         return self._of_joints(scalars(out))
+
+    def _six(self, joint: UnrolledJoint, values: Sequence[Any] | None) -> list[Scalars]:
+        """Linear and angular entries (3,) of ``values`` along the axes of a joint of several; 0 if None."""
+        six = scalars([0.0] * 6)
+        if values is not None:
+            for k in joint.rows:
+                six[self.unrolled.joints[k].axis] = values[k]
+        return [six[:3], six[3:]]
 
     def _wrench_in_parent(self, i: int, force: Scalars, moment: Scalars) -> tuple[Scalars, Scalars]:
         """Force and moment of body i about its origin, in the axes and about the origin of its parent body."""
@@ -240,6 +295,30 @@ class UnrolledKinematics:
         second = R @ P[:3, :3] @ R.T + (np.outer(arm, p) + np.outer(p, arm))
         column = (first + p * mass)[:, None]
         return symmetric(np.block([[second, column], [column.T, mass]]))
+
+
+def _pose(kind: str, q: Sequence[Expression]) -> tuple[Scalars, Scalars]:
+    """Rotation (3, 3) and translation (3,) of a joint of several degrees of freedom, by the code of the robot's."""
+    example = torch.tensor(MOTIONS[kind].neutral, dtype=torch.float64)
+    _, (rotation, origin) = trace(lambda x: pose(kind, x), [example], q[0].graph, q)
+    return expressions(q[0].graph, rotation), expressions(q[0].graph, origin)
+
+
+def _momentum(P: Scalars, axis: int) -> tuple[Scalars, Scalars]:
+    """Force and moment (3,) of a body of pseudo-inertia P under a unit of acceleration along one of the six axes."""
+    k = axis % 3
+    i, j, h = (k + 1) % 3, (k + 2) % 3, P[:3, 3]
+    force, moment = scalars([0.0] * 3), scalars([0.0] * 3)
+    if axis < 3:
+        force[k], moment[i], moment[j] = P[3, 3], h[j], -h[i]
+    else:
+        force[i], force[j] = -h[j], h[i]
+        moment[i], moment[j], moment[k] = -P[i, k], -P[j, k], P[i, i] + P[j, j]
+    return force, moment
+
+
+def _along(joint: UnrolledJoint, force: Scalars, moment: Scalars) -> Any:
+    return moment[joint.axis - 3] if joint.revolute else force[joint.axis]
 
 
 def symmetric(lower: Scalars) -> Scalars:

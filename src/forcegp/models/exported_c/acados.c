@@ -8,25 +8,25 @@
 
 static void taken(void **in, double *x) {
   struct blasfeo_dvec_args *state = in[0], *input = in[1];
-  for (int k = 0; k < 2 * @NV@; k++) x[k] = blasfeo_dvecex1(state->x, state->xi + k);
-  for (int k = 0; k < @NV@; k++) x[2 * @NV@ + k] = blasfeo_dvecex1(input->x, input->xi + k);
+  for (int k = 0; k < @X@; k++) x[k] = blasfeo_dvecex1(state->x, state->xi + k);
+  for (int k = 0; k < @NU@; k++) x[@X@ + k] = blasfeo_dvecex1(input->x, input->xi + k);
 }
 static void given(void **out, const double *x) {
   struct blasfeo_dvec_args *next = out[0];
-  for (int k = 0; k < 2 * @NV@; k++) blasfeo_dvecin1(x[k], next->x, next->xi + k);
+  for (int k = 0; k < @X@; k++) blasfeo_dvecin1(x[k], next->x, next->xi + k);
 }
 int @NAME@_disc_dyn_fun(void **in, void **out, void *params) {
-  double x[3 * @NV@], next[2 * @NV@];
+  double x[@ALL@], next[@X@];
   (void)params;
   taken(in, x);
-  const int found = @NAME@_step(x, x + @NV@, x + 2 * @NV@, next, next + @NV@);
+  const int found = @NAME@_step(x, x + @NQ@, x + @X@, next, next + @NQ@);
   given(out, next);
   return found;
 }
 
 //// step_jacobian
 int @NAME@_disc_dyn_fun_jac(void **in, void **out, void *params) { /* [d x+ / d u, d x+ / d x] transposed */
-  double x[3 * @NV@], next[2 * @NV@], A[4 * @NV@ * @NV@], B[2 * @NV@ * @NV@];
+  double x[@ALL@], next[2 * @NV@], A[4 * @NV@ * @NV@], B[2 * @NV@ * @NV@];
   struct blasfeo_dmat_args *J = out[1];
   (void)params;
   taken(in, x);

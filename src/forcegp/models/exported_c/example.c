@@ -3,9 +3,9 @@
 #include <stdio.h>
 
 int main(void) {
-  double q[@NV@] = {@START_Q@};
+  double q[@NQ@] = {@START_Q@};
   double v[@NV@] = {@START_V@};
-  const double u[@NV@] = {@START_U@};
+  const double u[@NU@] = {@START_U@};
   const double dt = 0.001;
   double a[@NV@];
 
@@ -17,13 +17,9 @@ int main(void) {
     }
     if (step % 100 == 0) {
       printf("%.1f s  q =", step * dt);
-      for (int j = 0; j < @NV@; j++) printf(" %8.4f", q[j]);
+      for (int j = 0; j < @NQ@; j++) printf(" %8.4f", q[j]);
       printf("\n");
     }
-    for (int j = 0; j < @NV@; j++) {
-      v[j] += dt * a[j];
-      q[j] += dt * v[j];
-    }
-  }
+@ADVANCE@  }
   return 0;
 }

@@ -16,15 +16,24 @@ static int stored(const double *from, double *to, int count) {
 }
 /* x = [q, v, u]; what is not finite is refused here, and the `count` results become NaN */
 static int refused(const double *q, const double *v, const double *u, double *x, double *result, int count) {
-  int found = stored(q, x, @NV@) | stored(v, x + @NV@, @NV@) | stored(u, x + 2 * @NV@, @NV@);
+  int found = stored(q, x, @NQ@) | stored(v, x + @NQ@, @NV@) | stored(u, x + @AT_U@, @NU@);
   for (int k = 0; found && k < count; k++) result[k] = NAN;
   return found ? @NAME@_INPUT_NOT_FINITE : @NAME@_OK;
 }
 
+//// integrate
+/* q after the body velocity step[] has acted for one second: velocity times seconds */
+int @NAME@_integrate(const double q[@NQ@], const double step[@NV@], double q_next[@NQ@]) {
+  double x[@NQ@ + @NV@], y[@NQ@];
+  const int found = stored(q, x, @NQ@) | stored(step, x + @NQ@, @NV@);
+  moved(tables, 1, x, y);
+  return stored(y, q_next, @NQ@) | (found ? @NAME@_INPUT_NOT_FINITE : @NAME@_OK);
+}
+
 //// mean
 /* mean of the acceleration at (q, v) under u */
-int @NAME@_mean(const double q[@NV@], const double v[@NV@], const double u[@NV@], double a[@NV@]) {
-  double x[3 * @NV@], y[@NV@];
+int @NAME@_mean(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double a[@NV@]) {
+  double x[@ALL@], y[@NV@];
   if (refused(q, v, u, x, a, @NV@)) return @NAME@_INPUT_NOT_FINITE;
   mean(tables, 1, x, y);
   return stored(y, a, @NV@);
@@ -32,9 +41,9 @@ int @NAME@_mean(const double q[@NV@], const double v[@NV@], const double u[@NV@]
 
 //// covariance
 /* the same and its covariance, without measurement noise */
-int @NAME@_mean_covariance(const double q[@NV@], const double v[@NV@], const double u[@NV@], double a[@NV@],
+int @NAME@_mean_covariance(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double a[@NV@],
                          double covariance[@NV@ * @NV@]) {
-  double x[3 * @NV@], y[@GIVEN@], c[@NV@ * @NV@];
+  double x[@ALL@], y[@GIVEN@], c[@NV@ * @NV@];
   if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, covariance, @NV@ * @NV@)) return @NAME@_INPUT_NOT_FINITE;
   mean_and_terms(tables, 1, x, y);
   covariance_of(tables, y + @NV@, c);
@@ -42,28 +51,28 @@ int @NAME@_mean_covariance(const double q[@NV@], const double v[@NV@], const dou
 }
 
 //// linearize
-/* the same and its derivatives: jacobian[3 NV i + k] = d a_i / d [q, v, u]_k */
-int @NAME@_linearize(const double q[@NV@], const double v[@NV@], const double u[@NV@], double a[@NV@],
-                   double jacobian[3 * @NV@ * @NV@]) {
-  double x[3 * @NV@], y[@NV@ + 3 * @NV@ * @NV@];
-  if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, jacobian, 3 * @NV@ * @NV@)) return @NAME@_INPUT_NOT_FINITE;
+/* the same and its derivatives: jacobian[@COLUMNS@ i + k] = d a_i / d [@STATE@]_k */
+int @NAME@_linearize(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double a[@NV@],
+                   double jacobian[@SLOPES_SIZE@]) {
+  double x[@ALL@], y[@NV@ + @SLOPES_SIZE@];
+  if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, jacobian, @SLOPES_SIZE@)) return @NAME@_INPUT_NOT_FINITE;
   slopes(tables, 1, x, y);
-  return stored(y, a, @NV@) | stored(y + @NV@, jacobian, 3 * @NV@ * @NV@);
+  return stored(y, a, @NV@) | stored(y + @NV@, jacobian, @SLOPES_SIZE@);
 }
 
 //// step
 /* the state one step later */
-int @NAME@_step(const double q[@NV@], const double v[@NV@], const double u[@NV@], double q_next[@NV@],
+int @NAME@_step(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double q_next[@NQ@],
               double v_next[@NV@]) {
-  enum {N = @NV@, ROUNDS = 60};
+  enum {N = @NV@, @POSITIONS@ROUNDS = 60};
   const double *const *t = tables;
   const double dt = @DT@;
   const long live = 1;
-  double x[3 * N], y[N + 3 * N * N], q1[N], v1[N], a[N], q0[N], v0[N], m[N], d[N];
+  double x[@ROWS@], y[N + @Y@], q1[@Q@], v1[N], a[N], q0[@Q@], v0[N], m[N], d[N];
   (void)ROUNDS; (void)a; (void)q0; (void)v0; (void)m; (void)d;
-  if (refused(q, v, u, x, q_next, N) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
+  if (refused(q, v, u, x, q_next, @Q@) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
   { @STEP@ }
-  if (!(stored(q1, q_next, N) | stored(v1, v_next, N))) return @NAME@_OK;
+  if (!(stored(q1, q_next, @Q@) | stored(v1, v_next, N))) return @NAME@_OK;
   return @IMPLICIT@ && !stored(y, a, N) ? @NAME@_STEP_NOT_FOUND : @NAME@_RESULT_NOT_FINITE;
 }
 
@@ -78,7 +87,7 @@ static void along(const double *y, double S[2 * @NV@][3 * @NV@], double K[@NV@][
 }
 
 /* the same and its derivatives in [q, v], A[2 NV i + k], and in u, B[NV i + k] */
-int @NAME@_step_jacobian(const double q[@NV@], const double v[@NV@], const double u[@NV@], double q_next[@NV@],
+int @NAME@_step_jacobian(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double q_next[@NQ@],
                        double v_next[@NV@], double A[4 * @NV@ * @NV@], double B[2 * @NV@ * @NV@]) {
   enum {N = @NV@};
   const double dt = @DT@;

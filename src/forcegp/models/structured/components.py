@@ -1,6 +1,6 @@
 """Forces of a fitted model, each by itself, and those of the actuators that make a wanted acceleration."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -160,20 +160,26 @@ def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tens
 def require_actuated(posterior: Any) -> None:
     """Raises InvalidInput for a StructuredPosterior of which no u can be solved for."""
     actuated = any(isinstance(force, Actuation) for force in posterior.system.known_forces)
+    nv, nu = posterior.system.sizes[1:]
+    if nv != nu:
+        raise InvalidInput(
+            f"no u makes every acceleration: {posterior.system.robot.name} has {nv} degrees of freedom and u has {nu} "
+            "entries; search for u with `predictor.linearize` or `predictor.rollouts`."
+        )
     if posterior.carries_known_forces or not actuated:
         lacks = "analytical mean (fit with mean='analytical')" if actuated else "Actuation() among its known_forces"
         raise InvalidInput(f"this model has no {lacks}, so no u can be solved for; call `predict` or give it one.")
 
 
-def inverse_dynamics(posterior: Any, x: Float[Tensor, "n rows"], normal_force: Any, covariance: bool) -> Gaussian:
-    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a StructuredPosterior at rows x = [q, v, a].
+def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool) -> Gaussian:
+    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a StructuredPosterior at rows of q, v and a.
 
     u stands on both sides: friction in proportion to the load changes with what presses the robot onto the surface,
     and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
     J = d(Q_K + Q_U)/du and the covariance S of the processes, that of u is to first order J^-1 B S B^T J^-T.
     """
     require_actuated(posterior)
-    q, v, a = x.detach().chunk(3, dim=-1)
+    q, v, a = (x.detach() for x in states)
     shape = (len(q), len(posterior.system.contacts))
     wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
     if wanted.shape not in (shape, shape[1:]):

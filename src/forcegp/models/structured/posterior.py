@@ -42,7 +42,7 @@ from forcegp.models.structured.components import Components, Curve, Latents, com
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
-from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor
+from forcegp.models.structured.predictor_preparation import PredictorPhysics, prepared_predictor, rows_for
 from forcegp.models.structured.update import Keep, learn_and_forget, learn_more_rows
 from forcegp.models.training_data import ACCELERATION, FORCE, Noise, TrainingData, second_moments, shrunk
 from forcegp.priors import JointAccelerations, JointForces, NoForces
@@ -171,8 +171,8 @@ class StructuredPosterior(Posterior):
     ) -> Predictor:
         self._require_commanded_torques()
         how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        physics = self._physics(self.system)
-        return replace(prepared_predictor(self.latent, self.widening, self.training, physics, **how), posterior=self)
+        physics, training = self._physics(self.system), rows_for(self.training, self.model.system, self.system)
+        return replace(prepared_predictor(self.latent, self.widening, training, physics, **how), posterior=self)
 
     @override
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
@@ -363,8 +363,11 @@ class StructuredPosterior(Posterior):
         """
         system = self.system if system is None else system
         self._require_commanded_torques()
-        example = [x[:1] for x in (self.training.q, self.training.v, self.training.u)]
-        return PredictorCode.of(self._physics(system).traced, example, self.latent, compressed, self.widening)
+        rows = rows_for(self.training, self.model.system, system)
+        example = [x[:1] for x in (rows.q, rows.v, rows.u)]
+        return PredictorCode.of(
+            self._physics(system), example, system.robot.space, self.latent, compressed, self.widening
+        )
 
     def _require_commanded_torques(self) -> None:
         noise = self.model.noise

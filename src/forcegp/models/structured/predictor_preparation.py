@@ -18,9 +18,10 @@ from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, com
 from forcegp.mechanics import Actuation, ConstrainedDynamics, MechanicalSystem, RigidBodyBias
 from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor
-from forcegp.models.predictor_code import PredictorCode, TermsFunction
+from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.training_data import Standardization, TrainingData
 from forcegp.priors import ForcePrior, prior_to_dict
+from forcegp.robots.manifold import ConfigurationSpace
 
 COVARIANCES = ("auto", "compressed", "exact", "none")
 SAMPLES, CHECKS = 300, 150
@@ -63,6 +64,34 @@ class PredictorPhysics:
         around = passive, dynamics.M, dynamics.A, dynamics.b
         return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
 
+    def held(
+        self, q: Tensor, v: Tensor, u: Tensor, f: Tensor, a: Tensor, multiplier: Tensor, left: Tensor
+    ) -> list[Tensor]:
+        """[lambda, b - A a, r, s, t, H, G], by which derivatives do not go through factors and pseudo-inverses.
+
+        With the acceleration, the multiplier and what is `left` of b - A a (redundant contacts) held,
+
+            r = Q - M a + A^T lambda,  s = b - A a,  t = A^T left,
+            da = H dr + G (ds + G^T dt),  G = M^-1 A^T (A M^-1 A^T)^+
+
+        which is implicit differentiation, and for `left` the derivative of a pseudo-inverse of constant rank (Golub &
+        Pereyra, SIAM J. Numer. Anal. 10, 1973, eq. 4.12).
+        """
+        dynamics = self.system.dynamics(q, v, u, self.inertials)
+        A, lower, inverse = dynamics.A, dynamics.inverse_lower, dynamics.pseudo_inverse
+        Q = (self.prior.mixing(dynamics) @ f[..., None])[..., 0] + (dynamics.Q_K if self.analytical else 0.0)
+        change = inverse @ (dynamics.b[..., None] - A @ (lower.mT @ (lower @ Q[..., None])))
+        found = [(inverse.mT @ change)[..., 0], dynamics.b - (A @ dynamics.acceleration_under(Q)[..., None])[..., 0]]
+        kinematics = dynamics.state.kinematics
+        inertial = kinematics.inverse_dynamics(a, self.inertials) - kinematics.bias_forces(self.inertials)
+        for force in self.system.known_forces:
+            added = force.added_inertia()
+            if added is not None:
+                inertial = inertial + (added @ a[..., None])[..., 0]
+        r = Q - inertial + (A.mT @ multiplier[..., None])[..., 0]
+        s, t = dynamics.b - (A @ a[..., None])[..., 0], (A.mT @ left[..., None])[..., 0]
+        return [*found, r, s, t, dynamics.H, lower.mT @ inverse]
+
     def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:
         return list(self.standardization(self.prior.features(dynamics)))
 
@@ -87,9 +116,8 @@ def prepared_predictor(
             f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
             "0.01, and an integer from 1."
         )
-    physics.system.robot.require_vectors("predictors")
     begin = time.perf_counter()
-    nv, device = training.q.shape[-1], training.q.device
+    sizes, device, space = physics.system.sizes, training.q.device, physics.system.robot.space
     if covariance == "auto":
         covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
     options = [covariance, tolerance, largest_rank, widening]
@@ -102,7 +130,7 @@ def prepared_predictor(
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        compressed = kept_covariance(key, lambda: _compressed(latent, training, physics.terms, tolerance, largest_rank))
+        compressed = kept_covariance(key, lambda: _compressed(latent, training, physics, tolerance, largest_rank))
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > tolerance:
             warnings.warn(
@@ -114,9 +142,9 @@ def prepared_predictor(
     code = None
     if compile:
         example = [x[:1] for x in (training.q, training.v, training.u)]
-        given = (physics.traced, example, latent, compressed, widening)
-        code = KeptCode(nv, len(physics.system.contacts), partial(PredictorCode.of, *given), key)
-    made = Predictor(nv, device, latent, physics.terms, code, covariance, compressed, widening, 0.0)
+        given = (physics, example, space, latent, compressed, widening)
+        code = KeptCode(space, sizes, len(physics.system.contacts), partial(PredictorCode.of, *given), key)
+    made = Predictor(space, sizes, device, latent, physics.terms, code, covariance, compressed, widening, 0.0)
     first = "mean" if compressed is None else "covariance"
     if made.compiled(first) and code is not None and not code.is_traced:
         some = [x[:: 1 + len(x) // 3] for x in (training.q, training.v, training.u)]
@@ -125,6 +153,22 @@ def prepared_predictor(
             made = replace(made, code=replace(code, key=None), _functions={})  # a prior's code changed: no key shows it
             made.compiled(first)
     return replace(made, prepare_seconds=time.perf_counter() - begin)
+
+
+def rows_for(training: TrainingData, trained: MechanicalSystem, system: MechanicalSystem) -> TrainingData:
+    """The training rows with the inputs of another system, such as one without the switches of contacts.
+
+    Raises InvalidInput for inputs that they lack.
+    """
+    had = trained.inputs
+    if len(system.inputs) == len(had):
+        return training
+    new = [name for name in system.inputs if name not in had]
+    if new:
+        raise InvalidInput(
+            f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
+        )
+    return replace(training, u=training.u[..., [had.index(name) for name in system.inputs]])
 
 
 def _numbers(latent: LatentPosterior, training: TrainingData, physics: PredictorPhysics) -> list[Tensor]:
@@ -138,7 +182,7 @@ def _numbers(latent: LatentPosterior, training: TrainingData, physics: Predictor
 def _compressed(
     latent: ExactPosterior,
     training: TrainingData,
-    terms: TermsFunction,
+    physics: PredictorPhysics,
     tolerance: float,
     largest_rank: int,
 ) -> CompressedCovariance:
@@ -147,7 +191,8 @@ def _compressed(
 
     def sample(count: int, seed: int, rows: int) -> Sample:
         with torch.no_grad():
-            _, W, *features = terms(*sample_states(training, count, seed, rows))
+            states = sample_states(training, physics.system.robot.space, count, seed, rows)
+            _, W, *features = physics.terms(*states)
         usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
         return Sample([z[usable] for z in features], W[usable])
 
@@ -156,7 +201,9 @@ def _compressed(
     return compress(latent, latents, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
 
 
-def sample_states(training: TrainingData, count: int, seed: int, rows: int) -> list[Float[Tensor, "_ nv"]]:
+def sample_states(
+    training: TrainingData, space: ConfigurationSpace, count: int, seed: int, rows: int
+) -> list[Float[Tensor, "_ size"]]:
     """q, v and u of states of three kinds: `rows` training rows, or all, and a third of `count` of the others each.
 
     These are rows moved by a fraction of the difference of two others; and positions, velocities and forces of
@@ -172,4 +219,8 @@ def sample_states(training: TrainingData, count: int, seed: int, rows: int) -> l
     third = count // 3
     i, j, k = some(third), some(third), some(third)
     mixed = [some(count - 2 * third) for _ in states]
-    return [torch.cat([x[own], x[i] + STEP * (x[j] - x[k]), x[other]]) for x, other in zip(states, mixed, strict=True)]
+    moved = [x[i] + STEP * (x[j] - x[k]) for x in states]
+    if not space.is_vector_space:
+        q = states[0]
+        moved[0] = space.integrate(q[i], STEP * space.difference(q[k], q[j]))
+    return [torch.cat([x[own], between, x[other]]) for x, between, other in zip(states, moved, mixed, strict=True)]
