@@ -109,7 +109,7 @@ def test_wind_and_velocity_are_the_same_to_the_air():
     """Features of a body in wind are those of one that moves against still air."""
     dataset = flight([(3.0, -2.0, 1.0)], rows=500)
     there = with_wind(dataset, np.broadcast_to((3.0, -2.0, 1.0), (500, 3)))
-    assert there.system.inputs[4:] == ("wind_x", "wind_y", "wind_z")
+    assert there.system.inputs[4:] == ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
     windy = there.system.dynamics(*map(torch.tensor, (there.q, there.v, there.u)))
     rotation = windy.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
     v = dataset.v.copy()
@@ -121,3 +121,5 @@ def test_wind_and_velocity_are_the_same_to_the_air():
     torch.testing.assert_close(
         windy.Q_K, dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K
     )
+    stored = MechanicalSystem.from_dict(there.system.to_dict())
+    assert stored.inputs == there.system.inputs and stored.held_inputs == (4, 5, 6)

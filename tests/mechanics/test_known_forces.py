@@ -21,6 +21,7 @@ from forcegp.mechanics import (
     KnownForce,
     LoadJointFriction,
     MechanicalSystem,
+    ObservedWind,
     ObservedWrench,
     RigidBodyBias,
     RotorInertia,
@@ -286,7 +287,7 @@ def test_they_survive_a_file_exactly(make_and_formula):
 
 
 def test_every_known_force_of_files_is_tested_here():
-    elsewhere = {Thrusters, ObservedWrench}  # tests/mechanics/test_thrusters.py
+    elsewhere = {Thrusters, ObservedWrench, ObservedWind}  # test_thrusters.py, tests/data/test_wind.py
     assert {type(make()) for make, _ in FORMULAS.values()} | elsewhere == set(KNOWN_FORCES.values())
 
 

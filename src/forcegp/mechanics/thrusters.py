@@ -96,7 +96,7 @@ class ObservedWrench(LinkForce):
     """
 
     frame: str
-    names: tuple[str, ...] = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+    names: tuple[str, ...] = ("wind_x", "wind_y", "wind_z")
 
     @override
     def bound_to(self, robot: Robot) -> "ObservedWrench":
@@ -121,7 +121,7 @@ class ObservedWind(KnownForce):
     motions keep it as they keep an `ObservedWrench`.
     """
 
-    names: ClassVar[tuple[str, ...]] = ("wind_x", "wind_y", "wind_z")
+    names: ClassVar[tuple[str, ...]] = ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
 
     @override
     def force(self, state: State) -> Tensor:

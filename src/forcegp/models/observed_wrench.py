@@ -14,6 +14,7 @@ from forcegp.mechanics import MechanicalSystem, ObservedWind, ObservedWrench
 from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
 from forcegp.priors import AerodynamicForce, ForcePrior
 
+NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
@@ -50,7 +51,7 @@ def observing(
     posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
     observed = _observed(unexplained, effect, dataset, times)
-    system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame)))
+    system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
     return posterior.with_system(system), seen.rows(_with_past(dataset, seconds))

@@ -278,9 +278,10 @@ class StructuredPosterior(Posterior):
         (docs/how-to/incremental.md). Rows of a call count as simultaneous, those of the fit as at its first row. Raises
         InvalidInput where time goes back.
         """
-        if (in_wind := rows_in_wind(self, rows)) is not None:
-            there = replace(self, target=None).update(in_wind, budget, keep=keep, horizon=horizon)
-            return replace(there, target=self.target)
+        if (there := rows_in_wind(self, rows)) is not None:
+            return replace(
+                replace(self, target=None).update(there, budget, keep=keep, horizon=horizon), target=self.target
+            )
         if self.target is not None:
             raise InvalidInput(
                 "the posterior was carried to another system than the one that its rows were measured on; update it "
@@ -288,9 +289,8 @@ class StructuredPosterior(Posterior):
             )
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
         require_rows("rows", rows, self.system.robot.joint_names, "the model", example)
-        if horizon is not None:
-            return learn_and_forget(self, rows, budget, horizon)
-        return learn_more_rows(self, rows, budget, keep)
+        forget = horizon is not None
+        return learn_and_forget(self, rows, budget, horizon) if forget else learn_more_rows(self, rows, budget, keep)
 
     @override
     def refined_on_motions(
