@@ -122,4 +122,5 @@ def test_wind_and_velocity_are_the_same_to_the_air():
         windy.Q_K, dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K
     )
     stored = MechanicalSystem.from_dict(there.system.to_dict())
-    assert stored.inputs == there.system.inputs and stored.held_inputs == (4, 5, 6)
+    assert stored.inputs == there.system.inputs
+    assert stored.held_inputs == (4, 5, 6)

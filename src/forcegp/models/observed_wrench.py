@@ -78,14 +78,20 @@ def without_wind(system: MechanicalSystem) -> MechanicalSystem:
     return replace(system, known_forces=tuple(x for x in system.known_forces if not isinstance(x, ObservedWind)))
 
 
-def rows_in_wind(posterior: Posterior, rows: Dataset) -> Dataset | None:
-    """Rows to `update` with: those of the system that a model with wind was trained on, with the wind before each.
+def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
+    """Rows to `update` with as the system has them that the model was trained on: with the wind, where that has it.
 
-    None for any other posterior. Raises InvalidInput for rows with less than .1 s of their own past, which show none.
+    Raises InvalidInput for a posterior that was carried to another system, and for rows with less than .1 s of their
+    own past, which show no wind.
     """
     target, own = posterior.target, posterior.model.system
-    if "air" not in posterior.settings or target is None or target.to_dict() != without_wind(own).to_dict():
-        return None
+    if target is None:
+        return rows
+    if "air" not in posterior.settings or target.to_dict() != without_wind(own).to_dict():
+        raise InvalidInput(
+            "the posterior was carried to another system than the one that its rows were measured on; update it "
+            "before it is carried there: posterior.update(rows).with_system(system)."
+        )
     _, seen = _in_observed_wind(posterior, rows)
     late = _with_past(rows, LEAST)
     if not len(late):

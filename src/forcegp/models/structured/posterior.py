@@ -31,7 +31,7 @@ from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
-from forcegp.models.observed_wrench import rows_in_wind
+from forcegp.models.observed_wrench import rows_of_own_system
 from forcegp.models.prediction import Gaussian, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -278,19 +278,15 @@ class StructuredPosterior(Posterior):
         (docs/how-to/incremental.md). Rows of a call count as simultaneous, those of the fit as at its first row. Raises
         InvalidInput where time goes back.
         """
-        if (there := rows_in_wind(self, rows)) is not None:
-            return replace(
-                replace(self, target=None).update(there, budget, keep=keep, horizon=horizon), target=self.target
-            )
-        if self.target is not None:
-            raise InvalidInput(
-                "the posterior was carried to another system than the one that its rows were measured on; update it "
-                "before it is carried there: posterior.update(rows).with_system(system)."
-            )
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
         require_rows("rows", rows, self.system.robot.joint_names, "the model", example)
-        forget = horizon is not None
-        return learn_and_forget(self, rows, budget, horizon) if forget else learn_more_rows(self, rows, budget, keep)
+        own, rows = replace(self, target=None), rows_of_own_system(self, rows)
+        more = (
+            learn_more_rows(own, rows, budget, keep)
+            if horizon is None
+            else learn_and_forget(own, rows, budget, horizon)
+        )
+        return replace(more, target=self.target)
 
     @override
     def refined_on_motions(
