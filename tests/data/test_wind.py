@@ -117,6 +117,8 @@ def test_wind_and_velocity_are_the_same_to_the_air():
     still = dataset.system.dynamics(*map(torch.tensor, (dataset.q, v, dataset.u)))
     prior = AerodynamicForce()
     torch.testing.assert_close(prior.features(windy)[0], prior.features(still)[0])
+    without = dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u)))
+    torch.testing.assert_close(AerodynamicForce(wind=(3.0, -2.0, 1.0)).features(without)[0], prior.features(still)[0])
     # and it is no force
     torch.testing.assert_close(
         windy.Q_K, dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K

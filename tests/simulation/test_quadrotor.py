@@ -150,6 +150,18 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
         posterior.update(rows.rows(np.arange(10)))
 
 
+def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
+    """So rows of the same wind are predicted without an observer, and the model can be fitted again."""
+    rows = acting(train).rows(np.arange(0, 4000, 20))
+    a = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy()
+    assert np.sqrt(np.square(a - rows.a).mean()) < 0.5 * np.sqrt(np.square(rows.a).mean())
+    assert posterior.model.prior.wind == posterior.settings["air"]["wind"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        again = posterior.model.fit(rows, restarts=1)  # too few rows to show their wind
+    assert again.system.inputs == train.system.inputs
+
+
 def test_a_report_shows_the_air_forces_at_the_body(posterior, test):
     seeing, seen = observing(posterior, acting(test))
     scene = recorded_scene(seen, seeing, seconds=1.0)

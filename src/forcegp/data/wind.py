@@ -111,7 +111,7 @@ def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
     assert dataset.system is not None, "wind was found in a recording with a system"
     forces = (*dataset.system.known_forces, forcegp.mechanics.ObservedWind())
     system = replace(dataset.system, known_forces=forces)
-    first = system.held_inputs[0]
+    first = system.inputs.index(forcegp.mechanics.ObservedWind.names[0])
     u = np.insert(dataset.u, [first] * 3, wind, axis=1)
     return replace(dataset, u=u, system=system)
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -143,13 +144,13 @@ class MechanicalSystem(Summary):
             "baumgarte": self.baumgarte or "none",
         }
 
-    @property
+    @cached_property
     def actuation(self) -> Actuation:
         """How u acts; that of one actuator per joint where no known force is an Actuation."""
         own = (force for force in self.known_forces if isinstance(force, Actuation))
         return next(own, None) or Actuation().bound_to(self.robot)
 
-    @property
+    @cached_property
     def inputs(self) -> tuple[str, ...]:
         """Names of the columns of u: actuators, observed wrenches and wind, then switches of contacts (1 or 0)."""
         switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)

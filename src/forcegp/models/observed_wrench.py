@@ -12,7 +12,7 @@ from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem, ObservedWind, ObservedWrench
 from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
-from forcegp.priors import AerodynamicForce, ForcePrior
+from forcegp.priors import AerodynamicForce, ForcePrior, SumPrior
 
 NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
@@ -57,20 +57,22 @@ def observing(
     return posterior.with_system(system), seen.rows(_with_past(dataset, seconds))
 
 
-def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, Dataset] | None:
-    """The recording with the wind that acts on its rows, and the law of air that shows it (`forcegp.data.find_wind`).
+def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, ForcePrior, Dataset] | None:
+    """The law of air of the rows (`forcegp.data.find_wind`), the prior with their mean wind, and the rows with theirs.
 
     None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where u holds the wind already,
     and where the rows do not show it.
     """
-    of_air = [term for term in prior.summands() if isinstance(term, AerodynamicForce) and term.observe != 0.0]
-    if not of_air or any(isinstance(force, ObservedWind) for force in system.known_forces):
+    still, terms = without_wind(system), prior.summands()
+    of_air = [term for term in terms if isinstance(term, AerodynamicForce) and term.observe != 0.0]
+    if not of_air or dataset.joint_names != still.robot.joint_names or dataset.u.shape[1] != still.sizes[2]:
         return None
-    if dataset.joint_names != system.robot.joint_names or dataset.u.shape[1] != system.sizes[2]:
-        return None  # which the fit refuses
-    rows = replace(dataset, system=system, truth={})
-    found = find_wind(rows)
-    return None if found is None else (found[0], with_wind(rows, found[1]))
+    rows = replace(dataset, system=still, truth={})
+    if (found := find_wind(rows)) is None:
+        return None
+    law, wind = found
+    windy = [replace(term, wind=law.wind) if isinstance(term, AerodynamicForce) else term for term in terms]
+    return law, windy[0] if len(windy) == 1 else SumPrior(tuple(windy)), with_wind(rows, wind)
 
 
 def without_wind(system: MechanicalSystem) -> MechanicalSystem:

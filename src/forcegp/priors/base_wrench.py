@@ -13,7 +13,7 @@ from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem, ObservedWin
 from forcegp.priors.force_prior import ExpressedKernels, Scaling
 from forcegp.priors.joint_forces import as_names, chosen_inputs
 from forcegp.priors.kernels import check_kernel
-from forcegp.priors.tool_forces import ToolPoint, require_moving
+from forcegp.priors.tool_forces import ToolPoint, finite_numbers, require_moving
 from forcegp.robots import Robot
 
 AXES = "xyz"
@@ -140,7 +140,8 @@ class AerodynamicForce(BaseWrench):
     The six functions of `BaseWrench` depend on velocity, speed times velocity, rates, attitude, height and what the
     actuators deliver, so that a linear kernel holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018) and
     a thrust that differs from the data sheet. Velocities are those against the air: the fit finds the wind of its rows
-    (`forcegp.data.find_wind`), and without columns of an `ObservedWind` in u the air is still. `forcegp evaluate` and
+    (`forcegp.data.find_wind`), and where u has no columns of an `ObservedWind`, the air moves with `wind` [m/s, world],
+    which the fit sets to the mean of its rows. `forcegp evaluate` and
     `forcegp rollout` observe the wind of a recording, and the force that stays unexplained, from the rows before each
     (`forcegp.models.observing`). `observe` is the time in s that the observer of this force looks back; with None it
     follows the recording, and 0 observes nothing, neither here nor in the fit.
@@ -148,10 +149,15 @@ class AerodynamicForce(BaseWrench):
 
     inputs: tuple[str, ...] = ("velocity", "drag", "angular-velocity", "thrust", "height", "attitude")
     observe: float | None = None
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @override
     def __post_init__(self) -> None:
         super().__post_init__()
+        wind = finite_numbers(self.wind)
+        if wind is None or len(wind) != 3:
+            raise InvalidInput(f"AerodynamicForce wind is {self.wind!r}; give its velocity along x, y and z in m/s.")
+        object.__setattr__(self, "wind", wind)
         if self.observe is None:
             return
         try:  # files and commands hold text
@@ -165,7 +171,7 @@ class AerodynamicForce(BaseWrench):
     @override
     def _flow(self, state: State) -> Tensor | float:
         wind = ObservedWind.at(state)
-        return 0.0 if wind is None else wind
+        return state.v.new_tensor(self.wind) if wind is None else wind
 
 
 def _halves(six: Tensor) -> tuple[Tensor, Tensor]:

@@ -223,9 +223,15 @@ class StructuredGP(StructuredModel):
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
         if found := in_wind(self.prior, self.system, dataset):
-            law, rows = found
-            learned = replace(self, system=rows.system)._fit_rows(rows, points, search, engine, learning_points)
+            law, prior, rows = found
+            learned = replace(self, prior=prior, system=rows.system)._fit_rows(
+                rows, points, search, engine, learning_points
+            )
             return learned.with_system(without_wind(learned.system)).with_settings(air=law.to_dict())
+        if dataset.u.shape[1] < self.system.sizes[2] and len((still := without_wind(self.system)).inputs) < len(
+            self.system.inputs
+        ):
+            return replace(self, system=still)._fit_rows(dataset, points, search, engine, learning_points)
         chosen = engine_of(engine)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:
