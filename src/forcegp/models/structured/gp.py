@@ -222,7 +222,8 @@ class StructuredGP(StructuredModel):
         self, dataset: Dataset, points: int | None, search: Search, engine: Engine | str, learning_points: int | None
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
-        if isinstance(dataset, Dataset) and (found := in_wind(self.prior, self.system, dataset)):
+        require_type("dataset", dataset, Dataset)
+        if found := in_wind(self.prior, self.system, dataset):
             law, prior, rows = found
             learned = replace(self, prior=prior, system=rows.system)._fit_rows(
                 rows, points, search, engine, learning_points
