@@ -222,7 +222,7 @@ class StructuredGP(StructuredModel):
         self, dataset: Dataset, points: int | None, search: Search, engine: Engine | str, learning_points: int | None
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
-        require_type("dataset", dataset, Dataset)
+        dataset = checked_rows(self.system.robot.joint_names, dataset)
         if found := in_wind(self.prior, self.system, dataset):
             law, prior, rows = found
             learned = replace(self, prior=prior, system=rows.system)._fit_rows(
