@@ -148,6 +148,8 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
     torch.testing.assert_close(*means, rtol=1e-9, atol=1e-9)
     with pytest.raises(InvalidInput, match="longer pieces"):
         posterior.update(rows.rows(np.arange(10)))
+    with pytest.raises(InvalidInput, match="longer pieces"):
+        observing(posterior, rows.rows(np.arange(10)))
 
 
 def test_a_report_shows_the_air_forces_at_the_body(posterior, test):
