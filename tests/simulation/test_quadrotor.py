@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, StructuredGP
+from forcegp.cli.fit import _wind_not_found
 from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
@@ -150,6 +151,14 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
         posterior.update(rows.rows(np.arange(10)))
     with pytest.raises(InvalidInput, match="longer pieces"):
         observing(posterior, rows.rows(np.arange(10)))
+
+
+def test_a_fit_reports_that_no_wind_was_found(posterior):
+    still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
+    assert not _wind_not_found(posterior)
+    assert _wind_not_found(still)
+    unasked = replace(still, model=replace(still.model, prior=AerodynamicForce(observe=0.0)))
+    assert not _wind_not_found(unasked)
 
 
 def test_a_report_shows_the_air_forces_at_the_body(posterior, test):
