@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, StructuredGP
+from forcegp.cli.fit import _wind_not_found
 from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
@@ -148,6 +149,16 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
     torch.testing.assert_close(*means, rtol=1e-9, atol=1e-9)
     with pytest.raises(InvalidInput, match="longer pieces"):
         posterior.update(rows.rows(np.arange(10)))
+    with pytest.raises(InvalidInput, match="longer pieces"):
+        observing(posterior, rows.rows(np.arange(10)))
+
+
+def test_a_fit_reports_that_no_wind_was_found(posterior):
+    still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
+    assert not _wind_not_found(posterior)
+    assert _wind_not_found(still)
+    unasked = replace(still, model=replace(still.model, prior=AerodynamicForce(observe=0.0)))
+    assert not _wind_not_found(unasked)
 
 
 def test_without_columns_the_air_moves_as_in_the_training(posterior, train):

@@ -193,10 +193,19 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
         "wind": posterior.settings.get("air", {}).get("wind"),
+        "wind_not_found": _wind_not_found(posterior),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
     }
+
+
+def _wind_not_found(posterior: Any) -> bool:
+    """Whether the fit looked for wind that its rows do not show."""
+    prior = getattr(posterior.model, "prior", None)
+    air = [x for x in prior.summands() if isinstance(x, forcegp.AerodynamicForce)] if prior else []
+    given = "wind_x" in posterior.system.inputs
+    return any(x.observe != 0.0 for x in air) and "air" not in posterior.settings and not given
 
 
 def payloads(posterior: Any, dataset: forcegp.Dataset) -> dict[str, str]:
@@ -246,6 +255,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
             "noise std": _per_joint(summary["noise_std"]),
             **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
             **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
+            **({"wind of these rows": "not found; learned as still air"} if summary.get("wind_not_found") else {}),
             "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
         },
     )

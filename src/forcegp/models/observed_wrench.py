@@ -35,7 +35,7 @@ def observing(
     the second before. Without such a prior, or where its time is 0, both come back as they are.
 
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
-    for a recording whose rows are not in order of time.
+    for a recording that is too short or whose rows are not in order of time.
     """
     prior: ForcePrior | None = getattr(posterior.model, "prior", None)
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
@@ -95,18 +95,18 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
     _, seen = _in_observed_wind(posterior, rows)
-    late = _with_past(rows, LEAST)
-    if not len(late):
-        raise InvalidInput(
-            f"the rows hold less than {LEAST} s of flight, which does not show their wind; update with longer pieces."
-        )
-    return seen.rows(late)
+    return seen.rows(_with_past(rows, LEAST))
 
 
 def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
-    """Which rows have a past of that time in their episode."""
+    """Which rows have a past of that time in their episode. Raises InvalidInput for none."""
     first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
-    return np.flatnonzero(dataset.time - np.array([first[number] for number in dataset.episode]) >= seconds)
+    late = np.flatnonzero(dataset.time - np.array([first[number] for number in dataset.episode]) >= seconds)
+    if not len(late):
+        raise InvalidInput(
+            f"the rows hold less than {seconds:g} s of flight, which does not show their wind; give longer pieces."
+        )
+    return late
 
 
 def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
