@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, StructuredGP
-from forcegp.cli.fit import _wind_not_found
+from forcegp.cli.fit import fit_summary
 from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
+from forcegp.evaluation.predicted_rows import predict_rows
 from forcegp.mechanics import Actuation, RigidBodyBias
 from forcegp.models import load_posterior, observing, save_posterior
 from forcegp.report.motion import recorded_scene
@@ -155,10 +156,31 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
 
 def test_a_fit_reports_that_no_wind_was_found(posterior):
     still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
-    assert not _wind_not_found(posterior)
-    assert _wind_not_found(still)
     unasked = replace(still, model=replace(still.model, prior=AerodynamicForce(observe=0.0)))
-    assert not _wind_not_found(unasked)
+    found = [fit_summary(each, 1.0)["wind_not_found"] for each in (posterior, still, unasked)]
+    assert found == [False, True, False]
+    assert fit_summary(posterior, 1.0)["wind"] == posterior.settings["air"]["wind"]
+
+
+def test_known_physics_alone_has_no_observer(posterior, test):
+    rows = acting(test).rows(np.arange(200))
+    seeing, seen = observing(posterior, rows)
+    known = predict_rows(seeing, seen).known_physics
+    there = rows.rows(np.arange(len(rows) - len(seen), len(rows)))
+    np.testing.assert_allclose(known, predict_rows(posterior, there).known_physics, rtol=1e-10, atol=1e-10)
+
+
+def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
+    rows = acting(test).rows(np.arange(3))
+    predictor = posterior.predictor()
+    for q, v, u in zip(rows.q, rows.v, rows.u, strict=True):
+        expected = posterior.predict(q, v, u, covariance=False).mean
+        np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_intervals_of_motions_need_a_fixed_base(posterior, train):
+    with pytest.raises(InvalidInput, match="need a base that is fixed"):
+        posterior.calibrated_on_motions(acting(train), (0.2,))
 
 
 def test_without_columns_the_air_moves_as_in_the_training(posterior, train):

@@ -201,11 +201,11 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
 
 
 def _wind_not_found(posterior: Any) -> bool:
-    """Whether the fit looked for wind that its rows do not show."""
+    """Whether the fit looked for wind that its rows do not show; windows do not look for it."""
     prior = getattr(posterior.model, "prior", None)
     air = [x for x in prior.summands() if isinstance(x, forcegp.AerodynamicForce)] if prior else []
-    given = "wind_x" in posterior.system.inputs
-    return any(x.observe != 0.0 for x in air) and "air" not in posterior.settings and not given
+    looked = not {"air", "observe"} & set(posterior.settings) and not posterior.system.held_inputs
+    return looked and any(x.observe != 0.0 for x in air)
 
 
 def payloads(posterior: Any, dataset: forcegp.Dataset) -> dict[str, str]:

@@ -185,6 +185,17 @@ def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
     return [(number, dataset.select_episodes([number]), f"episode {number}") for number in dataset.episodes]
 
 
+def sums_before(
+    values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"], seconds: float
+) -> Float[np.ndarray, "rows k"]:
+    """Sums of the rows before each, with weights exp(-age / seconds); zero for the first."""
+    sums = np.zeros_like(values)
+    keep = np.exp(-np.diff(time) / seconds)
+    for row in range(1, len(values)):
+        sums[row] = keep[row - 1] * (sums[row - 1] + values[row - 1])
+    return sums
+
+
 def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Apply `change` to each episode and put its rows back where they came from."""
     result: dict[str, np.ndarray] = {}

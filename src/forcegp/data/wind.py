@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.filtering import episodes_in_order
+from forcegp.data.filtering import episodes_in_order, sums_before
 
 SECONDS = 0.3  # s: rows that lie this far apart count 1/e for each other's wind
 MOST_ROWS, FEWEST_ROWS = 3000, 400
@@ -26,7 +26,7 @@ MOVING = 12  # causes that vanish with the velocity
 
 @dataclass(frozen=True)
 class AirLaw:
-    """What air does to a base that flies: its force [N] and torque [Nm] are linear in what `_causes` lists.
+    """What air does to a base that flies: its force [N] and torque [Nm] are linear in what `_Forces.causes` lists.
 
     `coefficients[k]` belong to degree of freedom k of the base, `deviations[k]` is the spread of what they leave
     unexplained, `wind` the mean velocity of the air [m/s] in the recording that they were found from.
@@ -69,10 +69,9 @@ class AirLaw:
             sums = np.zeros_like(joined)
             for number, rows, _ in episodes_in_order(dataset):
                 own = np.flatnonzero(dataset.episode == number)
-                keep = np.exp(-np.diff(rows.time) / seconds)
-                sums[own] = _before(joined[own], keep)
+                sums[own] = sums_before(joined[own], rows.time, seconds)
                 if after:
-                    sums[own] += joined[own] + _before(joined[own][::-1], keep[::-1])[::-1]
+                    sums[own] += joined[own] + sums_before(joined[own][::-1], -rows.time[::-1], seconds)[::-1]
             normal, right = sums[:, :9].reshape(-1, 3, 3) + hold, sums[:, 9:] + start @ hold
             wind = np.clip(np.linalg.solve(normal, right[..., None])[..., 0], -STRONGEST, STRONGEST)
         return wind
@@ -84,8 +83,8 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     The mean wind of every episode and the law are found together, by least squares with the law projected out
     (Kaufman's variable projection, BIT 1975, with Levenberg-Marquardt steps): a body that moves to and fro shows the
     slope of the drag, and the force that stays is that slope times the wind. The wind then follows the rows nearby.
-    Nothing is found for bases that do not fly freely, for rows out of order, for fewer than 400, and for winds beyond
-    40 m/s or with a standard deviation beyond 2 m/s.
+    Nothing is found for bases that do not fly freely, for rows out of order, for fewer than 400, where drag explains no
+    more than its coefficients would of noise, and for winds beyond 40 m/s or a standard deviation beyond 2 m/s.
     """
     system = dataset.system
     groups = () if system is None else system.robot.layout.groups
@@ -136,10 +135,11 @@ class _Forces:
             q, v, u, a = (
                 torch.tensor(x[block], device=robot.device) for x in (dataset.q, dataset.v, dataset.u, dataset.a)
             )
-            dynamics = dataset.system.dynamics(q, v, u)
-            Q_U = (dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K
-            parts.append((Q_U[:, group.rows], dynamics.state.delivered[:, group.rows]))
-        wrench, delivered = (torch.cat(part).detach().cpu().numpy() for part in zip(*parts, strict=True))
+            with torch.no_grad():
+                dynamics = dataset.system.dynamics(q, v, u)
+                Q_U = (dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K
+                parts.append((Q_U[:, group.rows], dynamics.state.delivered[:, group.rows]))
+        wrench, delivered = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
         places = dataset.q[:, group.places]
         rotation = Rotation.from_quat(places[:, group.motion.turn]).as_matrix()
         return cls(wrench, dataset.v[:, group.rows], delivered, rotation, places[:, 2:3])
@@ -232,11 +232,3 @@ def _first_winds(forces: _Forces, own: np.ndarray, count: int) -> np.ndarray:
     wind = np.zeros((count, 3))
     wind[:, :2] = found[2:].reshape(count, 2) / drag
     return np.clip(wind, -0.5 * STRONGEST, 0.5 * STRONGEST)
-
-
-def _before(values: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """Sums of the rows before each, of which `keep` stays from row to row."""
-    sums = np.zeros_like(values)
-    for row in range(1, len(values)):
-        sums[row] = keep[row - 1] * (sums[row - 1] + values[row - 1])
-    return sums

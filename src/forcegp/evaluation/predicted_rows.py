@@ -99,7 +99,10 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     covariance = _array(covariance)
     measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
-    known = _array(dynamics.acceleration_map(known=True).offset)
+    alone = u.clone()
+    alone[:, list(posterior.system.held_inputs)] = 0.0  # what an observer reports is no part of the known physics
+    by_itself = posterior.dynamics(q, v, alone) if posterior.system.held_inputs else dynamics
+    known = _array(by_itself.acceleration_map(known=True).offset)
     carried = dynamics.Q_K if posterior.carries_known_forces else torch.zeros_like(dynamics.Q_K)
     return PredictedRows(
         mean=mean,

@@ -114,6 +114,10 @@ def rolling(
     ground = Held((0.0, 0.0, 1.0)) if ground is None else ground
     if not isinstance(ground, Held | Plane):
         raise InvalidInput(f"the ground is a {type(ground).__name__}; give a Plane, or Held(normal).")
-    tangents = surface_axes(torch.tensor(ground.normal, dtype=torch.float64)).T[:2].tolist()
-    surfaces = (ground, *(Held(tuple(tangent)) for tangent in tangents))
-    return tuple(RollingContact(frame, point, each, switch, radius, axis, ground.normal) for each in surfaces)  # type: ignore[return-value]  # three
+    first, second, _ = surface_axes(torch.tensor(ground.normal, dtype=torch.float64)).T.tolist()
+    wheel = (switch, radius, axis, ground.normal)
+    return (
+        RollingContact(frame, point, ground, *wheel),
+        RollingContact(frame, point, Held(tuple(first)), *wheel),
+        RollingContact(frame, point, Held(tuple(second)), *wheel),
+    )

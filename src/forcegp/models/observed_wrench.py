@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_wind
-from forcegp.data.filtering import episodes_in_order
+from forcegp.data.filtering import episodes_in_order, sums_before
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem, ObservedWind, ObservedWrench
 from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
@@ -60,19 +60,24 @@ def observing(
 def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, ForcePrior, Dataset] | None:
     """The law of air of the rows (`forcegp.data.find_wind`), the prior with their mean wind, and the rows with theirs.
 
-    None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where u holds the wind already,
+    None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where the system has wind already,
     and where the rows do not show it.
     """
-    still, terms = without_wind(system), prior.summands()
+    terms = prior.summands()
     of_air = [term for term in terms if isinstance(term, AerodynamicForce) and term.observe != 0.0]
-    if not of_air or dataset.joint_names != still.robot.joint_names or dataset.u.shape[1] != still.sizes[2]:
+    if not of_air or has_wind(system) or dataset.u.shape[1] != system.sizes[2]:
         return None
-    rows = replace(dataset, system=still, truth={})
+    rows = replace(dataset, system=system, truth={})
     if (found := find_wind(rows)) is None:
         return None
     law, wind = found
     windy = [replace(term, wind=law.wind) if isinstance(term, AerodynamicForce) else term for term in terms]
     return law, windy[0] if len(windy) == 1 else SumPrior(tuple(windy)), with_wind(rows, wind)
+
+
+def has_wind(system: MechanicalSystem) -> bool:
+    """Whether u has columns for the velocity of the air."""
+    return any(isinstance(force, ObservedWind) for force in system.known_forces)
 
 
 def without_wind(system: MechanicalSystem) -> MechanicalSystem:
@@ -112,7 +117,7 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
 def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
     """Both with the wind that the rows before each one show, where the fit found a law of air."""
     stored = posterior.settings.get("air")
-    if stored is None or any(isinstance(force, ObservedWind) for force in posterior.system.known_forces):
+    if stored is None or has_wind(posterior.system):
         return posterior, dataset
     rows = replace(dataset, system=posterior.system)
     seen = with_wind(rows, AirLaw.from_dict(stored).wind_before(rows))
@@ -158,9 +163,5 @@ def _observed(
 
 def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:
     """Means of the rows before each, with weights exp(-age / seconds); zero for the first."""
-    means, total, weight = np.zeros_like(values), np.zeros(values.shape[1]), 0.0
-    keep = np.exp(-np.diff(time) / seconds)
-    for row in range(1, len(values)):
-        total, weight = keep[row - 1] * (total + values[row - 1]), keep[row - 1] * (weight + 1.0)
-        means[row] = total / weight
-    return means
+    sums = sums_before(np.concatenate([values, np.ones((len(values), 1))], axis=1), time, seconds)
+    return sums[:, :-1] / np.where(sums[:, -1:] > 0.0, sums[:, -1:], 1.0)

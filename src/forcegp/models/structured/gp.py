@@ -14,7 +14,7 @@ from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
-from forcegp.models.observed_wrench import in_wind, without_wind
+from forcegp.models.observed_wrench import has_wind, in_wind, without_wind
 from forcegp.models.search import (
     ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
@@ -223,16 +223,13 @@ class StructuredGP(StructuredModel):
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
         dataset = checked_rows(self.system.robot.joint_names, dataset)
+        if has_wind(self.system) and dataset.u.shape[1] == len((still := without_wind(self.system)).inputs):
+            return replace(self, system=still)._fit_rows(dataset, points, search, engine, learning_points)
         if found := in_wind(self.prior, self.system, dataset):
             law, prior, rows = found
-            learned = replace(self, prior=prior, system=rows.system)._fit_rows(
-                rows, points, search, engine, learning_points
-            )
+            windy = replace(self, prior=prior, system=rows.system)
+            learned = windy._fit_rows(rows, points, search, engine, learning_points)
             return learned.with_system(without_wind(learned.system)).with_settings(air=law.to_dict())
-        if dataset.u.shape[1] < self.system.sizes[2] and len((still := without_wind(self.system)).inputs) < len(
-            self.system.inputs
-        ):
-            return replace(self, system=still)._fit_rows(dataset, points, search, engine, learning_points)
         chosen = engine_of(engine)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:

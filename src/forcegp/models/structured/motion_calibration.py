@@ -32,6 +32,7 @@ def calibrate_motions(
 ) -> MotionIntervals:
     """What `StructuredPosterior.calibrated_on_motions` documents."""
     require_type("dataset", dataset, Dataset)
+    posterior.system.robot.require_vectors("intervals of motions")
     wanted = tuple(sorted(set(horizons)))
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
         raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
