@@ -3,7 +3,7 @@
 Run it alternately with the two versions, for instance
     git worktree add /tmp/before COMMIT
     for k in 1 2 3; do for tree in /tmp/before .; do PYTHONPATH=$tree/src python benchmarks/arm_cost.py; done; done
-and compare medians. It uses only what both versions have. The commit before bases could move is f1fc32b^.
+and compare medians over the runs. It uses only what both versions have. The commit before bases could move is f1fc32b^.
 """
 
 import json
@@ -11,7 +11,6 @@ import time
 import warnings
 from collections.abc import Callable
 
-import numpy as np
 import torch
 
 from forcegp import JointFriction, StructuredGP
@@ -19,13 +18,13 @@ from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 
 def cpu(job: Callable[[], object], times: int) -> float:
-    """Median CPU seconds."""
+    """Least CPU seconds, since noise only adds."""
     seconds = []
     for _ in range(times):
         begun = time.process_time()
         job()
         seconds.append(time.process_time() - begun)
-    return float(np.median(seconds))
+    return min(seconds)
 
 
 def main() -> None:
@@ -49,7 +48,8 @@ def main() -> None:
             lambda: [system.dynamics(q[0], v[0], u[0]).acceleration(rest[0]) for _ in range(100)],
             25,
         ),
-        "predictor, 2,000 x one row": (lambda: [predictor(*one) for _ in range(2000)], 25),
+        "predictor, 2,000 x one row of tensors": (lambda: [predictor(*at) for _ in range(2000)], 25),
+        "predictor, 2,000 x one row of arrays": (lambda: [predictor(*one) for _ in range(2000)], 25),
         "compiled dynamics, 2,000 x one row": (lambda: [compiled.forward_dynamics(*at) for _ in range(2000)], 25),
     }
     print(json.dumps({name: round(cpu(*job), 6) for name, job in jobs.items()}))

@@ -186,15 +186,17 @@ class MechanicalSystem(Summary):
 
     def state(self, q: Tensor, v: Tensor, u: Tensor, inertials: Inertials | None = None) -> State:
         """Checked states (q, v, u), each with its own size. Raises InvalidInput."""
-        actuation, inputs = self.actuation, self.inputs
-        count = len(actuation.names)
-        plain = actuation.matrix is None and len(inputs) == count
-        pushing = [force for force in self.known_forces if isinstance(force, Thrusters)]
+        return State.of(self.robot, q, v, u, inertials, self.inputs, None if self._u_is_delivered else self._delivered)
 
-        def delivered(state: State) -> Tensor:
-            return sum((force.force(state) for force in pushing), actuation.force(state))
+    @cached_property
+    def _u_is_delivered(self) -> bool:
+        """Whether u is the force of every joint, and nothing else."""
+        return self.actuation.matrix is None and len(self.inputs) == len(self.actuation.names)
 
-        return State.of(self.robot, q, v, u, inertials, inputs, None if plain else delivered)
+    def _delivered(self, state: State) -> Tensor:
+        """Joint forces of all actuators."""
+        pushing = (force.force(state) for force in self.known_forces if isinstance(force, Thrusters))
+        return sum(pushing, self.actuation.force(state))
 
     def dynamics(
         self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None

@@ -395,8 +395,9 @@ class Predictor(Summary):
         states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
         shape, named = states[0].shape, f"q, v or {names[2]}"
         sizes = self.sizes if names[2] == "u" else (*self.sizes[:2], self.nv)
-        fit = (x.shape == (*shape[:-1], size) for x, size in zip(states, sizes, strict=True))
-        if not shape or len(shape) > 2 or not all(fit):
+        wanted_shapes = (shape if size == sizes[0] else (*shape[:-1], size) for size in sizes)
+        fit = shape[-1:] == sizes[:1] and all(x.shape == each for x, each in zip(states, wanted_shapes, strict=True))
+        if len(shape) > 2 or not fit:
             shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
             wanted = f"all three ({self.nv},) for one state or (n, {self.nv})"
             if len({*sizes}) > 1:
