@@ -186,6 +186,14 @@ def acceleration_unit(dataset: forcegp.Dataset) -> str:
     return units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
 
 
+def _carried(posterior: forcegp.models.Posterior) -> bool:
+    """Whether robot or contacts are not those of the training; what an observer reports is neither."""
+    if posterior.target is None:
+        return False
+    here, there = ({**system.to_dict(), "known_forces": None} for system in (posterior.target, posterior.model.system))
+    return here != there
+
+
 def _report(
     posterior: forcegp.models.Posterior,
     evaluation: forcegp.Evaluation,
@@ -195,7 +203,7 @@ def _report(
 ) -> list[Any]:
     points = len(posterior.training)
     unit = acceleration_unit(dataset)
-    where = "" if posterior.target is None else ", carried to another robot or contacts"
+    where = ", carried to another robot or contacts" if _carried(posterior) else ""
     title = (
         f"{points} training points, {posterior.description}{where}; {evaluation.rows} rows of {data}; errors in {unit}"
     )
