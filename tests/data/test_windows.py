@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from tests.data.test_moving_bases import jumbled, tumbling
 
 from forcegp.data import REVOLUTE_UNITS, Dataset, Preparation, WeakForm
 from forcegp.data.windows import white_noise
@@ -170,3 +173,39 @@ def test_a_filtered_log_is_warned_of():
         WeakForm(0.1).windows(filtered)
     kept = Preparation(trim=0.1).apply(sine(0.002 * np.arange(1000))).dataset
     assert len(WeakForm(0.1).windows(kept)) == 17
+
+
+def test_windows_of_positions_show_a_tumbling_base_as_windows_of_its_velocity_do():
+    """y of q is that of v, whose weights are exact for any path; a turned world changes nothing."""
+    log = tumbling()
+    speeds, seen = (WeakForm(0.1, signal=signal).windows(log) for signal in ("v", "q"))
+    np.testing.assert_allclose(seen.observed, speeds.observed, atol=1e-4)
+    turned = WeakForm(0.1).windows(tumbling(world=Rotation.from_rotvec([0.3, -1.2, 0.7]), shift=(4.0, -2.0, 1.0)))
+    np.testing.assert_allclose(turned.observed, seen.observed, atol=1e-8)
+    signs = WeakForm(0.1).windows(jumbled(log))
+    np.testing.assert_allclose(signs.observed, seen.observed, atol=1e-9)
+    space, nodes = log.system.robot.space, seen.nodes
+    nearest = log.q[np.abs(log.time[:, None] - nodes.time).argmin(axis=0)]
+    away = space.difference(torch.tensor(nearest), torch.tensor(nodes.q)).numpy()
+    assert np.abs(away).max() < np.abs(log.v).max() / 240.0  # positions of nodes are those of their times
+
+
+def test_no_window_holds_a_contact_that_is_switched():
+    log = tumbling()  # its foot is held during half of every second
+    windows = WeakForm(0.1).windows(log)
+    assert set(np.unique(windows.nodes.u[:, 3])) == {0.0, 1.0}
+    free = WeakForm(0.1).windows(replace(log, u=np.column_stack([log.u[:, :3], np.ones(len(log))])))
+    assert len(windows) < len(free)
+    with pytest.raises(DatasetError, match="or a contact that is switched"):
+        WeakForm(0.6).windows(log)
+
+
+def test_noise_of_windows_of_a_moving_base_is_of_the_stated_size():
+    log, how, std = tumbling(), WeakForm(0.1), 1e-4
+    space, generator, found = log.system.robot.space, np.random.default_rng(0), []
+    for _ in range(20):
+        moved = space.integrate(torch.tensor(log.q), torch.tensor(std * generator.normal(size=log.v.shape)))
+        windows = how.windows(replace(log, q=moved.numpy()))
+        found.append(windows.observed)
+    stated = windows.nodes.noise_std[:: how.nodes].mean(axis=0)
+    np.testing.assert_allclose(np.std(found, axis=0).mean(axis=0) / stated, 1.0, atol=0.1)

@@ -194,10 +194,13 @@ class LearningOptions(BackendOptions, RobotOptions):
         Without `accelerations` nobody has measured `a`: nothing is compared with it.
         """
         if self.checks:
-            # without a system it compares no torques
-            looked_at = (dataset, system) if accelerations else (replace(dataset, system=None), None)
-            found = forcegp.checks.quick_check(*looked_at)
-            used = [each for each in found if accelerations or each.subject not in ("acceleration", "noise_std")]
+            # without a system it compares no torques; those of moving bases are never compared
+            without = not (accelerations or system.robot.layout.groups)
+            found = forcegp.checks.quick_check(
+                *((replace(dataset, system=None), None) if without else (dataset, system))
+            )
+            of_accelerations = () if accelerations else ("acceleration", "base acceleration", "noise_std")
+            used = [each for each in found if each.subject not in of_accelerations]
             # check has no --contact: it would find nothing wrong with the contacts of the data
             line = findings_in_one_line(used, self.data, self.words(*ROBOT_OPTIONS), advise=bool(self.contact))
             if line is not None:

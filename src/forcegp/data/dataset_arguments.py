@@ -14,9 +14,3 @@ def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str
             f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}; give data of the "
             "same robot, with its joints in the same order"
         )
-
-
-def require_vectors(dataset: Dataset, what: str) -> None:
-    """Raise InvalidInput where positions of the recorded robot do not add up (`Robot.require_vectors`)."""
-    if dataset.system is not None:
-        dataset.system.robot.require_vectors(what)

@@ -3,6 +3,7 @@
 With a test function phi of integral 1, y = int phi a dt comes from q or v alone
 (docs/how-to/without-accelerations.md): the weak form (Messenger & Bortz 2021, "Weak SINDy"). It is linear in the
 unknown forces, and exactly so; no filter comes before. White noise of the signal makes independent noise of y.
+Positions of a base that moves are steps from the middle of their window, and what turns on the way is added.
 """
 
 import warnings
@@ -10,11 +11,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from scipy.special import beta
 
+from forcegp.data.configurations import actuators, as_vectors, chart_acceleration, space_of
 from forcegp.data.dataset import Dataset
-from forcegp.data.dataset_arguments import require_vectors
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
 from forcegp.data.row_selection import farthest_point_sampling
@@ -27,6 +29,8 @@ EXACT_DEGREE = 5
 FEWEST_ROWS = EXACT_DEGREE + 3
 LONGEST_STEP = 2.5
 """Steps of time longer than this multiple of the median are gaps, and no window spans one."""
+PATH_DEGREE = 3
+"""Of the polynomials that show how much a moving base turns in a window."""
 
 WINDOWS_AT_ONCE = 4096
 SMALLEST_SHARE = 1e-6
@@ -128,12 +132,12 @@ class WeakForm:
     def windows(self, dataset: Dataset, points: int | None = None) -> Windows:
         """The `points` windows whose mean states (q, v, u) lie farthest apart; all of them for None.
 
-        Windows follow each other without sharing a row, so their noise is independent. Rows must be in order of time,
+        Windows follow each other without sharing a row, so their noise is independent; none holds a row at which a
+        contact is switched. Rows must be in order of time,
         at the rate of the sensors and unfiltered: noise of filtered signals is not white (a DataWarning reports it).
         Raises DatasetError for rows in another order, positions that jump by a turn and logs without a window;
         InvalidInput for more points than windows, windows of too few rows and more nodes than rows.
         """
-        require_vectors(dataset, "windows of positions")
         rows = _window_rows(dataset, self)
         _warn_of_filtered(dataset)
         if points is not None:
@@ -143,7 +147,10 @@ class WeakForm:
             rows = rows[farthest_point_sampling(self._mean_states(dataset, rows), points)]
         time = dataset.time[rows]
         weights, c = self.signal_weights(time), self.acceleration_weights(time)
-        observed = np.einsum("km,kmj->kj", weights, getattr(dataset, self.signal)[rows])
+        middle, near = _near_middle(dataset, rows)
+        observed = np.einsum("km,kmj->kj", weights, near if self.signal == "q" else dataset.v[rows])
+        if self.signal == "q":
+            observed += np.einsum("km,kmj->kj", c, _turning(dataset, near, time))
         noise = white_noise(dataset, self.signal) * np.linalg.norm(weights, axis=1)[:, None]
         parts = np.array_split(np.arange(rows.shape[1]), self.nodes)
         positive = np.maximum(c, SMALLEST_SHARE * c.max(axis=1, keepdims=True))
@@ -153,10 +160,18 @@ class WeakForm:
             means = [np.einsum("km,kmj->kj", w, values[:, part]) for w, part in zip(shares, parts, strict=True)]
             return np.stack(means, axis=1).reshape(-1, values.shape[-1])
 
+        v, u = at_nodes(dataset.v[rows]), at_nodes(dataset.u[rows])
+        switches = actuators(dataset)
+        u[:, switches:] = np.repeat(
+            dataset.u[rows[:, 0], switches:], self.nodes, axis=0
+        )  # means are not exactly 0 or 1
+
         repeat = {name: np.repeat(values, self.nodes, axis=0) for name, values in (("a", observed), ("noise", noise))}
         nodes = replace(
             dataset,
-            **{name: at_nodes(getattr(dataset, name)[rows]) for name in ("q", "v", "u")},
+            q=_moved(dataset, np.repeat(middle, self.nodes, axis=0), at_nodes(near)),
+            v=v,
+            u=u,
             a=repeat["a"],
             time=at_nodes(dataset.time[rows][..., None])[:, 0],
             episode=np.repeat(dataset.episode[rows[:, 0]], self.nodes),
@@ -173,8 +188,9 @@ class WeakForm:
         for start in range(0, len(rows), WINDOWS_AT_ONCE):
             some = rows[start : start + WINDOWS_AT_ONCE]
             c = self.acceleration_weights(dataset.time[some])
-            states = (np.einsum("km,kmj->kj", c, getattr(dataset, name)[some]) for name in ("q", "v", "u"))
-            means.append(np.hstack(list(states)))
+            middle, near = _near_middle(dataset, some)
+            near, v, u = (np.einsum("km,kmj->kj", c, values) for values in (near, dataset.v[some], dataset.u[some]))
+            means.append(np.hstack([_moved(dataset, middle, near), v, u]))
         return np.concatenate(means)
 
 
@@ -183,7 +199,8 @@ def white_noise(dataset: Dataset, signal: Literal["q", "v"]) -> Float[np.ndarray
 
     Third differences of white noise have 20 times its variance, those of a motion at the rate of a sensor next to none.
     """
-    thirds = [np.diff(getattr(rows, signal), 3, axis=0) for _, rows, _ in episodes_in_order(dataset) if len(rows) > 3]
+    signals = [as_vectors(rows) if signal == "q" else rows.v for _, rows, _ in episodes_in_order(dataset)]
+    thirds = [np.diff(values, 3, axis=0) for values in signals if len(values) > 3]
     return np.sqrt(np.square(np.concatenate(thirds)).mean(axis=0) / 20.0)
 
 
@@ -205,14 +222,45 @@ def _window_rows(dataset: Dataset, how: WeakForm) -> Int[np.ndarray, "N m"]:
         at = np.flatnonzero(dataset.episode == number)
         blocks = at[: len(at) // length * length].reshape(-1, length) if length else at[:0].reshape(0, 1)
         gaps = np.diff(dataset.time[blocks], axis=1) > LONGEST_STEP * median
-        found.append(blocks[~gaps.any(axis=1)])
+        switched = np.diff(dataset.u[blocks][..., actuators(dataset) :], axis=1).any(axis=2)
+        found.append(blocks[~(gaps | switched).any(axis=1)])
     every = np.concatenate(found)
     if not len(every):
         raise DatasetError(
             f"no episode has {how.seconds:g} s without a gap (a step of more than {LONGEST_STEP:g} times the median, "
-            f"{median:.4g} s); give shorter windows, or a log without gaps."
+            f"{median:.4g} s) or a contact that is switched; give shorter windows, or a log without gaps."
         )
     return every
+
+
+def _near_middle(dataset: Dataset, rows: Int[np.ndarray, "N m"]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions in the middle of every window (N, nq), and those of its rows as steps from there (N, m, nv)."""
+    space, q = space_of(dataset), dataset.q[rows]
+    middle = q[:, q.shape[1] // 2]
+    if space.is_vector_space:
+        return np.zeros_like(middle), q
+    return middle, space.difference(torch.tensor(middle)[:, None], torch.tensor(q)).numpy()
+
+
+def _moved(dataset: Dataset, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
+    return space_of(dataset).integrate(torch.tensor(middle), torch.tensor(step)).numpy()
+
+
+def _turning(dataset: Dataset, near: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """What a lacks in the second derivative of steps from the middle, (N, m, nv): body axes turn on the way.
+
+    From the polynomials of degree `PATH_DEGREE` through a window, for this is small and noise must stay small in it.
+    """
+    space = space_of(dataset)
+    if space.is_vector_space:
+        return np.zeros_like(near)
+    s, half, _ = _scaled(time)
+    powers = s[..., None] ** np.arange(PATH_DEGREE + 1)
+    path = np.linalg.pinv(powers) @ near
+    k = np.arange(1, PATH_DEGREE + 1)[:, None]
+    rate = powers[..., :-1] @ (k * path[:, 1:]) / half[..., None]
+    bend = powers[..., :-2] @ (k[1:] * k[:-1] * path[:, 2:]) / np.square(half)[..., None]
+    return chart_acceleration(space, powers @ path, rate, bend) - bend
 
 
 def _warn_of_filtered(dataset: Dataset) -> None:
