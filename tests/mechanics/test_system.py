@@ -27,6 +27,7 @@ from forcegp.mechanics import (
     Sphere,
     State,
     ViscousJointFriction,
+    fixed_point,
 )
 from forcegp.robots import Robot
 
@@ -125,6 +126,12 @@ def test_a_frame_below_a_locked_joint_may_be_fixed_in_the_world():
     with pytest.raises(ContactError, match="'bracket' of chain is fixed in the world"):
         MechanicalSystem(locked, (Contact("bracket", (0.0, 0.0, 0.0), FLOOR),))
     MechanicalSystem(locked, (Contact("forearm", (0.0, 0.0, 0.0), FLOOR),))
+
+
+def test_held_points_need_not_be_unpacked():
+    held, floor = fixed_point("tool", (0.0, 0.0, 0.1)), Contact("tool", (0.0, 0.0, 0.0), FLOOR)
+    system = MechanicalSystem(robot("chain"))
+    assert system.with_contacts([held, floor]).contacts == system.with_contacts([*held, floor]).contacts
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -42,6 +42,7 @@ CONSISTENCY_TOLERANCE = 1e-6
 class MechanicalSystem(Summary):
     """What is known: the robot, its contacts, the known forces, and Baumgarte's terms if the motion has them.
 
+    `contacts` may also hold what `fixed_point`, `fixed_frame` and `rolling` give, several contacts each.
     `known_forces` is the complete list; the default is actuation and rigid-body bias. Joint damping and friction of the
     URDF enter only where listed, for example `ViscousJointFriction.from_robot(robot)`.
     Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
@@ -60,6 +61,8 @@ class MechanicalSystem(Summary):
         for name, kind in (("contacts", Contact), ("known_forces", KnownForce)):
             given = getattr(self, name)
             values = tuple(given) if isinstance(given, Iterable) else (given,)
+            nested = (value if isinstance(value, tuple | list) else (value,) for value in values)
+            values = tuple(each for several in nested for each in several)
             if not isinstance(given, Iterable) or not all(isinstance(value, kind) for value in values):
                 raise InvalidInput(f"{name} is {given!r}; give a sequence of {kind.__name__} objects.")
             object.__setattr__(self, name, values)
@@ -291,7 +294,7 @@ class MechanicalSystem(Summary):
         """The same contacts and forces on another robot with the same joints."""
         return replace(self, robot=robot)
 
-    def with_contacts(self, contacts: Sequence[Contact]) -> "MechanicalSystem":
+    def with_contacts(self, contacts: Sequence[Contact | Sequence[Contact]]) -> "MechanicalSystem":
         """The same robot and forces under other contacts."""
         return replace(self, contacts=contacts)  # type: ignore[arg-type]  # the constructor makes a tuple, or refuses
 

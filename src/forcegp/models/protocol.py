@@ -318,7 +318,7 @@ class Posterior(MotionModel, Summary, ABC):
             "another; fit it to data from there, or use a structured model, which learns forces."
         )
 
-    def with_contacts(self: AnyPosterior, contacts: Sequence[Contact]) -> AnyPosterior:
+    def with_contacts(self: AnyPosterior, contacts: Sequence[Contact | Sequence[Contact]]) -> AnyPosterior:
         """The same knowledge under other contacts, without another fit: another surface, or none at all, `[]`.
 
         What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
