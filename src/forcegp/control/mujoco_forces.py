@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import mujoco as untyped
 import numpy as np
@@ -112,7 +112,7 @@ class MujocoForces(Summary):
         self._chosen = self._tables[number]
         self._library.evaluate(self._chosen)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "MujocoForces":
         if mujoco.get_mjcb_passive() is not None:
             raise InvalidInput("MuJoCo has a passive callback already; leave its context, or set_mjcb_passive(None).")
         self._library.evaluate(self._chosen)

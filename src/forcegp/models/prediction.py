@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from forcegp.summary import Summary, listed
 
 Rows = Float[Tensor, "rows nv"]
 """One number per state and joint."""
+AnyGaussian = TypeVar("AnyGaussian", bound="Gaussian")  # beartype cannot check Self where a module is hooked
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,7 +36,7 @@ class Gaussian(Summary):
         """Standard deviation of each entry (..., k)."""
         return self.variance.sqrt()
 
-    def __getitem__(self, index: Any) -> Self:
+    def __getitem__(self: AnyGaussian, index: Any) -> AnyGaussian:
         """The same for some of the states: `prediction[i]`, `prediction[:10]`, `prediction[mask]`.
 
         `index` is for the batch dimensions. Raises UnknownRow for states that are not there.
