@@ -5,11 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from forcegp import check, identify_analytical
+from forcegp import Dataset, MechanicalSystem, Robot, check, identify_analytical
 from forcegp.checks import quick_check
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+BODY = """<robot name="drone"><link name="body"><inertial><mass value="2"/>
+<inertia ixx="0.03" iyy="0.03" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +58,37 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
     q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
     findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
     assert "--orientation wxyz --axes v=world,body." in findings[0].remedy
+
+
+def swaying(speed: float, noise: float) -> Dataset:
+    """A body tilted by 40 degrees that sways about its axes at `speed` [rad/s], as noisy sensors see it at 50 Hz."""
+    system, time = MechanicalSystem(Robot.from_urdf_text(BODY, base="floating")), 0.02 * np.arange(400)
+    draw = np.random.default_rng(3).normal
+    angles = np.stack([np.sin(1.1 * time), np.sin(1.7 * time), np.sin(2.3 * time)], axis=1) * speed / 2.0
+    turned = Rotation.from_rotvec([0.0, 0.7, 0.0]) * Rotation.from_rotvec(angles)
+    q = np.hstack([0.0 * angles, (turned * Rotation.from_rotvec(0.02 * noise * draw(size=(400, 3)))).as_quat()])
+    rate = (turned[:-2].inv() * turned[2:]).as_rotvec() / 0.04
+    v = np.zeros((400, 6))
+    v[1:-1, 3:] = turned[1:-1].apply(rate)
+    v[:, 3:] += noise * draw(size=(400, 3))
+    a = np.gradient(v, time, axis=0)
+    return Dataset(q=q, v=v, u=np.zeros((400, 6)), a=a, time=time, system=system).rows(slice(1, -1))
+
+
+def test_rates_in_the_axes_of_the_world_are_named_in_noise_as_well():
+    """Where turns are slow, both readings miss by much of the speed; what they differ in decides."""
+    log = swaying(0.3, noise=0.05)
+    (finding,) = quick_check(log)
+    assert finding.severity == "wrong"
+    assert "angular velocities in the axes of the world" in finding.seen
+    assert "--axes v=body,world." in finding.remedy
+    stated = {"import": {"mapping": {"axes": {"v": ["world", "body"]}}}}  # linear ones were turned already
+    (finding,) = quick_check(replace(log, metadata=stated))
+    assert "--axes v=world." in finding.remedy
+
+
+def test_noise_alone_is_not_taken_for_other_axes():
+    assert not [each for each in quick_check(swaying(0.0, noise=0.1)) if each.severity == "wrong"]
 
 
 def test_an_accelerometer_is_no_acceleration(log):

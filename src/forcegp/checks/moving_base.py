@@ -4,6 +4,7 @@ State estimators differ: quaternions begin or end with w, velocities are those o
 Each reading predicts how positions change from row to row; that which the log obeys shows.
 """
 
+import contextlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -21,6 +22,9 @@ from forcegp.robots.manifold import Group
 CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
 itself below this share of the speed."""
+SURE = 20.0
+"""Standard errors of independent rows by which other axes have to fit better: successive rows are not independent."""
+TINY = 1e-24
 MOST_ROWS = 2000
 IMU = {"axes": {"a": ("imu",)}}
 
@@ -37,7 +41,7 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
     change = torch.tensor(dataset.v[after + 1] - dataset.v[after]) / step
     a = torch.tensor(0.5 * (dataset.a[after] + dataset.a[after + 1]))
     for group in system.robot.layout.groups:
-        yield from _of_velocity(system.robot, group, q0, q1, step, middle)
+        yield from _of_velocity(system.robot, group, q0, q1, step, middle, _stated_axes(dataset))
         error, size = _rms(change[:, group.rows] - a[:, group.rows]), _rms(change[:, group.rows])
         at, gravity = q0[:, group.places], system.robot.gravity
         measured = in_base(group, at, a[:, group.rows], ("imu", "body"), middle[:, group.rows], gravity)
@@ -62,7 +66,17 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
             )
 
 
-def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tensor, v: Tensor) -> Iterator[Finding]:
+def _stated_axes(dataset: Dataset) -> tuple[str, str]:
+    """Of linear and angular velocities in the log file, as its import was given them."""
+    with contextlib.suppress(AttributeError, TypeError, KeyError, ValueError):  # somebody else's metadata
+        *_, linear, angular = 2 * tuple(dataset.metadata["import"]["mapping"]["axes"]["v"])
+        return str(linear), str(angular)
+    return "body", "body"
+
+
+def _of_velocity(
+    robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tensor, v: Tensor, stated: tuple[str, str]
+) -> Iterator[Finding]:
     own = v[:, group.rows]
     whole = list(range(own.shape[1]))
     parts = {"linear ": [k for k in whole if group.motion.free[k] < 3]}
@@ -76,8 +90,7 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
         moved = robot.space.difference(first, second)[:, group.rows] / step
         body, turned, of_world = in_base(group, first[:, group.places], own, ("world", "world")), own.clone(), []
         for name, part in parts.items():
-            as_recorded, other = (_rms((moved - velocity)[:, part]) for velocity in (own, body))
-            if part and mistaken(as_recorded, other, _rms(own[:, part])):
+            if part and _explained((moved - own)[:, part], (body - own)[:, part]):
                 turned[:, part] = body[:, part]
                 of_world.append(name)
         return of_world, _rms(moved - turned)
@@ -96,8 +109,8 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
     if of_world:
         both = len(of_world) == 2
         meant.append(f"{'' if both else of_world[0]}velocities in the axes of the world")
-        axes = tuple("world" if part in of_world else "body" for part in parts)
-        correction["axes"] = {"v": axes[:1] if both else axes}
+        axes = tuple("world" if part in of_world else now for part, now in zip(parts, stated, strict=True))
+        correction["axes"] = {"v": axes[:1] if len(set(axes)) == 1 else axes}
     reading = " and ".join(meant)
     remedy = (
         f"forcegp import {import_flags(correction)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
@@ -122,6 +135,18 @@ def _of_velocity(robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tenso
         )
     else:
         yield ok(subject="base", seen=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
+
+
+def _explained(error: Tensor, difference: Tensor) -> bool:
+    """Whether `difference` (rows, k), what another reading changes, is what the `error` consists of.
+
+    Its coefficient in a regression of the error is 1 for the other reading, 0 for this one, and 1/2 where both are
+    noise: noise e of v changes the difference by R^T e - e, of which the error has the part -e.
+    """
+    variance = torch.minimum(error.square().mean(0), (error - difference).square().mean(0)).clamp_min(TINY)
+    weight = float((difference.square() / variance).sum())
+    share = float((error * difference / variance).sum()) / weight if weight > 0.0 else 0.0
+    return abs(share - 1.0) < CLEARLY and (share - 0.5) * weight**0.5 > SURE
 
 
 def _rms(values: Tensor) -> float:
