@@ -194,6 +194,7 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
         "noise_std": posterior.noise_std.tolist(),
         "wind": posterior.settings.get("air", {}).get("wind"),
         "wind_not_found": _wind_not_found(posterior),
+        "steady_forces": posterior.settings.get("steady_forces"),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
@@ -240,6 +241,7 @@ def _points_used(summary: Mapping[str, Any]) -> str:
 
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     forces, air = summary.get("force_noise_std"), summary.get("wind")
+    still = "learned as still air" + (", with a force in each episode" if summary.get("steady_forces") else "")
     # the status counts failed evaluations, too, and the starts
     status = with_option_names(summary["status"], ("iterations",))
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
@@ -255,7 +257,7 @@ def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
             "noise std": _per_joint(summary["noise_std"]),
             **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
             **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
-            **({"wind of these rows": "not found; learned as still air"} if summary.get("wind_not_found") else {}),
+            **({"wind of these rows": f"not found; {still}"} if summary.get("wind_not_found") else {}),
             "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
         },
     )

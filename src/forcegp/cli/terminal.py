@@ -11,7 +11,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import forcegp
 import forcegp.evaluation
@@ -70,6 +70,7 @@ LEAST_SHARE = 0.02
 """Of the work that must be done before the remaining time is guessed from it."""
 
 
+@runtime_checkable
 class ProgressCallback(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
 

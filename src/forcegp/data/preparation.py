@@ -123,6 +123,12 @@ class Preparation:
         return Prepared(dataset=prepared, report=metadata["preparation"], preparation=chosen)
 
 
+def memory(metadata: Mapping[str, Any]) -> float:
+    """Time in s within which rows of a filtered log repeat their neighbours; 0 where the metadata name no filter."""
+    cutoff = preparation_report(metadata).get("cutoff")
+    return 0.0 if cutoff is None else 1.0 / (PASSED * float(cutoff))
+
+
 def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     """`metadata["preparation"]` as a `Preparation` leaves it; empty for what others may have put there."""
     report: Any = metadata.get("preparation")

@@ -21,6 +21,7 @@ STRONGEST, SURE = 40.0, 2.0  # m/s: a wind beyond, or a standard deviation beyon
 APART = 0.5  # s, between rows that count as independent of each other
 STEP = 0.05  # m/s, of derivatives
 BLOCK = 4096  # rows
+LIKELIER = 3.0  # forces of episodes a priori, over what one cause adds
 MOVING = 12  # causes that vanish with the velocity
 
 
@@ -86,9 +87,7 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     Nothing is found for bases that do not fly freely, for rows out of order, for fewer than 400, where drag explains no
     more than its coefficients would of noise, and for winds beyond 40 m/s or a standard deviation beyond 2 m/s.
     """
-    system = dataset.system
-    groups = () if system is None else system.robot.layout.groups
-    if system is None or not groups or groups[0].kind != "floating" or system.contacts or not dataset.time_ordered:
+    if not _flies(dataset) or not dataset.time_ordered:
         return None
     numbers, episode = np.unique(dataset.episode, return_inverse=True)
     thin = np.arange(0, len(dataset), max(1, len(dataset) // MOST_ROWS))
@@ -105,6 +104,35 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     return forces.law(wind), wind
 
 
+def steady_forces(dataset: Dataset) -> Float[np.ndarray, "rows 3"] | None:
+    """The force [N, world] by which each episode differs from the others; None for one, and where no base flies freely.
+
+    With the law of air in still air and a constant force of the world in every episode, whose coefficients are small
+    a priori: causes that hardly change in an episode can look like its force. So they share what either would explain.
+    The mean of the forces over the rows is left out, for the law holds it. Where wind is not found, this is what
+    different winds leave.
+    """
+    numbers, own = np.unique(dataset.episode, return_inverse=True)
+    if len(numbers) < 2 or not _flies(dataset) or len(dataset) < FEWEST_ROWS // 2:
+        return None
+    thin = np.arange(0, len(dataset), max(1, len(dataset) // MOST_ROWS))
+    forces, count = _Forces.of(dataset.rows(thin)), 3 * len(numbers)
+    X, _ = forces.causes(np.zeros((len(thin), 3)))
+    X = X / (np.sqrt(np.square(X).mean(0)) + 1e-300)
+    constant = np.zeros((len(thin), 3, len(numbers), 3))
+    constant[np.arange(len(thin)), :, own[thin]] = np.swapaxes(forces.rotation, 1, 2)
+    of_law = np.einsum("nk,ij->nikj", X, np.eye(3)).reshape(3 * len(thin), -1)
+    A = np.hstack([LIKELIER * constant.reshape(3 * len(thin), count), of_law])
+    target = forces.wrench[:, :3].ravel()
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    shares = U.T @ target
+    left = np.square(target).mean() - np.square(shares[s > 1e-10 * s[0]]).sum() / len(target)
+    ridge = max(left, 0.0) / (np.square(target).mean() + 1e-300)
+    steady = LIKELIER * (Vt.T @ (s * shares / (np.square(s) + ridge + 1e-20 * s[0] ** 2)))[:count]
+    of_rows = steady.reshape(-1, 3)[own]
+    return of_rows - of_rows.mean(0)
+
+
 def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
     """The recording with an `ObservedWind` in its system, whose columns of u hold the wind [m/s, world]."""
     assert dataset.system is not None, "wind was found in a recording with a system"
@@ -113,6 +141,11 @@ def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
     first = system.inputs.index(forcegp.mechanics.ObservedWind.names[0])
     u = np.insert(dataset.u, [first] * 3, wind, axis=1)
     return replace(dataset, u=u, system=system)
+
+
+def _flies(dataset: Dataset) -> bool:
+    groups = () if dataset.system is None else dataset.system.robot.layout.groups
+    return bool(groups) and groups[0].kind == "floating" and not dataset.system.contacts  # type: ignore[union-attr]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Wind, and a slow force that no feature explains: observed from the past rows of a recording, then known."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from jaxtyping import Float, Int
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_wind
 from forcegp.data.filtering import episodes_in_order, sums_before
+from forcegp.data.wind import steady_forces
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem, ObservedWind, ObservedWrench
 from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
@@ -24,7 +26,7 @@ def observing(
 ) -> tuple[AnyPosterior, Dataset]:
     """The posterior and the recording with an `ObservedWrench` on link `frame`, in six more columns of u.
 
-    Where the fit found the wind of its rows (`in_wind`), three more hold the velocity of the air, an `ObservedWind`
+    Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
     that the rows before show (`AirLaw.wind_before`).
 
     Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
@@ -51,38 +53,51 @@ def observing(
     posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
     observed = _observed(unexplained, effect, dataset, times)
-    system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES)))
+    system = _with_wrench(posterior.system, frame)
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
     return posterior.with_system(system), seen.rows(_with_past(dataset, seconds))
 
 
-def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, ForcePrior, Dataset] | None:
-    """The law of air of the rows (`forcegp.data.find_wind`), the prior with their mean wind, and the rows with theirs.
+def in_air(
+    prior: ForcePrior, system: MechanicalSystem, dataset: Dataset
+) -> tuple[Mapping[str, Any], ForcePrior, Dataset] | None:
+    """What air did in the rows, for the settings of a fit, the prior for it, and the rows with columns that hold it.
 
-    None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where the system has wind already,
-    and where the rows do not show it.
+    Where the rows show their wind (`forcegp.data.find_wind`), these are its law and velocity; else, for several
+    episodes, an `ObservedWrench` with the force that each has of its own (`steady_forces`), so that no function has to
+    explain it. None where the prior has no `AerodynamicForce` or observes nothing (`observe=0`), where the system
+    observes already, and where the rows show neither.
     """
     terms = prior.summands()
     of_air = [term for term in terms if isinstance(term, AerodynamicForce) and term.observe != 0.0]
-    if not of_air or has_wind(system) or dataset.u.shape[1] != system.sizes[2]:
+    if not of_air or _observes(system) or dataset.u.shape[1] != system.sizes[2]:
         return None
     rows = replace(dataset, system=system, truth={})
-    if (found := find_wind(rows)) is None:
+    if (found := find_wind(rows)) is not None:
+        law, wind = found
+        windy = [replace(term, wind=law.wind) if isinstance(term, AerodynamicForce) else term for term in terms]
+        return {"air": law.to_dict()}, windy[0] if len(windy) == 1 else SumPrior(tuple(windy)), with_wind(rows, wind)
+    if (forces := steady_forces(rows)) is None:
         return None
-    law, wind = found
-    windy = [replace(term, wind=law.wind) if isinstance(term, AerodynamicForce) else term for term in terms]
-    return law, windy[0] if len(windy) == 1 else SumPrior(tuple(windy)), with_wind(rows, wind)
+    columns = np.concatenate([rows.u, forces, np.zeros_like(forces)], axis=1)
+    each = {str(number): forces[rows.episode == number][0].tolist() for number in rows.episodes}
+    seen = replace(rows, u=columns, system=_with_wrench(system, of_air[0].link(system.robot)))
+    return {"steady_forces": each}, prior, seen
 
 
-def has_wind(system: MechanicalSystem) -> bool:
-    """Whether u has columns for the velocity of the air."""
-    return any(isinstance(force, ObservedWind) for force in system.known_forces)
+def _with_wrench(system: MechanicalSystem, frame: str) -> MechanicalSystem:
+    return replace(system, known_forces=(*system.known_forces, ObservedWrench(frame, NAMES)))
 
 
-def without_wind(system: MechanicalSystem) -> MechanicalSystem:
-    """The system without columns of wind in u."""
-    return replace(system, known_forces=tuple(x for x in system.known_forces if not isinstance(x, ObservedWind)))
+def _observes(system: MechanicalSystem) -> bool:
+    return any(isinstance(force, ObservedWind | ObservedWrench) for force in system.known_forces)
+
+
+def unobserved(system: MechanicalSystem) -> MechanicalSystem:
+    """The system without the columns of u that :func:`in_air` gives it."""
+    own = ObservedWind.names, NAMES
+    return replace(system, known_forces=tuple(x for x in system.known_forces if getattr(x, "names", ()) not in own))
 
 
 def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
@@ -94,11 +109,14 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     target, own = posterior.target, posterior.model.system
     if target is None:
         return rows
-    if "air" not in posterior.settings or target.to_dict() != without_wind(own).to_dict():
+    in_air = {"air", "steady_forces"} & set(posterior.settings)
+    if not in_air or target.to_dict() != unobserved(own).to_dict():
         raise InvalidInput(
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
+    if "air" not in posterior.settings:
+        return observing(posterior, rows)[1]
     _, seen = _in_observed_wind(posterior, rows)
     return seen.rows(_with_past(rows, LEAST))
 
@@ -117,7 +135,7 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
 def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
     """Both with the wind that the rows before each one show, where the fit found a law of air."""
     stored = posterior.settings.get("air")
-    if stored is None or has_wind(posterior.system):
+    if stored is None or _observes(posterior.system):
         return posterior, dataset
     rows = replace(dataset, system=posterior.system)
     seen = with_wind(rows, AirLaw.from_dict(stored).wind_before(rows))

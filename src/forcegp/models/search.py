@@ -107,6 +107,13 @@ def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
     return replace(noise, acceleration=_start_of_noise(rows), learn=True)
 
 
+def learns_noise(noise: Noise | None, rows: Dataset) -> bool:
+    """Whether `resolved_noise` is one that is learned."""
+    if noise is None or noise.acceleration is None:
+        return rows.noise_level is None or (noise is not None and noise.learn)
+    return noise.learn
+
+
 def _start_of_noise(rows: Dataset | Windows) -> tuple[float, ...]:
     """Where the search for the noise of every joint begins, in units of its acceleration."""
     spread = (rows.observed if isinstance(rows, Windows) else rows.a).std(axis=0)

@@ -14,13 +14,14 @@ from forcegp.errors import DataWarning, InvalidInput, require_type
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, Learned, learn_to_list
-from forcegp.models.observed_wrench import has_wind, in_wind, without_wind
+from forcegp.models.observed_wrench import in_air, unobserved
 from forcegp.models.search import (
     ALL_ROWS,
     MOST_POINTS_FOR_RESTARTS,
     FitProgress,
     checked_rows,
     described_rows,
+    learns_noise,
     noise_of_windows,
     resolved_noise,
     training_rows,
@@ -32,6 +33,7 @@ from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts
 from forcegp.models.structured.refinement import (
     fit_with_refined_loads,
+    independent_rows,
     learning_rows,
     on_all_rows,
     require_memory_to_learn,
@@ -223,13 +225,14 @@ class StructuredGP(StructuredModel):
     ) -> StructuredPosterior:
         """From accelerations: parameters from some of the rows, the posterior from all."""
         dataset = checked_rows(self.system.robot.joint_names, dataset)
-        if has_wind(self.system) and dataset.u.shape[1] == len((still := without_wind(self.system)).inputs):
-            return replace(self, system=still)._fit_rows(dataset, points, search, engine, learning_points)
-        if found := in_wind(self.prior, self.system, dataset):
-            law, prior, rows = found
-            windy = replace(self, prior=prior, system=rows.system)
-            learned = windy._fit_rows(rows, points, search, engine, learning_points)
-            return learned.with_system(without_wind(learned.system)).with_settings(air=law.to_dict())
+        plain = unobserved(self.system)
+        if len(plain.inputs) < len(self.system.inputs) and dataset.u.shape[1] == len(plain.inputs):
+            return replace(self, system=plain)._fit_rows(dataset, points, search, engine, learning_points)
+        if found := in_air(self.prior, self.system, dataset):
+            settings, prior, rows = found
+            seeing = replace(self, prior=prior, system=rows.system)
+            learned = seeing._fit_rows(rows, points, search, engine, learning_points)
+            return learned.with_system(unobserved(learned.system)).with_settings(**settings)
         chosen = engine_of(engine)
         all_rows = training_rows(self.system.robot.joint_names, dataset, points)
         if chosen is not None:
@@ -238,11 +241,15 @@ class StructuredGP(StructuredModel):
         if search.learn is not None and learning_points is None:
             learning_points = len(all_rows)
         rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
+        described = described_rows(all_rows, dataset)
+        if learns_noise(self.noise, dataset) and len(apart := independent_rows(rows)) < len(rows):
+            if len(rows) == len(all_rows):
+                described["correlated_rows"] = len(rows) / len(apart)
+            rows = apart
         search = replace(search, start=self._continuation(rows, dataset, search))
         fitted = widened(self._fit_with_loads(rows, dataset, search), search.hyperprior)
         warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first
         report = None if search.progress is None else partial(search.progress, ALL_ROWS)
-        described = described_rows(all_rows, dataset)
         return on_all_rows(fitted, all_rows, chosen, described, search.hyperprior, report)
 
     def _fit_windows(

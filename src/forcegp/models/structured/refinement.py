@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from forcegp.data import Dataset, farthest_rows
+from forcegp.data.preparation import memory
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference import (
     Choice,
@@ -62,6 +64,24 @@ def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) 
     return rows.rows(slice(learning_points)) if ordered else farthest_rows(rows, learning_points)
 
 
+def independent_rows(rows: Dataset) -> Dataset:
+    """Those that lie further apart in time than a filter makes them alike; of two, the one that comes first.
+
+    Noise that is learned is taken for independent. Where rows of a filtered log lie close together, errors that change
+    slowly would look like forces, and the noise like none.
+    """
+    seconds = memory(rows.metadata) * (1.0 - 1e-9)
+    if seconds == 0.0:
+        return rows
+    kept, found = [], dict[tuple[int, int], float]()  # at most one time in a stretch of that length
+    for row, (time, episode) in enumerate(zip(rows.time.tolist(), rows.episode.tolist(), strict=True)):
+        place = int(time // seconds)
+        if all(abs(found.get((episode, place + k), np.inf) - time) >= seconds for k in (-1, 0, 1)):
+            found[episode, place] = time
+            kept.append(row)
+    return rows.rows(np.array(kept))
+
+
 def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
     """Raise NotEnoughMemory where the exact likelihood of these rows or windows does not fit into memory."""
     weights = likelihood.training.weights
@@ -91,7 +111,9 @@ def on_all_rows(
     reference = fitted.training
     training = reference
     if len(rows) != len(reference.q):
-        training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
+        correlated = described.get("correlated_rows", 1.0)
+        training = TrainingData.of(rows, reference.q.device)
+        training = replace(training, reference=reference, correlated_rows=correlated)
     likelihood = replace(fitted.likelihood, training=training)
     fitted.model.system.check_states(training.q, training.v, training.u)
     if training is not reference:
