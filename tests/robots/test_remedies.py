@@ -1,11 +1,20 @@
 """One report names all problems of a file, and its remedy takes the file."""
 
+import re
+
 import pytest
 import torch
 from tests.robots.test_base import LOOSE
 from tests.robots.test_urdf_errors import SMALL, changed
 
-from forcegp.errors import InvalidNumber, NonPhysicalInertia, RobotFileWarning, RobotModelError
+from forcegp.errors import (
+    InvalidNumber,
+    MissingInertia,
+    NonPhysicalInertia,
+    RobotFileWarning,
+    RobotModelError,
+    UnexpandedXacro,
+)
 from forcegp.robots import Robot
 from forcegp.robots.problems import LISTED, Problems
 
@@ -69,6 +78,8 @@ IGNORED = {
     "a negative <limit> effort is taken as no limit": changed('effort="5"', 'effort="-5"'),
     "a lower limit above the upper one is taken as no limit": changed('upper="1"', 'upper="-2"'),
     "the first of several <axis> counts": changed("<limit", '<axis xyz="1 0 0"/><limit'),
+    "the first of several <inertial> counts": changed("</link>\n</robot>", "<inertial/></link></robot>"),
+    "the first of several <limit> counts": changed("</joint>", '<limit lower="-9" effort="9"/></joint>'),
     "a <robot> without a name is called 'robot'": changed(' name="small"', ""),
 }
 
@@ -117,4 +128,30 @@ def test_a_world_that_drake_knows_and_the_file_does_not_define_is_offered_as_the
 def test_a_misspelt_parent_is_no_root():
     with pytest.raises(RobotModelError, match="did you mean 'base'") as caught:
         Robot.from_urdf_text(changed('parent link="base"', 'parent link="bsae"'))
+    assert caught.value.remedy == {}
+
+
+def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
+    text = re.sub("<inertia .*/>", "", SMALL)
+    with pytest.raises(NonPhysicalInertia, match="add it, or take the mass as a point") as caught:
+        Robot.from_urdf_text(text)
+    with pytest.warns(RobotFileWarning, match=r"taken as a point \(link 'arm'\)"):
+        robot = Robot.from_urdf_text(text, **caught.value.remedy)
+    assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(2 * 0.1**2, rel=1e-12)
+    assert robot.tree.equals(Robot.from_urdf_text(robot.to_urdf()).tree)
+
+
+def test_definitions_that_xacro_left_do_not_matter():
+    left = '<xacro:arg name="a" default="b"/><xacro:property name="m" value="${1 + 1}"/>'
+    xmlns = ' name="small" xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    robot = Robot.from_urdf_text(SMALL.replace("</robot>", f"{left}</robot>").replace(' name="small"', xmlns))
+    assert robot.joint_names == ("hinge",)
+    with pytest.raises(UnexpandedXacro):
+        Robot.from_urdf_text(f'<robot name="r">{left}</robot>')
+
+
+def test_the_only_joint_is_not_offered_to_be_locked():
+    link = '<link name="b"/><joint name="free" type="floating"><parent link="a"/><child link="b"/></joint>'
+    with pytest.raises(MissingInertia) as caught:
+        Robot.from_urdf_text(f'<robot name="r"><link name="a"/>{link}</robot>')
     assert caught.value.remedy == {}

@@ -248,7 +248,7 @@ class Robot(RobotStructure):
             without = bodies_without_inertia(description, layout, tree, problems.broken)
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
-            problems.offer_no_lock_of(names)
+            problems.offer_no_lock_of([*robot.single_joint_names, *(group.name for group in layout.groups)])
             check_base(description, layout.standing, problems)
             return robot
         return None

@@ -34,7 +34,10 @@ ENDS = ("parent", "child")
 
 @dataclass(frozen=True)
 class InertialDescription:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), both in the axes of the link frame."""
+    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), both in the axes of the link frame.
+
+    An inertia that the file does not give is NaN.
+    """
 
     mass: float
     center_of_mass: np.ndarray
@@ -177,8 +180,8 @@ def _child(element: Element, tag: str, place: _Place) -> Element:
 
 def _optional_child(element: Element, tag: str, place: _Place) -> Element | None:
     children = element.findall(tag)
-    if len(children) > 1:
-        raise DuplicateName(f"{place}: <{element.tag}> has {len(children)} <{tag}> elements; keep one.")
+    if len(children) > 1:  # as in other readers
+        place.problems.ignore(f"the first of several <{tag}> counts", place.owner, f"{len(children)} <{tag}>")
     return children[0] if children else None
 
 
@@ -249,9 +252,9 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     mass = _number(_attribute(_child(element, "mass", place), "value", place), "<mass> value", place)
     if 0.0 < mass < LIGHTEST:
         raise InvalidNumber(f"{place}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
-    entries = _child(element, "inertia", place)
+    entries = _optional_child(element, "inertia", place)
     ixx, ixy, ixz, iyy, iyz, izz = (
-        _number(_attribute(entries, key, place), f"<inertia> {key}", place)
+        np.nan if entries is None else _number(_attribute(entries, key, place), f"<inertia> {key}", place)
         for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     origin = _origin(_optional_child(element, "origin", place), place)
@@ -281,14 +284,14 @@ def _joint(
                 f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
     origin = _origin(_optional_child(element, "origin", place), place)
-    axes = element.findall("axis")
-    if len(axes) > 1:
-        place.problems.ignore("the first of several <axis> counts", place.owner, f"{len(axes)} <axis>")
-    axis = _vector(axes[0] if axes else None, "xyz", (1.0, 0.0, 0.0), place)
-    length = float(np.linalg.norm(axis))
-    if kind in MOVABLE and not (math.isfinite(length) and length > 0.0):
+    axis_element = _optional_child(element, "axis", place)
+    if kind == "planar" and axis_element is None:  # x by the format, which nobody means
+        place.problems.ignore("a planar joint without <axis> moves along x and y", place.owner, "no <axis>")
+    axis = _vector(axis_element, "xyz", (0.0, 0.0, 1.0) if kind == "planar" else (1.0, 0.0, 0.0), place)
+    length, directed = float(np.linalg.norm(axis)), kind in (*MOVABLE, "planar")
+    if directed and not (math.isfinite(length) and length > 0.0):
         raise InvalidNumber(f"{place}: <axis> {axis.tolist()} has no direction; give a non-zero, finite vector.")
-    unit = tuple((axis / length).tolist()) if kind in MOVABLE else (1.0, 0.0, 0.0)
+    unit = tuple((axis / length).tolist()) if directed else (1.0, 0.0, 0.0)
     limit = _optional_child(element, "limit", place)
     lower, upper = -math.inf, math.inf
     if limit is not None and kind in ("revolute", "prismatic") and ("lower" in limit.attrib or "upper" in limit.attrib):
