@@ -6,7 +6,8 @@ are robot files: those that Pinocchio (URDF) or MuJoCo (MJCF) loads, with a join
 bodies all have mass in Pinocchio's model; MuJoCo itself requires that. Of every file that is loaded, mass matrix, bias
 forces and forward dynamics at a random state are compared, relative to the largest entry (of bias forces that vanish:
 to those of 1 rad/s^2). Joints that mimic others are compared by projecting the full model with the constant matrix G of
-the file. Of MuJoCo acts what a robot has: no springs, damping, tendons, actuators, contacts or medium.
+the file. Of MuJoCo acts what a robot has: no springs, damping, tendons, actuators, contacts, medium or
+rotors of free bodies.
 
     python -m benchmarks.robot_files FOLDER [FOLDER ...]       counts
     python -m benchmarks.robot_files FOLDER --each             a line for every file that moves
@@ -82,7 +83,13 @@ def measured(path: Path, *, mjcf: bool) -> File:
                 except ForceGPError as second:
                     outcome, message = f"{type(second).__name__} after one round", str(second)
     seconds = time.perf_counter() - started
-    wrong = np.nan if robot is None or kind not in ("robot", "massless") else _difference(robot, compared(robot))
+    if robot is not None:  # rotors of a free body turn with it here, and not in MuJoCo: a warning says so
+        free = [group for group in robot.layout.groups if group.kind == "floating"]
+        robot = robot.with_armature({name: 0.0 for group in free for name in robot.joint_names[group.rows]})
+    wrong = np.nan
+    if robot is not None and kind in ("robot", "massless"):
+        theirs = compared(robot)
+        wrong, message = _difference(robot, theirs), f"condition of M {np.linalg.cond(theirs[0]):.1e}"
     return File(path, "MJCF" if mjcf else "URDF", kind, outcome, remedy, asked, message, wrong, seconds)
 
 
@@ -183,6 +190,8 @@ def _mujoco_numbers(model: Any, robot: Robot) -> Numbers:
         model.opt.disableflags |= int(bit)
     model.opt.density, model.opt.viscosity = 0.0, 0.0
     model.body_gravcomp[:], model.tendon_armature[:] = 0.0, 0.0
+    for joint in np.flatnonzero(model.jnt_type == 0):
+        model.dof_armature[model.jnt_dofadr[joint] : model.jnt_dofadr[joint] + 6] = 0.0
     names = [joint.name for joint in robot.all_joints if joint.type != "fixed"]  # some have no name in the file
     followed = _couplings(model, names)
     x, v, tau = _state(robot)
@@ -234,7 +243,7 @@ def report(files: list[File], *, each: bool) -> None:
     for file in files:
         if file.oracle in ("robot", "massless") and (each or file.error > CLOSE or file.seconds > 3.0):
             told = f"{'base?' if file.asked else '     '} {file.error:8.1e} {file.seconds:5.2f} s {file.path}"
-            print(f"{file.outcome:10} {told} {dict(file.remedy)}")
+            print(f"{file.outcome:10} {told} {dict(file.remedy)} {file.message if file.outcome in LOADED else ''}")
     for file in files:
         if file.outcome not in LOADED and file.oracle != "still" and (each or file.oracle == "robot"):
             print(f"{file.oracle}: {file.outcome}: {file.message[:300]}")

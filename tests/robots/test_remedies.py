@@ -2,6 +2,7 @@
 
 import re
 
+import pinocchio as pin
 import pytest
 import torch
 from tests.robots.test_base import LOOSE
@@ -80,6 +81,9 @@ IGNORED = {
     "the first of several <axis> counts": changed("<limit", '<axis xyz="1 0 0"/><limit'),
     "the first of several <inertial> counts": changed("</link>\n</robot>", "<inertial/></link></robot>"),
     "the first of several <limit> counts": changed("</joint>", '<limit lower="-9" effort="9"/></joint>'),
+    "a negative <dynamics> damping is taken as none": changed("<axis", '<dynamics damping="-0.1"/><axis'),
+    "a product of inertia that is not given is 0": changed(' ixy="0"', ""),
+    "an <inertial> without mass is left out": changed('<link name="base"/>', '<link name="base"><inertial/></link>'),
     "a <robot> without a name is called 'robot'": changed(' name="small"', ""),
 }
 
@@ -91,7 +95,7 @@ def test_what_can_be_ignored_is_a_warning_or_with_strict_an_error(what):
     q = torch.ones(1).double()
     assert torch.equal(robot.mass_matrix(q), Robot.from_urdf_text(SMALL).mass_matrix(q))
     joint = robot.joint("hinge")
-    assert (joint.velocity_limit, joint.effort_limit, joint.lower).count(float("inf")) == ("negative" in what)
+    assert (joint.velocity_limit, joint.effort_limit, joint.lower).count(float("inf")) == ("negative <limit>" in what)
     assert joint.lower == (-float("inf") if "lower" in what else -1.0)
     robot.with_armature([0.1])  # nothing is said twice
     with pytest.raises(InvalidNumber, match="leave strict out"):
@@ -155,3 +159,34 @@ def test_the_only_joint_is_not_offered_to_be_locked():
     with pytest.raises(MissingInertia) as caught:
         Robot.from_urdf_text(f'<robot name="r"><link name="a"/>{link}</robot>')
     assert caught.value.remedy == {}
+
+
+NOT_XML = {
+    "dashes in a comment": changed("<link", "<!-- a -- b ---><link"),
+    "no space": changed('"hinge" type', '"hinge"type'),
+}
+
+
+@pytest.mark.parametrize("what", NOT_XML)
+def test_what_other_readers_take_though_it_is_no_xml(what):
+    text = NOT_XML[what].replace('izz="0.1"', 'izz="0.9"')
+    with pytest.raises(NonPhysicalInertia) as caught:
+        Robot.from_urdf_text(text)
+    robot = Robot.from_urdf_text(text, **caught.value.remedy, strict=None)
+    assert robot.joint_names == ("hinge",)
+    assert Robot.from_urdf_text(robot.to_urdf()).tree.equals(robot.tree)
+    assert pin.buildModelFromXML(text).nv == 1
+
+
+def test_comments_need_not_have_the_encoding_of_the_file(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_bytes(changed("<link", "<!-- \N{DEGREE SIGN} --><link").encode("latin-1"))
+    assert Robot.from_urdf(path).joint_names == ("hinge",)
+
+
+def test_a_joint_without_direction_is_offered_to_be_locked():
+    text = MANY.replace('<child link="FL_foot"/>', '<child link="FL_foot"/><axis xyz="0 0 0"/>')
+    with pytest.raises(RobotModelError, match=r"'joint_FL_foot': <axis> .* has no direction") as caught:
+        Robot.from_urdf_text(text)
+    robot = Robot.from_urdf_text(text, **caught.value.remedy, strict=None)
+    assert robot.joint_names[6:] == ("joint_FR_foot",)

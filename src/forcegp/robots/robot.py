@@ -44,6 +44,7 @@ from forcegp.robots.urdf_file import (
     with_root,
     write_text,
 )
+from forcegp.robots.xml_text import well_formed
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -125,7 +126,8 @@ class Robot(RobotStructure):
 
         ``strict`` of None warns of nothing: for text that was warned of before.
         """
-        text = text.lstrip() if root is None else with_root(text.lstrip(), root)
+        text = well_formed(text.lstrip())
+        text = text if root is None else with_root(text, root)
         given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
         return cls._made(text, Problems(source, given, strict=bool(strict)), gravity, armature, quiet=strict is None)
 

@@ -7,6 +7,7 @@ axes and ``|dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2`` for changes s of the eigenva
 three variables.
 """
 
+import contextlib
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -55,6 +56,8 @@ def read_text(path: str | Path) -> str:
     try:
         return data.decode(encoding)
     except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
+        with contextlib.suppress(ValueError, LookupError):  # comments are written in any language
+            return re.sub(rb"<!--.*?-->", b"", data, flags=re.DOTALL).decode(encoding)
         raise UnreadableRobotFile(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'

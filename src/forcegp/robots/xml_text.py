@@ -12,8 +12,27 @@ MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
+TAG = re.compile(r"""<[A-Za-z_](?:[^<>"']|"[^"<]*"|'[^'<]*')*>""")
+VALUE = re.compile(r"""("[^"]*"|'[^']*')""")
 DEFINITIONS = ("}arg", "}property", "}macro")
 """Elements of xacro that add nothing by themselves."""
+
+
+def well_formed(text: str) -> str:
+    """The text, or where it is no XML, what other readers of robot files make of it.
+
+    Comments may hold anything, and attributes need no space between them.
+    """
+    if text.count("<") > MOST_TAGS:
+        return text  # refused where it is read
+    try:
+        SafeElementTree.fromstring(_with_prefixes(text.lstrip()))
+    except (ParseError, UnicodeError):
+        text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+        return TAG.sub(lambda tag: VALUE.sub(r"\1 ", tag[0]), text)
+    except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
+        pass  # refused where it is read
+    return text
 
 
 def parse_xml(text: str, source: str) -> Element:
