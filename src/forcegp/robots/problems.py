@@ -108,7 +108,12 @@ def remedy_text(remedy: Mapping[str, Any], reader: str) -> str:
     """The arguments in Python, and the options of the command line that they are."""
     words = []
     for name, value in remedy.items():
-        listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
+        listed = ",".join(f"{k}={_short(v)}" for k, v in value.items()) if isinstance(value, Mapping) else value
         words.append(f"--{'lock' if name == 'locked' else name} {shlex.quote(listed)}")
     python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
     return f"{reader}(path, {python}), or {' '.join(words)}."
+
+
+def _short(value: float) -> str:
+    """A number that reads back exactly, as 0 for 0.0."""
+    return f"{value:g}" if float(f"{value:g}") == value else repr(value)
