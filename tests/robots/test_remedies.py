@@ -44,7 +44,7 @@ def test_all_problems_are_in_one_report_with_one_remedy():
 
 
 def test_the_remedy_keeps_what_was_given():
-    with pytest.raises(RobotModelError, match="--lock joint_FR_foot=0.123456789,slip=0") as caught:
+    with pytest.raises(RobotModelError, match=r"--lock joint_FR_foot=0\.123456789,slip=0") as caught:
         Robot.from_urdf_text(MANY, locked={"joint_FR_foot": 0.123456789}, inertias="nearest")
     assert caught.value.remedy == {
         "locked": {"joint_FR_foot": 0.123456789, "slip": 0.0},
