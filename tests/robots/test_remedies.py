@@ -159,6 +159,13 @@ def test_the_only_joint_is_not_offered_to_be_locked():
     with pytest.raises(MissingInertia) as caught:
         Robot.from_urdf_text(f'<robot name="r"><link name="a"/>{link}</robot>')
     assert caught.value.remedy == {}
+    with pytest.raises(NonPhysicalInertia, match="has no rotational inertia about some axis") as caught:
+        Robot.from_urdf_text(
+            '<robot name="r"><link name="ball"><inertial><mass value="1"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" '
+            'iyz="0" izz="0"/></inertial></link></robot>',
+            base="floating",
+        )
+    assert caught.value.remedy == {}  # bolted, nothing would move
 
 
 NOT_XML = {

@@ -127,7 +127,7 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
         return Text.assemble((name, "bold" if mass else ""), f" {mass:.4g} kg" if mass else "", (moved, "dim"))
 
     root = next(iter(robot.layout.links))
-    tree = Tree(line(root, "" if robot.base == "fixed" else f"  ({robot.base})"))
+    tree = Tree(line(root, f"  ({robot.base})" if root in robot.layout.moving else ""))
     branches = {root: tree}
     for joint in robot.all_joints:
         mimic = content["mimics"].get(joint.name)
