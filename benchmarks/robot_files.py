@@ -192,6 +192,7 @@ def _mujoco_numbers(model: Any, robot: Robot) -> Numbers:
     model.body_gravcomp[:], model.tendon_armature[:] = 0.0, 0.0
     for joint in np.flatnonzero(model.jnt_type == 0):
         model.dof_armature[model.jnt_dofadr[joint] : model.jnt_dofadr[joint] + 6] = 0.0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     names = [joint.name for joint in robot.all_joints if joint.type != "fixed"]  # some have no name in the file
     followed = _couplings(model, names)
     x, v, tau = _state(robot)
