@@ -7,7 +7,7 @@ from tests.models.arm import URDF
 
 from forcegp import Robot
 from forcegp.errors import InvalidInput
-from forcegp.report import shapes
+from forcegp.report import robot_figure, shapes, still_scene
 
 VISUAL = '<visual><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{geometry}</geometry></visual>'
 
@@ -93,3 +93,13 @@ def test_a_file_that_is_no_urdf_is_refused(tmp_path):
     path.write_text("hello")
     with pytest.raises(InvalidInput, match="is not a URDF"):
         shapes.link_shapes(Robot.from_urdf_text(URDF), path)
+
+
+def test_a_picture_takes_a_box_without_size_and_names_single_joints_alone(tmp_path):
+    path = tmp_path / "arm.urdf"
+    nothing = '<visual><geometry><box size="0 0 0"/></geometry></visual>'
+    trunk = URDF[URDF.index("<inertial>") : URDF.index("</inertial>")]
+    path.write_text(URDF.replace('<link name="base"/>', f'<link name="base">{nothing}{trunk}</inertial></link>'))
+    robot = Robot.from_urdf(path, base="floating")
+    axes = robot_figure(still_scene(robot, path)).axes[0]
+    assert [text.get_text() for text in axes.texts] == ["pan", "lift", "bend"]

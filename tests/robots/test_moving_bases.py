@@ -1,5 +1,6 @@
 """Floating, planar and spherical joints against Pinocchio, and the manifold of their positions."""
 
+from contextlib import nullcontext
 from xml.etree import ElementTree
 
 import numpy as np
@@ -7,7 +8,7 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, RobotFileWarning
 from forcegp.robots import Robot
 
 LIMBS = """<robot name="crab">
@@ -268,3 +269,26 @@ def test_a_joint_of_several_degrees_on_a_post_is_stored_as_it_is(kind):
     again = Robot.from_stored(robot.to_stored())
     assert (again.nv, again.joint_names) == (robot.nv, robot.joint_names)
     assert robot.joint_names[0].startswith("mount.")
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "1 0 0", "0.6 0 -0.8", None])
+def test_a_planar_joint_of_a_file_moves_in_the_plane_across_its_axis(axis):
+    element = "" if axis is None else f'<axis xyz="{axis}"/>'
+    text = LIMBS.replace(
+        "</robot>",
+        f'<link name="ground"/><joint name="glide" type="planar"><parent link="ground"/><child link="trunk"/>{element}'
+        "</joint></robot>",
+    )
+    with nullcontext() if axis else pytest.warns(RobotFileWarning, match="moves along x and y"):
+        robot = Robot.from_urdf_text(text)
+    normal = np.array([float(x) for x in (axis or "0 0 1").split()])
+    jacobian = robot.frame_jacobian(robot.neutral(), "trunk")[:, :3]
+    close(jacobian[:3, :2] @ jacobian[:3, :2].mT, np.eye(3) - np.outer(normal, normal))
+    close(jacobian[3:, 2], normal)
+    if axis in (None, "0 0 1"):  # Pinocchio takes no other axis
+        model = pin.buildModelFromXML(text)
+        x, q = robot.neutral(), pin.neutral(model)
+        x[:4] = torch.tensor([0.3, -0.2, 0.6, 0.8])
+        q[:4] = x[:4].numpy()
+        M = pin.crba(model, model.createData(), q)
+        close(robot.mass_matrix(x)[:3, :3], np.triu(M[:3, :3]) + np.triu(M[:3, :3], 1).T)

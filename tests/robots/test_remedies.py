@@ -1,11 +1,21 @@
 """One report names all problems of a file, and its remedy takes the file."""
 
+import re
+
+import pinocchio as pin
 import pytest
 import torch
 from tests.robots.test_base import LOOSE
 from tests.robots.test_urdf_errors import SMALL, changed
 
-from forcegp.errors import InvalidNumber, NonPhysicalInertia, RobotFileWarning, RobotModelError
+from forcegp.errors import (
+    InvalidNumber,
+    MissingInertia,
+    NonPhysicalInertia,
+    RobotFileWarning,
+    RobotModelError,
+    UnexpandedXacro,
+)
 from forcegp.robots import Robot
 from forcegp.robots.problems import LISTED, Problems
 
@@ -34,10 +44,10 @@ def test_all_problems_are_in_one_report_with_one_remedy():
 
 
 def test_the_remedy_keeps_what_was_given():
-    with pytest.raises(RobotModelError) as caught:
-        Robot.from_urdf_text(MANY, locked={"joint_FR_foot": 0.5}, inertias="nearest")
+    with pytest.raises(RobotModelError, match=r"--lock joint_FR_foot=0\.123456789,slip=0") as caught:
+        Robot.from_urdf_text(MANY, locked={"joint_FR_foot": 0.123456789}, inertias="nearest")
     assert caught.value.remedy == {
-        "locked": {"joint_FR_foot": 0.5, "slip": 0.0},
+        "locked": {"joint_FR_foot": 0.123456789, "slip": 0.0},
         "base": "floating",
         "inertias": "nearest",
     }
@@ -69,6 +79,11 @@ IGNORED = {
     "a negative <limit> effort is taken as no limit": changed('effort="5"', 'effort="-5"'),
     "a lower limit above the upper one is taken as no limit": changed('upper="1"', 'upper="-2"'),
     "the first of several <axis> counts": changed("<limit", '<axis xyz="1 0 0"/><limit'),
+    "the first of several <inertial> counts": changed("</link>\n</robot>", "<inertial/></link></robot>"),
+    "the first of several <limit> counts": changed("</joint>", '<limit lower="-9" effort="9"/></joint>'),
+    "a negative <dynamics> damping is taken as none": changed("<axis", '<dynamics damping="-0.1"/><axis'),
+    "a product of inertia that is not given is 0": changed(' ixy="0"', ""),
+    "an <inertial> without mass is left out": changed('<link name="base"/>', '<link name="base"><inertial/></link>'),
     "a <robot> without a name is called 'robot'": changed(' name="small"', ""),
 }
 
@@ -80,7 +95,7 @@ def test_what_can_be_ignored_is_a_warning_or_with_strict_an_error(what):
     q = torch.ones(1).double()
     assert torch.equal(robot.mass_matrix(q), Robot.from_urdf_text(SMALL).mass_matrix(q))
     joint = robot.joint("hinge")
-    assert (joint.velocity_limit, joint.effort_limit, joint.lower).count(float("inf")) == ("negative" in what)
+    assert (joint.velocity_limit, joint.effort_limit, joint.lower).count(float("inf")) == ("negative <limit>" in what)
     assert joint.lower == (-float("inf") if "lower" in what else -1.0)
     robot.with_armature([0.1])  # nothing is said twice
     with pytest.raises(InvalidNumber, match="leave strict out"):
@@ -118,3 +133,67 @@ def test_a_misspelt_parent_is_no_root():
     with pytest.raises(RobotModelError, match="did you mean 'base'") as caught:
         Robot.from_urdf_text(changed('parent link="base"', 'parent link="bsae"'))
     assert caught.value.remedy == {}
+
+
+def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
+    text = re.sub("<inertia .*/>", "", SMALL)
+    with pytest.raises(NonPhysicalInertia, match="add it, or take the mass as a point") as caught:
+        Robot.from_urdf_text(text)
+    with pytest.warns(RobotFileWarning, match=r"taken as a point \(link 'arm'\)"):
+        robot = Robot.from_urdf_text(text, **caught.value.remedy)
+    assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(2 * 0.1**2, rel=1e-12)
+    assert robot.tree.equals(Robot.from_urdf_text(robot.to_urdf()).tree)
+
+
+def test_definitions_that_xacro_left_do_not_matter():
+    left = '<xacro:arg name="a" default="b"/><xacro:property name="m" value="${1 + 1}"/>'
+    xmlns = ' name="small" xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    robot = Robot.from_urdf_text(SMALL.replace("</robot>", f"{left}</robot>").replace(' name="small"', xmlns))
+    assert robot.joint_names == ("hinge",)
+    with pytest.raises(UnexpandedXacro):
+        Robot.from_urdf_text(f'<robot name="r">{left}</robot>')
+
+
+def test_the_only_joint_is_not_offered_to_be_locked():
+    link = '<link name="b"/><joint name="free" type="floating"><parent link="a"/><child link="b"/></joint>'
+    with pytest.raises(MissingInertia) as caught:
+        Robot.from_urdf_text(f'<robot name="r"><link name="a"/>{link}</robot>')
+    assert caught.value.remedy == {}
+    with pytest.raises(NonPhysicalInertia, match="has no rotational inertia about some axis") as caught:
+        Robot.from_urdf_text(
+            '<robot name="r"><link name="ball"><inertial><mass value="1"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" '
+            'iyz="0" izz="0"/></inertial></link></robot>',
+            base="floating",
+        )
+    assert caught.value.remedy == {}  # bolted, nothing would move
+
+
+NOT_XML = {
+    "dashes in a comment": changed("<link", "<!-- a -- b ---><link"),
+    "no space": changed('"hinge" type', '"hinge"type'),
+}
+
+
+@pytest.mark.parametrize("what", NOT_XML)
+def test_what_other_readers_take_though_it_is_no_xml(what):
+    text = NOT_XML[what].replace('izz="0.1"', 'izz="0.9"')
+    with pytest.raises(NonPhysicalInertia) as caught:
+        Robot.from_urdf_text(text)
+    robot = Robot.from_urdf_text(text, **caught.value.remedy, strict=None)
+    assert robot.joint_names == ("hinge",)
+    assert Robot.from_urdf_text(robot.to_urdf()).tree.equals(robot.tree)
+    assert pin.buildModelFromXML(text).nv == 1
+
+
+def test_comments_need_not_have_the_encoding_of_the_file(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_bytes(changed("<link", "<!-- \N{DEGREE SIGN} --><link").encode("latin-1"))
+    assert Robot.from_urdf(path).joint_names == ("hinge",)
+
+
+def test_a_joint_without_direction_is_offered_to_be_locked():
+    text = MANY.replace('<child link="FL_foot"/>', '<child link="FL_foot"/><axis xyz="0 0 0"/>')
+    with pytest.raises(RobotModelError, match=r"'joint_FL_foot': <axis> .* has no direction") as caught:
+        Robot.from_urdf_text(text)
+    robot = Robot.from_urdf_text(text, **caught.value.remedy, strict=None)
+    assert robot.joint_names[6:] == ("joint_FR_foot",)

@@ -112,6 +112,11 @@ def _content(robot: forcegp.Robot) -> dict[str, Any]:
     }
 
 
+def _followed(joint: str, multiplier: float, offset: float) -> str:
+    times = {1.0: "", -1.0: "-"}.get(multiplier, f"{multiplier:g} ")
+    return f" = {times}{joint}" + (f" {offset:+g}" if offset else "")
+
+
 def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     """The tree and the table of joints."""
     from rich.text import Text
@@ -122,12 +127,12 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
         return Text.assemble((name, "bold" if mass else ""), f" {mass:.4g} kg" if mass else "", (moved, "dim"))
 
     root = next(iter(robot.layout.links))
-    tree = Tree(line(root, "" if robot.base == "fixed" else f"  ({robot.base})"))
+    tree = Tree(line(root, f"  ({robot.base})" if root in robot.layout.moving else ""))
     branches = {root: tree}
     for joint in robot.all_joints:
         mimic = content["mimics"].get(joint.name)
         how = "locked" if joint.name in robot.locked else joint.type
-        how += "" if mimic is None else " = {multiplier:g} {joint} {offset:+g}".format(**mimic)
+        how += "" if mimic is None else _followed(**mimic)
         branches[joint.child] = branches[joint.parent].add(line(joint.child, f"  {joint.name} ({how})"))
     header = {"lower": "lower", "upper": "upper", "velocity": "velocity_limit", "effort": "effort_limit"}
     header |= {name: name for name in ("damping", "friction", "armature")}

@@ -36,10 +36,13 @@ def robot_figure(scene: RecordedScene) -> Figure:
     ends = [np.zeros((1, 3))]
     for shape, pose in zip(scene.shapes, scene.poses[0], strict=True):
         vertices = shape.vertices @ pose[:3, :3].T + pose[:3, 3]
-        axes.add_collection3d(Poly3DCollection(vertices[shape.faces], facecolors=LINK, shade=True, alpha=0.7))
+        faces = vertices[shape.faces]
+        faces = faces[np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]).any(1)]  # others have no normal
+        if len(faces):
+            axes.add_collection3d(Poly3DCollection(faces, facecolors=LINK, shade=True, alpha=0.7))
         ends.append(vertices)
     state = scene.robot.kinematics(torch.from_numpy(scene.q[0]))
-    for joint in scene.robot.joints:
+    for joint in map(scene.robot.joint, scene.robot.single_joint_names):
         pose = state.frame_pose(joint.child).numpy()
         line = pose[:3, 3] + np.outer((0.0, AXIS * scene.size), pose[:3, :3] @ joint.axis)
         axes.plot(*line.T, color=style.PREDICTION, linewidth=1.5)

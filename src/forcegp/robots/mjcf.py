@@ -23,7 +23,7 @@ from forcegp.robots.inertia import physical_objection
 from forcegp.robots.mjcf_model import WORLD, CompiledModel, Translation
 from forcegp.robots.problems import Problems
 from forcegp.robots.urdf_file import IN_THE_FILE, nearest_inertia, read_text
-from forcegp.robots.xml_text import MOST_TAGS, parse_xml
+from forcegp.robots.xml_text import MOST_TAGS, parse_xml, well_formed
 
 DEEPEST = 300
 """Levels of elements: MuJoCo's reader calls itself for each."""
@@ -79,7 +79,7 @@ def translate(text: str, path: Path | None, nearest: bool, for_system: bool, pro
 
 def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:
     """Refuse files that exhaust memory or stack of MuJoCo's reader; ``included`` receives the files that they name."""
-    root = parse_xml(text, source)
+    root = parse_xml(well_formed(text), source)
     count, deepest = 0.0, 0
     stack = [(root, 1, 1.0)]
     while stack:

@@ -12,7 +12,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from forcegp.errors import RobotModelError
-from forcegp.robots.inertia import inverse, rotation_about, transform
+from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.layout import BASE, OUTSIDE
 from forcegp.robots.manifold import MOTIONS
 from forcegp.robots.mimic import followed
@@ -160,9 +160,8 @@ class MjcfWriter:
         """A joint as MuJoCo's; a planar one is two slides and a hinge."""
         if joint.type == "planar":
             parts = (("x", "slide", (1.0, 0.0, 0.0)), ("y", "slide", (0.0, 1.0, 0.0)), ("rz", "hinge", (0.0, 0.0, 1.0)))
-            return [
-                _Axis(self._attributes(joint, f"{joint.name}.{x}", kind), np.eye(4), axis) for x, kind, axis in parts
-            ]
+            pose = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
+            return [_Axis(self._attributes(joint, f"{joint.name}.{x}", kind), pose, axis) for x, kind, axis in parts]
         kind = KINDS[joint.type]
         name = joint.name
         first = f"{name}.{MOTIONS[joint.type].velocities[-1]}" if joint.type in MOTIONS else name

@@ -55,12 +55,15 @@ class Problems:
         """Note what was ignored or repaired, and of which element."""
         self.notes.setdefault(what, []).append(where)
 
-    def offer_no_lock_of(self, joints: Collection[str]) -> None:
-        """Take locks out of the remedies where they would hold all of these joints."""
-        held = {name for error in self.errors for name in error.remedy.get("locked", ())}
-        if held.issuperset(joints):
-            for error in self.errors:
-                error.remedy.pop("locked", None)
+    def offer_no_standstill(self, joints: Collection[str]) -> None:
+        """Take locks, and a fixed base, out of the remedies where they would hold all of these joints."""
+        remedies = [error.remedy for error in self.errors]
+        bolted = {"base" for remedy in remedies if remedy.get("base") == "fixed"}
+        if bolted.union(*(remedy.get("locked", ()) for remedy in remedies)).issuperset(joints):
+            for remedy in remedies:
+                remedy.pop("locked", None)
+                if bolted:
+                    remedy.pop("base", None)
 
     def warn(self, stacklevel: int) -> None:
         """One RobotFileWarning about all that was noted."""
@@ -108,7 +111,12 @@ def remedy_text(remedy: Mapping[str, Any], reader: str) -> str:
     """The arguments in Python, and the options of the command line that they are."""
     words = []
     for name, value in remedy.items():
-        listed = ",".join(f"{k}={v:g}" for k, v in value.items()) if isinstance(value, Mapping) else value
+        listed = ",".join(f"{k}={_short(v)}" for k, v in value.items()) if isinstance(value, Mapping) else value
         words.append(f"--{'lock' if name == 'locked' else name} {shlex.quote(listed)}")
     python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
     return f"{reader}(path, {python}), or {' '.join(words)}."
+
+
+def _short(value: float) -> str:
+    """A number that reads back exactly, as 0 for 0.0."""
+    return f"{value:g}" if float(f"{value:g}") == value else repr(value)

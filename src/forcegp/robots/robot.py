@@ -44,6 +44,7 @@ from forcegp.robots.urdf_file import (
     with_root,
     write_text,
 )
+from forcegp.robots.xml_text import well_formed
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -125,7 +126,8 @@ class Robot(RobotStructure):
 
         ``strict`` of None warns of nothing: for text that was warned of before.
         """
-        text = text.lstrip() if root is None else with_root(text.lstrip(), root)
+        text = well_formed(text.lstrip())
+        text = text if root is None else with_root(text, root)
         given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
         return cls._made(text, Problems(source, given, strict=bool(strict)), gravity, armature, quiet=strict is None)
 
@@ -248,7 +250,7 @@ class Robot(RobotStructure):
             without = bodies_without_inertia(description, layout, tree, problems.broken)
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
-            problems.offer_no_lock_of(names)
+            problems.offer_no_standstill([*robot.single_joint_names, *(group.name for group in layout.groups)])
             check_base(description, layout.standing, problems)
             return robot
         return None
@@ -270,7 +272,8 @@ class Robot(RobotStructure):
         """Coordinates that nothing resists at a position without symmetry."""
         step = torch.linspace(0.3, 1.1, self.nv, dtype=torch.float64).sin()
         M = self.mass_matrix(self.space.integrate(self.space.neutral(), step))
-        scale = M.diagonal().clamp(min=1e-300).rsqrt()
+        own = M.diagonal()
+        scale = own.rsqrt().where(own > SINGULAR * own.max(), 0.0)  # less is rounding
         values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 

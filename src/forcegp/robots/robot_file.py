@@ -36,7 +36,8 @@ def read_robot_file(path: str | Path) -> str:
         return document.toxml()
     except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
         raise MalformedUrdf(
-            f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it."
+            f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it, or "
+            "expand it where its packages are: xacro robot.xacro > robot.urdf."
         ) from None
 
 

@@ -34,7 +34,10 @@ ENDS = ("parent", "child")
 
 @dataclass(frozen=True)
 class InertialDescription:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), both in the axes of the link frame."""
+    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), both in the axes of the link frame.
+
+    An inertia that the file does not give is NaN.
+    """
 
     mass: float
     center_of_mass: np.ndarray
@@ -177,8 +180,8 @@ def _child(element: Element, tag: str, place: _Place) -> Element:
 
 def _optional_child(element: Element, tag: str, place: _Place) -> Element | None:
     children = element.findall(tag)
-    if len(children) > 1:
-        raise DuplicateName(f"{place}: <{element.tag}> has {len(children)} <{tag}> elements; keep one.")
+    if len(children) > 1:  # as in other readers
+        place.problems.ignore(f"the first of several <{tag}> counts", place.owner, f"{len(children)} <{tag}>")
     return children[0] if children else None
 
 
@@ -204,21 +207,23 @@ def _scalar(element: Element | None, attribute: str, default: float, place: _Pla
 
 def _limit(element: Element | None, attribute: str, place: _Place) -> float:
     """A limit >= 0 that may be absent; a negative one is none."""
-    value = _scalar(element, attribute, math.inf, place)
-    if value < 0.0:
-        what = f"a negative <limit> {attribute} is taken as no limit"
-        place.problems.ignore(what, place.owner, f"<limit> {attribute}={value:g}")
-        return math.inf
+    return _non_negative(element, attribute, math.inf, place, "no limit")
+
+
+def _loss(element: Element | None, attribute: str, place: _Place) -> float:
+    """Damping or dry friction: a finite number >= 0 that may be absent; a negative one is none."""
+    value = _non_negative(element, attribute, 0.0, place, "none")
+    if math.isinf(value):
+        raise InvalidNumber(f"{place}: <dynamics> {attribute} is inf; give a finite number >= 0, or leave it out.")
     return value
 
 
-def _non_negative(element: Element | None, attribute: str, default: float, place: _Place) -> float:
-    """A finite number >= 0 that may be absent."""
+def _non_negative(element: Element | None, attribute: str, default: float, place: _Place, none: str) -> float:
     value = _scalar(element, attribute, default, place)
-    if element is not None and not 0.0 <= value < math.inf:
-        raise InvalidNumber(
-            f"{place}: <{element.tag}> {attribute} is {value:g}", "; give a finite number >= 0, or leave it out."
-        )
+    if element is not None and value < 0.0:
+        what = f"a negative <{element.tag}> {attribute} is taken as {none}"
+        place.problems.ignore(what, place.owner, f"<{element.tag}> {attribute}={value:g}")
+        return default
     return value
 
 
@@ -246,12 +251,23 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     element = _optional_child(link, "inertial", place)
     if element is None:
         return None
-    mass = _number(_attribute(_child(element, "mass", place), "value", place), "<mass> value", place)
+    mass_element = _optional_child(element, "mass", place)
+    if mass_element is None or "value" not in mass_element.attrib:  # as in other readers
+        place.problems.ignore("an <inertial> without mass is left out", place.owner, "no <mass value=...>")
+        return None
+    mass = _number(mass_element.attrib["value"], "<mass> value", place)
     if 0.0 < mass < LIGHTEST:
         raise InvalidNumber(f"{place}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
-    entries = _child(element, "inertia", place)
+    entries = _optional_child(element, "inertia", place)
+    products = [] if entries is None else [key for key in ("ixy", "ixz", "iyz") if key not in entries.attrib]
+    if products:
+        place.problems.ignore("a product of inertia that is not given is 0", place.owner, f"no {', '.join(products)}")
     ixx, ixy, ixz, iyy, iyz, izz = (
-        _number(_attribute(entries, key, place), f"<inertia> {key}", place)
+        np.nan
+        if entries is None
+        else 0.0
+        if key in products
+        else _number(_attribute(entries, key, place), f"<inertia> {key}", place)
         for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     origin = _origin(_optional_child(element, "origin", place), place)
@@ -281,14 +297,19 @@ def _joint(
                 f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
     origin = _origin(_optional_child(element, "origin", place), place)
-    axes = element.findall("axis")
-    if len(axes) > 1:
-        place.problems.ignore("the first of several <axis> counts", place.owner, f"{len(axes)} <axis>")
-    axis = _vector(axes[0] if axes else None, "xyz", (1.0, 0.0, 0.0), place)
-    length = float(np.linalg.norm(axis))
-    if kind in MOVABLE and not (math.isfinite(length) and length > 0.0):
-        raise InvalidNumber(f"{place}: <axis> {axis.tolist()} has no direction; give a non-zero, finite vector.")
-    unit = tuple((axis / length).tolist()) if kind in MOVABLE else (1.0, 0.0, 0.0)
+    axis_element = _optional_child(element, "axis", place)
+    if kind == "planar" and axis_element is None:  # x by the format, which nobody means
+        place.problems.ignore("a planar joint without <axis> moves along x and y", place.owner, "no <axis>")
+    axis = _vector(axis_element, "xyz", (0.0, 0.0, 1.0) if kind == "planar" else (1.0, 0.0, 0.0), place)
+    length, directed = float(np.linalg.norm(axis)), kind in (*MOVABLE, "planar")
+    if directed and not (math.isfinite(length) and length > 0.0):
+        held = (place.problems.given.get("locked") or {}).get(name)
+        if held != 0.0:
+            seen = f"{place}: <axis> {axis.tolist()} has no direction"
+            advice = "; give a non-zero, finite vector, or lock the joint."
+            place.problems.errors.append(InvalidNumber(seen, advice, {"locked": {name: 0.0}}))
+        directed = False
+    unit = tuple((axis / length).tolist()) if directed else (1.0, 0.0, 0.0)
     limit = _optional_child(element, "limit", place)
     lower, upper = -math.inf, math.inf
     if limit is not None and kind in ("revolute", "prismatic") and ("lower" in limit.attrib or "upper" in limit.attrib):
@@ -313,8 +334,8 @@ def _joint(
         upper=upper,
         velocity_limit=_limit(limit, "velocity", place),
         effort_limit=_limit(limit, "effort", place),
-        damping=_non_negative(dynamics, "damping", 0.0, place),
-        friction=_non_negative(dynamics, "friction", 0.0, place),
+        damping=_loss(dynamics, "damping", place),
+        friction=_loss(dynamics, "friction", place),
         mimics=None if mimic is None or kind == "fixed" else _mimic(mimic, place),
     )
 

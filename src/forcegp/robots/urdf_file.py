@@ -7,6 +7,7 @@ axes and ``|dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2`` for changes s of the eigenva
 three variables.
 """
 
+import contextlib
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -55,6 +56,8 @@ def read_text(path: str | Path) -> str:
     try:
         return data.decode(encoding)
     except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
+        with contextlib.suppress(ValueError, LookupError):  # comments are written in any language
+            return re.sub(rb"<!--.*?-->", b"", data, flags=re.DOTALL).decode(encoding)
         raise UnreadableRobotFile(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'
@@ -228,27 +231,34 @@ def with_chosen_inertias(
     changed = False
     for name in layout.moving:
         inertial = links[name]
-        objection = inertial and physical_objection(inertial.mass, inertial.center_of_mass, inertial.inertia)
-        if inertial is None or objection is None or name in problems.broken:
+        if inertial is None or name in problems.broken:
             continue
+        bare, center = bool(np.isnan(inertial.inertia).all()), inertial.center_of_mass
+        given = np.zeros((3, 3)) if bare else inertial.inertia
+        objection = physical_objection(inertial.mass, center, given)
         seen = f"{source}: no physical body has the inertia of link {name!r}: {objection}"
-        mendable = inertial.mass >= 0.0 and np.isfinite([inertial.inertia, inertial.center_of_mass * np.eye(3)]).all()
-        if not mendable:
+        if objection is None and bare:
+            seen = f"{source}: link {name!r} has a mass and its <inertial> no <inertia>"
+        elif objection is None:
+            continue
+        if not (inertial.mass >= 0.0 and np.isfinite([given, center * np.eye(3)]).all()):
             problems.broken.add(name)
             problems.errors.append(NonPhysicalInertia(seen, f"{IN_THE_FILE}."))
             continue
-        nearest = nearest_inertia(inertial.inertia) if inertial.mass > 0.0 else np.zeros((3, 3))
+        nearest = nearest_inertia(given) if inertial.mass > 0.0 else np.zeros((3, 3))
         links[name] = replace(inertial, inertia=nearest)
         if choice == "strict":
-            problems.errors.append(
-                NonPhysicalInertia(
-                    seen, f"{IN_THE_FILE}, or take the nearest inertia that a body has.", {"inertias": "nearest"}
-                )
-            )
+            advice = f"{IN_THE_FILE}, or take the nearest inertia that a body has."
+            if objection is None:
+                advice = "; add it, or take the mass as a point at its centre."
+            problems.errors.append(NonPhysicalInertia(seen, advice, {"inertias": "nearest"}))
             continue
         changed = True
-        relative = 100.0 * np.linalg.norm(nearest - inertial.inertia) / np.linalg.norm(inertial.inertia)
-        text = replace_inertial(text, name, inertial.mass, inertial.center_of_mass, nearest, source=source)
+        text = replace_inertial(text, name, inertial.mass, center, nearest, source=source)
+        if objection is None:
+            problems.note("a mass without <inertia> is taken as a point", f"link {name!r}")
+            continue
+        relative = 100.0 * np.linalg.norm(nearest - given) / np.linalg.norm(given)
         problems.note(
             "an inertia that no body has is replaced by the nearest one that a body has",
             f"link {name!r}: {objection}; changed by {relative:.2g} %",

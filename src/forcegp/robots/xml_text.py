@@ -12,6 +12,27 @@ MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
+TAG = re.compile(r"""<[A-Za-z_](?:[^<>"']|"[^"<]*"|'[^'<]*')*>""")
+VALUE = re.compile(r"""("[^"]*"|'[^']*')""")
+DEFINITIONS = ("}arg", "}property", "}macro")
+"""Elements of xacro that add nothing by themselves."""
+
+
+def well_formed(text: str) -> str:
+    """The text, or where it is no XML, what other readers of robot files make of it.
+
+    Comments may hold anything, and attributes need no space between them.
+    """
+    if text.count("<") > MOST_TAGS:
+        return text  # refused where it is read
+    try:
+        SafeElementTree.fromstring(_with_prefixes(text.lstrip()))
+    except (ParseError, UnicodeError):
+        text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+        return TAG.sub(lambda tag: VALUE.sub(r"\1 ", tag[0]), text)
+    except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
+        pass  # refused where it is read
+    return text
 
 
 def parse_xml(text: str, source: str) -> Element:
@@ -40,10 +61,19 @@ def _with_prefixes(text: str) -> str:
 
 
 def refuse_xacro(root: Element, source: str) -> None:
-    """Macros, and expressions in what is read; those inside of <gazebo>, <sensor> or <visual> change no dynamics."""
+    """Macros, and expressions in what is read; those inside of <gazebo>, <sensor> or <visual> change no dynamics.
+
+    Nor do definitions that an expanded file still holds.
+    """
     owners = [owner for owner in root if owner.tag in ("link", "joint")]
     read = [*owners, *(inner for owner in owners for part in owner if part.tag in MECHANICS for inner in part.iter())]
-    macros = [element for owner in (root, *owners) for element in owner if "xacro}" in element.tag]
+    left = DEFINITIONS if root.find("link") is not None else ()
+    macros = [
+        element
+        for owner in (root, *owners)
+        for element in owner
+        if "xacro}" in element.tag and not element.tag.endswith(left)
+    ]
     for element in (*macros, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
         raise UnexpandedXacro(
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
