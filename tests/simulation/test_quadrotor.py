@@ -14,7 +14,7 @@ from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.predicted_rows import predict_rows
 from forcegp.mechanics import Actuation, RigidBodyBias
-from forcegp.models import load_posterior, observing, save_posterior
+from forcegp.models import export_c, load_posterior, observing, save_posterior
 from forcegp.report.motion import recorded_scene
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -176,6 +176,17 @@ def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
     for q, v, u in zip(rows.q, rows.v, rows.u, strict=True):
         expected = posterior.predict(q, v, u, covariance=False).mean
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
+    """Wind and wrench as inputs, at the rate of a controller; the program of it in C as well."""
+    seeing, seen = observing(posterior, acting(test))
+    predictor = seeing.predictor()
+    for k in (0, 500):
+        q, v, u = seen.q[k], seen.v[k], seen.u[k]
+        expected = seeing.predict(q, v, u, covariance=False).mean
+        np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
+    assert export_c(seeing, tmp_path / "c").differences
 
 
 def test_intervals_of_motions_need_a_fixed_base(posterior, train):

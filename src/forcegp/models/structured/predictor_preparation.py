@@ -15,7 +15,7 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress, kernel_groups
-from forcegp.mechanics import Actuation, ConstrainedDynamics, MechanicalSystem, RigidBodyBias
+from forcegp.mechanics import Actuation, ConstrainedDynamics, MechanicalSystem, ObservedWrench, RigidBodyBias
 from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
@@ -158,17 +158,20 @@ def prepared_predictor(
 def rows_for(training: TrainingData, trained: MechanicalSystem, system: MechanicalSystem) -> TrainingData:
     """The training rows with the inputs of another system, such as one without the switches of contacts.
 
-    Raises InvalidInput for inputs that they lack.
+    A wrench that an observer reports was 0 where nothing observed it. Raises InvalidInput for other inputs that they
+    lack.
     """
     had = trained.inputs
-    if len(system.inputs) == len(had):
+    if system.inputs == had:
         return training
-    new = [name for name in system.inputs if name not in had]
+    reported = [name for force in system.known_forces if isinstance(force, ObservedWrench) for name in force.names]
+    new = [name for name in system.inputs if name not in (*had, *reported)]
     if new:
         raise InvalidInput(
             f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
         )
-    return replace(training, u=training.u[..., [had.index(name) for name in system.inputs]])
+    with_zero = torch.nn.functional.pad(training.u, (0, 1))
+    return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in system.inputs]])
 
 
 def _numbers(latent: LatentPosterior, training: TrainingData, physics: PredictorPhysics) -> list[Tensor]:
