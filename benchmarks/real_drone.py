@@ -1,0 +1,114 @@
+"""A real drone in wind: force priors, a parametric model and an independent GP, each flight predicted from others.
+
+Files are logs of Neural-Fly (O'Connell et al., "Neural-Fly enables rapid learning for agile flight in strong winds",
+Science Robotics 2022; github.com/aerorobotics/neural-fly, data/experiment), which are not part of this project:
+position and velocity, quaternion x, y, z, w, rates in the axes of the world, normalised thrust and its value at hover,
+at 50 Hz. Torques are not logged, so only forces are compared: nRMSE of the linear accelerations in body axes, and the position
+after .5 s, in m. Accelerations are differences behind a zero-phase filter, which sees .1 s ahead: that flatters every
+observer alike. Models have the observers of `benchmarks.quadrotor`.
+
+    python -m benchmarks.real_drone FLIGHT.csv FLIGHT.csv [FLIGHT.csv ...] [--rows 200] [--mass 2.6]
+"""
+
+import argparse
+import csv
+import json
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.quadrotor import TIMES, training_error
+from forcegp import AerodynamicForce, Dataset, MechanicalSystem, Preparation, Robot, StructuredGP
+from forcegp.data import differentiate
+from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters
+from forcegp.models import IndependentGP, Posterior, observing
+
+GRAVITY, HORIZON, STRIDE, BEGUN = 9.81, 25, 5, 10  # m/s^2, rows: of .5 s, between starts, of the observer's begin
+
+
+def system_of(mass: float) -> MechanicalSystem:
+    inertia = f'ixx="{0.012 * mass}" iyy="{0.012 * mass}" izz="{0.02 * mass}" ixy="0" ixz="0" iyz="0"'
+    body = f'<inertial><mass value="{mass}"/><inertia {inertia}/></inertial>'
+    robot = Robot.from_urdf_text(f'<robot name="drone"><link name="body">{body}</link></robot>', base="floating")
+    push = Thrusters("body", [(0.0, 0.0, 0.0)], mass * GRAVITY)  # u is thrust over that at hover
+    return MechanicalSystem(robot, (), (Actuation(), push, RigidBodyBias()))
+
+
+def flight(path: Path, system: MechanicalSystem, cutoff: float) -> Dataset:
+    with path.open() as file:
+        lines = list(csv.DictReader(file))
+
+    def column(name: str) -> np.ndarray:
+        return np.array([json.loads(line[name]) for line in lines], dtype=float).reshape(len(lines), -1)
+
+    time, turn = column("t")[:, 0], Rotation.from_quat(column("q"))
+    v = np.hstack([turn.inv().apply(column("v")), turn.inv().apply(column("w"))])
+    log = Dataset(
+        q=np.hstack([column("p"), turn.as_quat()]),
+        v=v,
+        u=column("T_sp") / column("hover_throttle"),
+        a=differentiate(v, time),
+        time=time,
+        system=system,
+    )
+    return Preparation(cutoff=cutoff, trim=0.1).apply(log).dataset
+
+
+def joined(flights: list[Dataset]) -> Dataset:
+    columns = {name: np.concatenate([getattr(each, name) for each in flights]) for name in ("q", "v", "u", "a", "time")}
+    return replace(flights[0], **columns, episode=np.repeat(range(len(flights)), [len(each) for each in flights]))
+
+
+def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
+    rows = np.arange(BEGUN, len(dataset))
+    error = posterior.predict(dataset.q, dataset.v, dataset.u, covariance=False).mean.numpy() - dataset.a
+    starts = np.arange(BEGUN, len(dataset) - HORIZON, STRIDE)
+    u = np.stack([dataset.u[k : k + HORIZON] for k in starts])
+    moved = posterior.rollout(dataset.q[starts], dataset.v[starts], u, 0.02)
+    away = moved.q[:, -1, :3].numpy() - dataset.q[starts + moved.q.shape[-2] - 1][:, :3]
+    share = np.sqrt(np.square(error[rows, :3]).mean(0)) / dataset.a[rows, :3].std(0)
+    return float(share.mean()), float(np.sqrt(np.square(away).sum(1).mean()))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("flights", type=Path, nargs="+")
+    parser.add_argument("--rows", type=int, default=200, help="points of force prior and independent GP")
+    parser.add_argument("--mass", type=float, default=2.6, help="of the drone in kg; forces scale with it")
+    parser.add_argument("--cutoff", type=float, default=6.0, help="of the filter in Hz")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    system = system_of(options.mass)
+    flights = [flight(path, system, options.cutoff) for path in options.flights]
+    results = []
+    for k, test in enumerate(flights):
+        train = joined([each for other, each in enumerate(flights) if other != k])
+        points = min(options.rows, len(train))
+        linear = StructuredGP(system, AerodynamicForce(kernel="linear", observe=0.0))
+        usual = replace(linear, prior=AerodynamicForce(kernel="linear"))
+        parametric = linear.fit(train, points=min(1000, len(train)), restarts=1)
+        seconds = min(TIMES, key=lambda each: training_error(parametric, train, each))
+        made: dict[str, Callable[[], Posterior]] = {
+            "force prior": lambda: StructuredGP(system, AerodynamicForce()).fit(train, points=points, restarts=1),  # noqa: B023
+            "parametric with our observers": lambda: usual.fit(train, points=min(1000, len(train)), restarts=1),  # noqa: B023
+        }
+        found = {name: scores(*observing(make(), test)) for name, make in made.items()}
+        found["parametric"] = scores(*observing(parametric, test, seconds=seconds))
+        found["independent GP"] = scores(IndependentGP(system).fit(train, points=points, restarts=1), test)
+        results.append(found)
+        for name, (share, away) in found.items():
+            print(f"{options.flights[k].stem:32} {name:30} {share:.3f} {away:.3f} m", flush=True)
+    for name in results[0]:
+        squares = [
+            np.square([r[name] for r in results]).mean(0),
+            np.square([r["force prior"] for r in results]).mean(0),
+        ]
+        print(f"force prior over {name}: accelerations, position: {np.sqrt(squares[1] / squares[0]).round(3)}")
+
+
+if __name__ == "__main__":
+    main()
