@@ -110,6 +110,12 @@ class AnalyticalIdentification(Summary):
         return dict(zip(self.names, np.linalg.norm(self._spread, axis=1).tolist(), strict=True))
 
     @cached_property
+    def total_mass(self) -> tuple[float, float]:
+        """Of all bodies, and its standard error, in kg: a base that moves shows it better than the mass of any body."""
+        masses = slice(0, self.parameters.size, len(UNITS))
+        return float(self.parameters[:, 0].sum()), float(np.linalg.norm(self._spread[masses].sum(0)))
+
+    @cached_property
     def centers_of_mass(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
         """Of the bodies in the axes of their child links, and their standard errors (delta method), in m."""
         masses, moments = self.parameters[:, :1], self.parameters[:, 1:4]
@@ -182,6 +188,7 @@ class AnalyticalIdentification(Summary):
             },
             "noise_std": (self.fit.noise if self.noise is None else self.noise.acceleration).tolist(),
             "force_noise_std": None if self.noise is None else self.noise.force.tolist(),
+            "total_mass": dict(zip(("identified", "standard_error"), self.total_mass, strict=True)),
             "rows": len(self.episode),
             "base_parameters": list(self.base.expressions),
             "condition_number": self.condition_number,
