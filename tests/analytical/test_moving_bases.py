@@ -124,7 +124,7 @@ def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknow
     rng = np.random.default_rng(0)
     rows, nv, k = 40, 4, 3
     J, noise, truth = rng.normal(size=(rows, nv, k)), np.array([0.1, 1.0, 0.3, 0.5]), np.array([1.0, -2.0, 0.5])
-    held = rng.normal(size=(rows, 2, nv)) * (rng.random((rows, 2, 1)) < 0.5)
+    held = rng.normal(size=(rows, 2, nv)) * (rng.integers(0, 3, (rows, 1)) > np.arange(2))[..., None]
     pushed = (held.swapaxes(1, 2) @ (100.0 * rng.normal(size=(rows, 2, 1))))[..., 0]
     y = J @ truth + noise * rng.normal(size=(rows, nv)) + pushed
     prior = lambda x: (1e-3 * x, 1e-3 * np.eye(k))  # noqa: E731

@@ -157,7 +157,7 @@ def weighted_least_squares(
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
     `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
-    are directions of r that unknown forces have, in every row independent ones or zeros; they are left out of the sum.
+    are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
