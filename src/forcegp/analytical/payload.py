@@ -119,7 +119,7 @@ def identify_payload(
     dataset: a log with the payload: q, v, u and a, filtered alike (`forcegp.data.Preparation`), in no contact.
     system: the robot without the payload. None takes that of the dataset.
     baseline: a log of the same robot without the payload. None trusts the inertias of the URDF.
-    link: what carries it; None is the last link of the last joint.
+    link: what carries it; None is the last link of the last joint, or a base that moves.
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
 
@@ -231,7 +231,12 @@ class _Windows:
 
 
 def _last_link(robot: Robot) -> str:
-    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file."""
+    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file.
+
+    Of a robot whose base moves, the base.
+    """
+    if robot.base != "fixed":
+        return robot.layout.moving[0]
     last = len(robot.layout.bodies) - 1
     return [name for name, place in robot.layout.links.items() if place.body == last][-1]
 
