@@ -110,7 +110,8 @@ def test_residuals_and_their_jacobians(walker, likelihood):
     dynamics = system.dynamics(*(torch.tensor(s) for s in (q, v, u)))
     if likelihood == "torque":  # H takes out the same directions, along A^T
         wrong = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K
-        np.testing.assert_allclose((dynamics.H @ wrong[..., None])[..., 0], (dynamics.H.numpy() @ residual(start)[0][..., None])[..., 0], atol=1e-8)  # fmt: skip
+        seen, ours = (dynamics.H.numpy() @ np.array(each)[..., None] for each in (wrong, residual(start)[0]))
+        np.testing.assert_allclose(seen, ours, atol=1e-8)
         assert np.abs(dynamics.A.numpy() @ residual(start)[0][..., None]).max() < 1e-9
     else:
         np.testing.assert_allclose(residual(start)[0], a - dynamics.acceleration_map().offset.numpy(), atol=1e-8)
@@ -224,6 +225,7 @@ def test_a_robot_that_cannot_move_teaches_nothing(walker):
     held += tuple(c for foot in ("a_foot", "b_foot") for point in points for c in fixed_point(foot, point))
     system = replace(walker, contacts=held)
     q, v, u = rows_of(walker, 20)
-    rows = Dataset(q=q.numpy(), v=0 * v.numpy(), u=u[:, :3].numpy(), a=0 * v.numpy(), time=np.arange(20.0), system=system)  # fmt: skip
+    still = np.zeros(v.shape)
+    rows = Dataset(q=q.numpy(), v=still, u=u[:, :3].numpy(), a=still, time=np.arange(20.0), system=system)
     with pytest.raises(InvalidInput, match="no equation is left"):
         identify_analytical(rows)

@@ -135,7 +135,7 @@ def test_a_base_that_turns_is_off_by_the_angle_whatever_the_sign_of_its_quaterni
     assert right["rms"][0] < 1e-9
     recorded = motions.motions.q.copy()
     ahead = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
-    x, y, z, w = np.moveaxis(recorded[:, 1:, 3:], -1, 0)
+    z, w = recorded[:, 1:, 5].copy(), recorded[:, 1:, 6].copy()
     recorded[:, 1:, 5], recorded[:, 1:, 6] = w * ahead[2] + z * ahead[3], w * ahead[3] - z * ahead[2]
     recorded[:, 1:, 3:] *= -1.0
     off = motion_scores(model, replace(motions, motions=replace(motions.motions, q=recorded)))

@@ -163,7 +163,8 @@ def joint_terms(
     passive ones are not driven. Inertia is at least what these forces accelerate: the rotor of a wrist has a thousand
     times that of its link.
     """
-    state = system.state(*(torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v, u)))
+    at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v, u))
+    state = system.state(at_q, at_v, at_u)
     kinematics, delivered = state.kinematics, state.delivered.cpu().numpy()
     needed = kinematics.inverse_dynamics(torch.as_tensor(np.array(a), device=system.robot.device)).cpu().numpy()
     mass = system.mass_matrix(kinematics).diagonal(dim1=-2, dim2=-1).mean(0).cpu().numpy()

@@ -6,8 +6,9 @@ The payload is one more body, fixed to a link, in the equations of `forcegp.anal
 
 with h = 1 in the rows in which the robot holds it and b the body that carries it (Atkeson, An & Hollerbach 1986).
 Equations are averaged over windows of time, which takes noise of the acceleration, under which inertias look too small,
-but leaves friction as sharp as it is; forces of feet that stand are left out before (`recorded_rows`). Without a `baseline` the links are those of the URDF. With one they are
-estimated, too, and an error that both logs share is not mistaken for the payload.
+but leaves friction as sharp as it is. Forces of feet that stand are left out before (`recorded_rows`). Without a
+`baseline` the links are those of the URDF. With one they are estimated, too, and an error that both logs share is not
+mistaken for the payload.
 """
 
 from dataclasses import dataclass

@@ -50,10 +50,10 @@ def motion_residuals(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    What A^T lambda can explain, the forces of feet that stand, of loops and of wheels, is left out of the force residual;
-    under contacts that slide it holds the contact forces as well. Under friction that grows with |u| it is what
-    the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u| shrinks
-    the residual of any model.
+    What A^T lambda can explain, the forces of feet that stand, of loops and of wheels, is left out of the force
+    residual; under contacts that slide it holds the contact forces as well. Under friction that grows with |u| it is
+    what the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u|
+    shrinks the residual of any model.
     """
     require_type("dataset", dataset, Dataset)
     q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=system.robot.device) for x in ("q", "v", "u", "a"))
@@ -95,7 +95,8 @@ class RecordedRows:
     def __init__(self, system: MechanicalSystem, terms: JointTerms, q: Rows, v: Rows, u: Rows):
         robot = system.robot
         given = kept_forces(system, terms)
-        state = system.state(*(torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u)))
+        at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
+        state = system.state(at_q, at_v, at_u)
         self.kinematics, self.terms, self.v = state.kinematics, terms, np.array(v)
         self.delivered = state.delivered.cpu().numpy()
         self.load = abs(self.delivered)
@@ -147,7 +148,7 @@ class RecordedRows:
         M, bias = (part.cpu().numpy() for part in parts)
         M = M + self.inertia + self.terms.added_inertia(x)
         torque, _ = self.terms.torque(x, self.v, np.zeros_like(self.v), self.load)
-        A, idle = self.held, ~self.held.any(-1)
+        A, idle = self.held, np.logical_not(self.held.any(axis=-1))
         try:
             H = np.linalg.inv(M)
             through = A @ H
@@ -186,8 +187,8 @@ def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce
     sliding = ", ".join(dict.fromkeys(contact.frame for contact in system.contacts if slides(contact)))
     if sliding:
         raise InvalidInput(
-            f"the robot touches something with {sliding} and slides on it, with friction that is not measured; identify it from a "
-            "motion in the air (system.with_contacts([])), or use StructuredGP.identify."
+            f"the robot touches something with {sliding} and slides on it, with friction that is not measured; "
+            "identify it from a motion in the air (system.with_contacts([])), or use StructuredGP.identify."
         )
     if not any(type(force) is RigidBodyBias for force in system.known_forces):
         raise InvalidInput("the known forces lack RigidBodyBias(); list it, since its parameters are estimated.")

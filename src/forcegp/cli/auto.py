@@ -62,7 +62,7 @@ class Auto(Resuming, Import):
     """Continue although the log contains mistakes."""
     models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=MODEL_PARTS)] = ()
     """What is compared, as for forcegp validate."""
-    link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "the last one, or a base that moves", str)] = None
     """Where a payload may be."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter. auto: the one that predicts held-out torques best."""
@@ -202,18 +202,10 @@ class Auto(Resuming, Import):
     def _timed(
         self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
     ) -> forcegp.Preparation:
-        """With what can be estimated of this robot: the delay of joint torques in the air, or the lag of thrusters."""
-        system = dataset.system
-        if self.lag == "auto" and forcegp.data.thruster_columns(system):
+        """With the delay, or the lag of thrusters, where the robot shows them."""
+        if self.lag == "auto" and forcegp.data.thruster_columns(dataset.system):
             return replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
-        known = forcegp.data.torques_of_joints(dataset) and not (system is not None and system.contacts)
-        if self.delay != "auto" or known:
-            return preparation
-        terminal.note(
-            "u is taken to be on time: delays are estimated where it holds the torques of all joints and nothing is "
-            "touched; give --delay in s where it is late"
-        )
-        return replace(preparation, delay=0.0)
+        return self.with_delay_that_shows(terminal, preparation, dataset)
 
     def _prepared_rows(
         self, raw: forcegp.Dataset, wanted: forcegp.Preparation

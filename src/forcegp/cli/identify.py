@@ -86,6 +86,8 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
     dataset = forcegp.Dataset.load(command.data)
     test = None if command.test is None else forcegp.Dataset.load(command.test)
     system = command._system(dataset)
+    if command.motions is not None:
+        system.robot.require_vectors("refinements on motions")
     with terminal.progress("identifying", may_end_early=True) as report:
         found = forcegp.identify_analytical(
             dataset,
@@ -150,6 +152,8 @@ def _report_of_regression(
     identified: forcegp.MechanicalSystem | None,
 ) -> list[Any]:
     joints = found.given.robot.joint_names
+    kinds = ("N" if joint.type == "prismatic" else "Nm" for joint in found.given.robot.joints)
+    unit = ", ".join(dict.fromkeys(kinds))
     tables: list[Any] = []
     for name in ("training", "test"):
         if name not in content:
@@ -163,7 +167,7 @@ def _report_of_regression(
             ]
             for k, joint in enumerate(joints)
         ]
-        header = ["joint", "force rms\nbefore [Nm]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
+        header = ["joint", f"force rms\nbefore [{unit}]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
         tables.append(columns(f"{command.out}: residuals of the {name} data", header, rows))
     errors, values, units = found.standard_errors, found.values, found.units
     centers, center_errors = found.centers_of_mass

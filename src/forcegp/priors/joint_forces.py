@@ -200,8 +200,8 @@ class PerJointPrior(ForcePrior):
     def check(self, system: MechanicalSystem) -> None:
         if not joint_indices(self.joints, system.robot):
             raise InvalidInput(
-                f"{type(self).__name__} acts in joints, and {system.robot.name} has none but its base; leave it out, or "
-                "use the prior base-wrench or aerodynamic."
+                f"{type(self).__name__} acts in joints, and {system.robot.name} has none but its base; leave it out, "
+                "or use the prior base-wrench or aerodynamic."
             )
 
     @override

@@ -126,7 +126,10 @@ def outside_range(train: Dataset, test: Dataset) -> Bool[np.ndarray, " rows"]:
 
 
 def _postures(dataset: Dataset) -> np.ndarray:
-    return dataset.q if dataset.system is None else dataset.system.robot.posture(torch.tensor(dataset.q)).cpu().numpy()
+    if dataset.system is None:
+        return dataset.q
+    robot = dataset.system.robot
+    return robot.posture(torch.tensor(dataset.q, device=robot.device)).cpu().numpy()
 
 
 def _apart(predicted: PredictedRows, test: Dataset, outside: Bool[np.ndarray, " rows"]) -> dict[str, Any]:
@@ -208,15 +211,18 @@ def held_out_motions(
         return HeldOutMotions(None, (), tuple(dict.fromkeys(notes)))
     joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in ("q", "v", "u")}
     rows = tuple(row for each in found for row in each.rows)
-    return HeldOutMotions(RecordedMotions(rows, found[0].dt, **joined), possible, tuple(dict.fromkeys(notes)), space_of(recording))
+    return HeldOutMotions(
+        RecordedMotions(rows, found[0].dt, **joined), possible, tuple(dict.fromkeys(notes)), space_of(recording)
+    )
 
 
 def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: str = "rk4") -> dict[str, Any] | None:
     """Errors of q at every horizon [s], as plain JSON values; None where there are no motions.
 
     `rms_per_joint` (horizons, nv) is the root mean square over the motions of |q - q_recorded|, of a base in its own
-    axes, `rms` over joints as well, in rad or m; both over the motions that had not diverged by then (None where all had), and `diverged`
-    (horizons,) counts the others. `squared` (horizons, motions) is the mean over joints of the squared error of each.
+    axes, `rms` over joints as well, in rad or m; both over the motions that had not diverged by then (None where all
+    had), and `diverged` (horizons,) counts the others. `squared` (horizons, motions) is the mean over joints of the
+    squared error of each.
     """
     motions = held_out.motions
     if motions is None:
