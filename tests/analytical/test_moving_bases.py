@@ -110,7 +110,7 @@ def test_residuals_and_their_jacobians(walker, likelihood):
     dynamics = system.dynamics(*(torch.tensor(s) for s in (q, v, u)))
     if likelihood == "torque":  # H takes out the same directions, along A^T
         wrong = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K
-        seen, ours = (dynamics.H.numpy() @ np.array(each)[..., None] for each in (wrong, residual(start)[0]))
+        seen, ours = (dynamics.H.numpy() @ each[..., None] for each in (wrong.numpy(), residual(start)[0]))
         np.testing.assert_allclose(seen, ours, atol=1e-8)
         assert np.abs(dynamics.A.numpy() @ residual(start)[0][..., None]).max() < 1e-9
     else:

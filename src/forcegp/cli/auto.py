@@ -105,7 +105,9 @@ class Auto(Resuming, Import):
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing and identifying"):
-            rows, recording, settings = self._prepared_rows(dataset, self._timed(terminal, preparation, dataset))
+            rows, recording, settings = self._prepared_rows(
+                terminal, dataset, self._timed(terminal, preparation, dataset)
+            )
             identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
             try:
                 payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
@@ -203,15 +205,21 @@ class Auto(Resuming, Import):
         self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
     ) -> forcegp.Preparation:
         """With the delay, or the lag of thrusters, where the robot shows them."""
-        if self.lag == "auto" and forcegp.data.thruster_columns(dataset.system):
-            return replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
-        return self.with_delay_that_shows(terminal, preparation, dataset)
+        if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.system):
+            return self.with_delay_that_shows(terminal, preparation, dataset)
+        return replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
 
     def _prepared_rows(
-        self, raw: forcegp.Dataset, wanted: forcegp.Preparation
+        self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
     ) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
         """Rows to learn from, the same at the full rate, and what was done."""
-        chosen = replace(wanted, every=1).apply(raw)
+        try:
+            chosen = replace(wanted, every=1).apply(raw)
+        except DatasetError as error:
+            if self.lag != "auto" or wanted.lag != "auto":
+                raise
+            terminal.note(f"rotors are taken to follow at once: {error}")
+            chosen = replace(wanted, every=1, lag=0.0).apply(raw)
         numbers = chosen.preparation
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         numbers = replace(numbers, trim=max(self.trim, period))
