@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import check, identify_analytical
+from forcegp import check, excitation
 from forcegp.checks import quick_check
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -84,6 +84,17 @@ def test_check_reports_the_base(log):
     assert [each["joint"] for each in report.to_dict()["joints"]] == list(log.joint_names)
 
 
+def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
+    names = [name for name in log.system.inputs if not name.endswith("_stands")]
+    bare = replace(log, u=log.u[:, : len(names)], system=log.system.with_contacts([]), truth={})
+    (finding,) = [each for each in check(bare).findings if each.severity == "wrong"]
+    assert finding.subject == "base force"
+    assert finding.numbers["force"] == pytest.approx(19.2 * 9.81, rel=0.1)  # the robot with its load
+    q, v, u = (torch.tensor(x) for x in (bare.q, bare.v, bare.u))
+    falls = bare.system.dynamics(q, v, 0.0 * u).acceleration_map().offset.numpy()
+    assert not [each for each in check(replace(bare, a=falls)).findings if each.subject == "base force"]
+
+
 def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
-        identify_analytical(log)
+        excitation(log.system)

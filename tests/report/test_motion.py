@@ -4,7 +4,6 @@ import numpy as np
 import pinocchio
 import pytest
 import torch
-
 from tests.analytical.test_moving_bases import FEET, recorded
 from tests.robots.test_moving_bases import LIMBS
 
