@@ -77,10 +77,10 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
         if size > CARRIED * weight:
             yield wrong(
                 subject="base force",
-                seen=f"{group.name!r} does not fall: it moves under {size:.3g} N (the robot weighs {weight:.3g} N), and "
-                "nothing in the system acts on it, no foot that stands and no thruster.",
-                remedy="Describe them in Python, docs/how-to/moving-bases.md, write system.to_json() into a file, and "
-                "give --identified FILE in the place of --robot.",
+                seen=f"{group.name!r} does not fall: it moves under {size:.3g} N (the robot weighs {weight:.3g} N), "
+                "and nothing in the system acts on it, no foot that stands and no thruster.",
+                remedy="Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
+                "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
                 numbers={"force": size, "weight": weight},
             )
 
