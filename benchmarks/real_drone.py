@@ -3,9 +3,9 @@
 Files are logs of Neural-Fly (O'Connell et al., "Neural-Fly enables rapid learning for agile flight in strong winds",
 Science Robotics 2022; github.com/aerorobotics/neural-fly, data/experiment), which are not part of this project:
 position and velocity, quaternion x, y, z, w, rates in the axes of the world, normalised thrust and its value at hover,
-at 50 Hz. Torques are not logged, so only forces are compared: nRMSE of the linear accelerations in body axes, and the position
-after .5 s, in m. Accelerations are differences behind a zero-phase filter, which sees .1 s ahead: that flatters every
-observer alike. Models have the observers of `benchmarks.quadrotor`.
+at 50 Hz. Torques are not logged, so only forces are compared: nRMSE of the linear accelerations in body axes, and the
+position after .5 s, in m. Accelerations are differences behind a zero-phase filter, which sees .1 s ahead: that
+flatters every observer alike. Models have the observers of `benchmarks.quadrotor`.
 
     python -m benchmarks.real_drone FLIGHT.csv FLIGHT.csv [FLIGHT.csv ...] [--rows 200] [--mass 2.6]
 """
@@ -103,11 +103,8 @@ def main() -> None:
         for name, (share, away) in found.items():
             print(f"{options.flights[k].stem:32} {name:30} {share:.3f} {away:.3f} m", flush=True)
     for name in results[0]:
-        squares = [
-            np.square([r[name] for r in results]).mean(0),
-            np.square([r["force prior"] for r in results]).mean(0),
-        ]
-        print(f"force prior over {name}: accelerations, position: {np.sqrt(squares[1] / squares[0]).round(3)}")
+        ours, other = (np.square([found[each] for found in results]).mean(0) for each in ("force prior", name))
+        print(f"force prior over {name}: accelerations, position: {np.sqrt(ours / other).round(3)}")
 
 
 if __name__ == "__main__":

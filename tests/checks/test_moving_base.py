@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from forcegp import Dataset, MechanicalSystem, Robot, check, identify_analytical
+from forcegp import Dataset, MechanicalSystem, Robot, check, excitation
 from forcegp.checks import quick_check
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -78,17 +78,18 @@ def swaying(speed: float, noise: float) -> Dataset:
 def test_rates_in_the_axes_of_the_world_are_named_in_noise_as_well():
     """Where turns are slow, both readings miss by much of the speed; what they differ in decides."""
     log = swaying(0.3, noise=0.05)
-    (finding,) = quick_check(log)
+    (finding,) = [each for each in quick_check(log) if each.subject == "base"]
     assert finding.severity == "wrong"
     assert "angular velocities in the axes of the world" in finding.seen
     assert "--axes v=body,world." in finding.remedy
     stated = {"import": {"mapping": {"axes": {"v": ["world", "body"]}}}}  # linear ones were turned already
-    (finding,) = quick_check(replace(log, metadata=stated))
+    (finding,) = [each for each in quick_check(replace(log, metadata=stated)) if each.subject == "base"]
     assert "--axes v=world." in finding.remedy
 
 
 def test_noise_alone_is_not_taken_for_other_axes():
-    assert not [each for each in quick_check(swaying(0.0, noise=0.1)) if each.severity == "wrong"]
+    found = [each for each in quick_check(swaying(0.0, noise=0.1)) if each.subject == "base"]
+    assert [each.severity for each in found] == ["look"]  # no motion to compare with
 
 
 def test_an_accelerometer_is_no_acceleration(log):
@@ -119,6 +120,17 @@ def test_check_reports_the_base(log):
     assert [each["joint"] for each in report.to_dict()["joints"]] == list(log.joint_names)
 
 
+def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
+    names = [name for name in log.system.inputs if not name.endswith("_stands")]
+    bare = replace(log, u=log.u[:, : len(names)], system=log.system.with_contacts([]), truth={})
+    (finding,) = [each for each in check(bare).findings if each.severity == "wrong"]
+    assert finding.subject == "base force"
+    assert finding.numbers["force"] == pytest.approx(17.2 * 9.81, rel=0.05)  # the robot without its load
+    q, v, u = (torch.tensor(x) for x in (bare.q, bare.v, bare.u))
+    falls = bare.system.dynamics(q, v, 0.0 * u).acceleration_map().offset.numpy()
+    assert not [each for each in check(replace(bare, a=falls)).findings if each.subject == "base force"]
+
+
 def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
-        identify_analytical(log)
+        excitation(log.system)

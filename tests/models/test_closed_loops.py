@@ -98,5 +98,16 @@ def test_what_needs_a_surface_or_an_open_chain_refuses_loops(system, dataset, po
         StructuredGP(system, ContactFriction())
     with pytest.raises(InvalidInput, match="closed loop"):
         HybridForce(posterior.predictor())
-    with pytest.raises(InvalidInput, match="closed loops"):
-        identify_analytical(dataset)
+
+
+def test_regression_leaves_the_forces_inside_the_loop_out(system, dataset):
+    """One degree of freedom: friction of single joints is open, what it does to the motion is not."""
+    found = identify_analytical(dataset, friction=("coulomb",), rotors=None)
+    assert found.base.rank < found.parameters.size
+    a = found.accelerations(dataset.q, dataset.v, dataset.u)
+    before = (
+        system.dynamics(*(torch.tensor(getattr(dataset, name)) for name in "qvu")).acceleration_map().offset.numpy()
+    )
+    assert np.abs(a - dataset.a).mean() < 0.1 * np.abs(before - dataset.a).mean()
+    rows = system.dynamics(*(torch.tensor(getattr(dataset, name)) for name in "qvu"))
+    np.testing.assert_allclose((rows.A.numpy() @ a[..., None])[..., 0], rows.b, atol=1e-6)

@@ -4,8 +4,10 @@ import numpy as np
 import pinocchio
 import pytest
 import torch
+from tests.analytical.test_moving_bases import FEET, recorded
+from tests.robots.test_moving_bases import LIMBS
 
-from forcegp import Dataset
+from forcegp import Dataset, JointFriction, MechanicalSystem, Robot, StructuredGP
 from forcegp.errors import InvalidInput
 from forcegp.report import recorded_scene, scene_notes
 from forcegp.report.motion import LONGEST_ARROW
@@ -95,3 +97,18 @@ def test_a_dataset_without_robot_is_refused(swinging):
     )
     with pytest.raises(InvalidInput, match="holds no robot"):
         recorded_scene(bare)
+
+
+def test_a_foot_that_stands_has_one_arrow():
+    """Its three constraints are one force, that of the multipliers in world axes; a foot that swings has none."""
+    walker = MechanicalSystem(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
+    rows = recorded(walker, 40)
+    model = StructuredGP(rows.system, JointFriction(), noise=0.1).fit(rows, points=20, restarts=1)
+    scene = recorded_scene(rows, model)
+    feet = {arrows.title: arrows for arrows in scene.arrows if arrows.title.startswith("contact force")}
+    assert sorted(feet) == ["contact force at a_foot", "contact force at b_foot"]
+    chosen = [int(np.flatnonzero((rows.q == q).all(1))[0]) for q in scene.q]
+    forces = model.predict(rows.q, rows.v, rows.u).contact_force.mean.numpy().reshape(len(rows), 6, 3)[chosen]
+    for k, arrows in enumerate(feet.values()):
+        whole = forces[:, 3 * k : 3 * k + 3].sum(1)
+        np.testing.assert_allclose(arrows.mean * arrows.direction[:, 0], whole, atol=1e-8)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.checks.check_input import Finding, import_flags, look, ok, wrong
 from forcegp.checks.successive_rows import consecutive
-from forcegp.data import Dataset
+from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
@@ -26,6 +26,8 @@ SURE = 20.0
 """Standard errors of independent rows by which other axes have to fit better: successive rows are not independent."""
 TINY = 1e-24
 MOST_ROWS = 2000
+CARRIED = 0.5
+"""Of the weight: a larger force in half of the rows carries the robot."""
 IMU = {"axes": {"a": ("imu",)}}
 
 
@@ -63,6 +65,27 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
                 remedy="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
                 "an accelerometer; differentiate v, or add gravity to what an IMU measures.",
                 numbers={"error": error, "size": size},
+            )
+
+
+def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
+    """A base that floats and does not fall, although no foot, thruster or actuator of the system acts on it."""
+    robot, rows = system.robot, np.linspace(0, len(dataset) - 1, min(len(dataset), MOST_ROWS)).astype(int)
+    weight = float(torch.linalg.vector_norm(robot.gravity)) * sum(robot.link(name).mass for name in robot.layout.moving)
+    for group in robot.layout.groups[:1]:
+        if group.kind != "floating" or system.contacts or thruster_columns(system) or not weight:
+            continue
+        q, v, a = (torch.tensor(each[rows], device=robot.device) for each in (dataset.q, dataset.v, dataset.a))
+        force = robot.inverse_dynamics(q, v, a)[:, group.rows][:, :3]
+        size = float(torch.linalg.vector_norm(force, dim=-1).median())
+        if size > CARRIED * weight:
+            yield wrong(
+                subject="base force",
+                seen=f"{group.name!r} does not fall: it moves under {size:.3g} N (the robot weighs {weight:.3g} N), "
+                "and nothing in the system acts on it, no foot that stands and no thruster.",
+                remedy="Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
+                "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
+                numbers={"force": size, "weight": weight},
             )
 
 

@@ -17,7 +17,7 @@ from forcegp.checks.excitation import (
 )
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings, sampling_findings
-from forcegp.checks.moving_base import base_findings
+from forcegp.checks.moving_base import base_findings, carried_findings
 from forcegp.checks.parameters import parameter_findings
 from forcegp.checks.signals import signal_findings
 from forcegp.checks.stance import stance_findings, unmeasured_base_findings
@@ -231,7 +231,8 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
 def _of_base(dataset: Dataset, system: MechanicalSystem) -> tuple[Finding, ...]:
     """What is seen of a base that moves and of what holds it; torques and filters are not looked at."""
     unmeasured = list(unmeasured_base_findings(dataset, system))
-    return _sorted([*(unmeasured or base_findings(dataset, system)), *stance_findings(dataset, system)])
+    of_base = unmeasured or [*base_findings(dataset, system), *carried_findings(dataset, system)]
+    return _sorted([*of_base, *stance_findings(dataset, system)])
 
 
 def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:

@@ -86,6 +86,8 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
     dataset = forcegp.Dataset.load(command.data)
     test = None if command.test is None else forcegp.Dataset.load(command.test)
     system = command._system(dataset)
+    if command.motions is not None:
+        system.robot.require_vectors("refinements on motions")
     with terminal.progress("identifying", may_end_early=True) as report:
         found = forcegp.identify_analytical(
             dataset,
@@ -150,6 +152,8 @@ def _report_of_regression(
     identified: forcegp.MechanicalSystem | None,
 ) -> list[Any]:
     joints = found.given.robot.joint_names
+    kinds = ("N" if joint.type == "prismatic" else "Nm" for joint in found.given.robot.joints)
+    unit = ", ".join(dict.fromkeys(kinds))
     tables: list[Any] = []
     for name in ("training", "test"):
         if name not in content:
@@ -163,7 +167,7 @@ def _report_of_regression(
             ]
             for k, joint in enumerate(joints)
         ]
-        header = ["joint", "force rms\nbefore [Nm]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
+        header = ["joint", f"force rms\nbefore [{unit}]", "\nafter", "nRMSE of a\nbefore", "\nafter"]
         tables.append(columns(f"{command.out}: residuals of the {name} data", header, rows))
     errors, values, units = found.standard_errors, found.values, found.units
     centers, center_errors = found.centers_of_mass
@@ -184,8 +188,9 @@ def _report_of_regression(
     tables.append(columns("bodies, ± standard errors; the URDF decides what the data do not hold", header, rows))
     rows = []
     for field in dict.fromkeys(name.partition(".")[0] for name in found.terms.names):
-        rows.append([f"{field.replace('_', ' ')} [{units[f'{field}.{joints[0]}']}]"])
-        for name in (f"{field}.{joint}" for joint in joints):
+        names = [name for name in found.terms.names if name.startswith(f"{field}.")]
+        rows.append([f"{field.replace('_', ' ')} [{units[names[0]]}]"])
+        for name in names:
             rows.append([f"  {name.partition('.')[2]}", f"{values[name]:.4g}", f"{errors[name]:.2g}"])
     if rows:
         tables.append(columns("friction and rotors", ["", "identified", "std. error"], rows))
@@ -196,6 +201,8 @@ def _report_of_regression(
     )
     weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
     lines = [summary, f"Directions that the prior decides, not the data: {weak or 'none'}."]
+    if found.given.robot.base != "fixed":
+        lines.append("Mass of all bodies: {:.4g} ± {:.2g} kg, ± standard error.".format(*found.total_mass))
     if found.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(found.thickened)}.")
     if identified is not None:

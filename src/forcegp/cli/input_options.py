@@ -13,6 +13,7 @@ from typing_extensions import override
 from tyro.conf import arg
 
 import forcegp
+import forcegp.data
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import require_unchanged
@@ -272,3 +273,16 @@ class PreparationOptions(CutoffOptions):
                 given = each[0] if len(each) == 1 else each
             late[name] = given
         return replace(super()._preparation(), every=1 if self.every is None else self.every, trim=self.trim, **late)
+
+    def with_delay_that_shows(
+        self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
+    ) -> forcegp.Preparation:
+        """The same with a delay of 0 instead of "auto" where a log shows none, which is reported on stderr."""
+        contacts = dataset.system is not None and dataset.system.contacts
+        if preparation.delay != "auto" or (forcegp.data.torques_of_joints(dataset) and not contacts):
+            return preparation
+        terminal.note(
+            "u is taken to be on time: delays are estimated where it holds the torques of all joints and nothing is "
+            "touched; give --delay in s where it is late"
+        )
+        return replace(preparation, delay=0.0)

@@ -199,7 +199,7 @@ class LearningOptions(BackendOptions, RobotOptions):
             found = forcegp.checks.quick_check(
                 *((replace(dataset, system=None), None) if without else (dataset, system))
             )
-            of_accelerations = () if accelerations else ("acceleration", "base acceleration", "noise_std")
+            of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
             used = [each for each in found if each.subject not in of_accelerations]
             # check has no --contact: it would find nothing wrong with the contacts of the data
             line = findings_in_one_line(used, self.data, self.words(*ROBOT_OPTIONS), advise=bool(self.contact))

@@ -26,7 +26,8 @@ LABELS |= {f"inertia.{x}": (f"inertia {x}", "kg m²", 1.0) for x in ("xx", "yy",
 class Payload(PreparationOptions, RobotOptions):
     """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
 
-    The log is a motion without contact of 20 s or more that turns every joint in both directions. Without --baseline,
+    The log is a motion of 20 s or more that turns every joint in both directions, without contact but for feet that
+    stand. Without --baseline,
     errors of the URDF's links count as payload. With one, the links are estimated from both logs.
 
     For example:
@@ -38,7 +39,7 @@ class Payload(PreparationOptions, RobotOptions):
     """The log with the payload (a dataset, raw or prepared)."""
     baseline: Annotated[Path | None, DATASET, unless_given("DATA", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
-    link: Annotated[str | None, unless_given("LINK", "the last one", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "the last one, or a base that moves", str)] = None
     """The link that carries the payload; results are in its frame."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "stribeck", "offset")
     """Friction laws to estimate, as for forcegp identify."""
@@ -83,7 +84,8 @@ class Payload(PreparationOptions, RobotOptions):
         if forcegp.data.preparation_report(dataset.metadata):
             return system, dataset
         with terminal.progress(f"preparing {path}"):
-            prepared = self._preparation().apply(replace(dataset, system=system))
+            raw = replace(dataset, system=system)
+            prepared = self.with_delay_that_shows(terminal, self._preparation(), raw).apply(raw)
         why = prepared.report["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
         return system, prepared.dataset
@@ -100,5 +102,6 @@ def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
     joints = list(dict.fromkeys(name.partition(".")[2] for name in found.joints))
     fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
     rows = [[joint, *(f"{found.joints[f'{field}.{joint}'][0]:.3g}" for field in fields)] for joint in joints]
-    tables.append(columns("joints, in Nm, rad/s and kg m²", ["joint", *(f.replace("_", "\n") for f in fields)], rows))
+    header = ["joint", *(field.replace("_", "\n") for field in fields)]
+    tables += [columns("joints, in Nm, rad/s and kg m²", header, rows)] if rows else []
     return [*tables, f"{found.rows} rows."]

@@ -158,14 +158,16 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
     if dynamics.contacts and posterior.predicts_forces:
         known = not posterior.carries_known_forces
         map_ = dynamics.contact_force_map(known)
-        force = latents.through(map_.matrix @ B, map_.offset)
+        matrix, offset = (map_.matrix @ B).unflatten(-2, (-1, 3)), map_.offset.unflatten(-1, (-1, 3))
+        points: dict[tuple[object, ...], list[int]] = {}
         for index, contact in enumerate(dynamics.contacts):
-            if getattr(contact, "turning", False):
-                continue  # a torque
-            which = slice(3 * index, 3 * index + 3)
-            covariance = None if force.covariance is None else force.covariance[..., which, which]
+            if not getattr(contact, "turning", False):  # a torque
+                points.setdefault((contact.frame, contact.point), []).append(index)
+        for which in points.values():  # a foot that stands is three contacts, and one force
+            contact = dynamics.contacts[which[0]]
+            force = latents.through(matrix[..., which, :, :].sum(-3), offset[..., which, :].sum(-2))
             place = contact.position(dynamics.state.kinematics)
-            groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean[..., which], covariance))
+            groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean, force.covariance))
     return groups
 
 

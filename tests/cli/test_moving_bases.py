@@ -1,0 +1,107 @@
+"""Regression, payload and `forcegp auto` of robots whose base moves, from end to end."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.analytical.test_moving_bases import FEET, recorded
+from tests.robots.test_moving_bases import LIMBS
+
+from forcegp import Dataset, Robot, load_posterior
+from forcegp.analytical.bodies import with_bodies
+from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.mechanics import CoulombJointFriction, MechanicalSystem
+from forcegp.simulation.quadrotor import simulate_quadrotor
+from forcegp.simulation.scenarios import QuadrotorConfig
+
+COLUMNS = ("--time", "t", "--q", "x,y,z,qx,qy,qz,qw", "--v", "v{1..6}", "--u", "rotor_{1..4}")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Rows of a walker that carries 1.6 times its trunk, and the log of a drone in calm air with its system."""
+    place = tmp_path_factory.mktemp("moving")
+    walker = MechanicalSystem(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
+    heavier = body_pseudo_inertias(walker.robot).numpy() * np.array([1.6, 1.0, 1.0, 1.0])[:, None, None]
+    known = (*walker.known_forces, CoulombJointFriction(0.5, 0.2))
+    truth = replace(walker, robot=with_bodies(walker.robot, heavier), known_forces=known)
+    replace(recorded(truth, 300, noise=1e-3), system=walker).save(place / "walk.h5")
+    flight = simulate_quadrotor(QuadrotorConfig(seconds=6.0, seed=1, wind=0.0, noise=0.0))
+    names = ["t", *["x", "y", "z", "qx", "qy", "qz", "qw"], *(f"v{k}" for k in range(1, 7)), *flight.system.inputs]
+    table = np.column_stack([flight.time, flight.q, flight.v, flight.u])
+    np.savetxt(place / "flight.csv", table, "%.9g", ",", header=",".join(names), comments="")
+    (place / "drone.json").write_text(flight.system.to_json())
+    return place
+
+
+def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
+    words = ("identify", "walk.h5", "--model", "consistent", "--out", "found")
+    done = forcegp(*words, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    bodies = body_pseudo_inertias(Robot.from_urdf_text(LIMBS, base="floating")).numpy()[:, 3, 3]
+    assert content["total_mass"]["identified"] == pytest.approx(bodies.sum() + 0.6 * bodies[0], rel=0.01)
+    assert content["parameters"]["coulomb.a_hip"]["identified"] == pytest.approx(0.5, abs=0.02)
+    assert max(content["training"]["after"]["acceleration_rms"]) < max(
+        content["training"]["before"]["acceleration_rms"]
+    )
+    again = forcegp(
+        "identify", "walk.h5", "--model", "least-squares", "--friction", "none", "--out", "any", folder=folder
+    )
+    assert again.returncode == 0, again.stderr
+    assert "Mass of all bodies: " in again.stdout
+    assert "before [N, Nm]" in again.stdout
+    fitted = forcegp("fit", "walk.h5", "--identified", "found", "--prior", "joint-friction", "--points", 30,
+                     "--restarts", 1, "--noise", 0.01, "--out", "run", folder=folder)  # fmt: skip
+    assert fitted.returncode == 0, fitted.stderr
+
+
+def test_a_load_on_the_trunk(folder, forcegp):
+    done = forcegp("payload", "walk.h5", "--cutoff", "none", "--friction", "coulomb", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    trunk = Robot.from_urdf_text(LIMBS, base="floating").link("trunk")
+    content = json.loads(done.stdout)
+    assert content["link"] == "trunk"
+    assert content["payload"]["mass"]["value"] == pytest.approx(0.6 * trunk.mass, rel=0.05)
+
+
+def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
+    models = ("--models", "analytical,identified-torque-all", "--cutoff", "none")
+    done = forcegp("auto", "flight.csv", *COLUMNS, "--identified", "drone.json", *models, "--out", "answer", "--json",
+                   folder=folder)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    answer = "\n".join(content["answer"])
+    assert "a base that moves and 0 joints" in answer
+    assert "rotors follow within" in answer
+    assert "dry friction" not in answer
+    assert "forcegp excite" not in answer
+    assert content["identified"]["total_mass"]["identified"] == pytest.approx(1.2 * 1.02 / 1.1, rel=0.05)  # by thrust
+    assert content["models"]["analytical"]["motions"]["rms"][-1]["median"] > 0.0
+    page = (folder / "answer" / "report.html").read_text()
+    assert "whole mass" in page
+    flight = Dataset.load(folder / "answer" / "prepared.h5")
+    a = load_posterior(folder / "answer" / "model").predict(flight.q, flight.v, flight.u).mean.numpy()
+    assert np.abs(a - flight.a)[:, 2].mean() < np.abs(flight.a)[:, 2].std()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("identify walk.h5 --model consistent --motions 1 --out x", "refinements on motions need a base that is fixed"),
+        (
+            "validate walk.h5 --models joint-friction/motions --points 30 --out x",
+            "refinements on motions need a base that is fixed",
+        ),
+        ("auto flight.csv --out x", "give --robot ARM.urdf, or --identified"),
+        ("compare walk.h5", "give two or more, as in a,b"),
+        ("fit walk.h5 --motions 1 --prior joint-friction --out x", "refinements on motions need a base that is fixed"),
+    ],
+)
+def test_what_cannot_be_is_one_line_before_the_work(folder, forcegp, words, message):
+    refused = forcegp(*words.split(), folder=folder)
+    assert refused.returncode == 2
+    assert message in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1
+    assert not (folder / "x").exists()
