@@ -11,8 +11,9 @@ from forcegp import AerodynamicForce, StructuredGP
 from forcegp.cli.fit import fit_summary
 from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
-from forcegp.errors import InvalidInput
+from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evaluation.predicted_rows import predict_rows
+from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Actuation, RigidBodyBias
 from forcegp.models import export_c, load_posterior, observing, save_posterior
 from forcegp.report.motion import recorded_scene
@@ -176,6 +177,18 @@ def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
     for q, v, u in zip(rows.q, rows.v, rows.u, strict=True):
         expected = posterior.predict(q, v, u, covariance=False).mean
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_mass_beside_unknown_thrust_is_warned_of(train):
+    rows, body = acting(train).rows(np.arange(0, 4000, 100)), train.system.robot.link("body").inertial("mass")
+    quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
+    with pytest.warns(DataWarning, match="a heavier robot with as much more thrust moves the same"):
+        StructuredGP(train.system, AerodynamicForce()).identify(rows, body, **quick)
+    known = AerodynamicForce(inputs=("velocity", "drag", "angular-velocity", "attitude"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        StructuredGP(train.system, known).identify(rows, body, **quick)
+    assert not [each for each in caught if "heavier" in str(each.message)]
 
 
 def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):

@@ -9,9 +9,12 @@ from torch import Tensor
 from forcegp.data import Dataset, contact_doubts
 from forcegp.errors import ContactError, ContactWarning, DataWarning, InvalidInput
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models.identification.physical_parameters import Learned
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, checked_values
 from forcegp.models.training_data import CONSTANT, TrainingData
+from forcegp.priors import BaseWrench, ForcePrior
+from forcegp.robots.structure import LinkInertia
 
 INVISIBLE = 1e-9
 """|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
@@ -197,3 +200,19 @@ def warn_of_contacts(system: MechanicalSystem, dataset: Dataset) -> None:
         if doubt.numbers.get("distance", 0.0) > FAR_FROM_SURFACE:
             continue  # check_distance refuses the rows or warns
         warnings.warn(str(doubt), ContactWarning, stacklevel=4)
+
+
+def warn_of_thrust(prior: ForcePrior, learned: Learned | Sequence[Learned]) -> None:
+    """Warn where a mass is learned beside an unknown share of the thrust: c times both accelerate the same."""
+    each = learned if isinstance(learned, Sequence) else (learned,)
+    masses = [one.link for one in each if isinstance(one, LinkInertia) and "mass" in one.parts]
+    for term in prior.summands():
+        free = {"thrust", "actuation"} & set(term.inputs if isinstance(term, BaseWrench) else ())
+        if masses and free:
+            warnings.warn(
+                f"the mass of {', '.join(masses)} is learned beside {type(term).__name__}, which depends on "
+                f"{' and '.join(sorted(free))}: a heavier robot with as much more thrust moves the same, so no motion "
+                "shows the mass. Where the thrust is known, leave that input out (inputs=...); else keep the mass.",
+                DataWarning,
+                stacklevel=5,
+            )
