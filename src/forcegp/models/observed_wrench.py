@@ -22,7 +22,12 @@ MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past tha
 
 
 def observing(
-    posterior: AnyPosterior, dataset: Dataset, *, seconds: float | None = None, frame: str | None = None
+    posterior: AnyPosterior,
+    dataset: Dataset,
+    *,
+    seconds: float | None = None,
+    frame: str | None = None,
+    whole: bool = False,
 ) -> tuple[AnyPosterior, Dataset]:
     """The posterior and the recording with an `ObservedWrench` on link `frame`, in six more columns of u.
 
@@ -32,9 +37,9 @@ def observing(
     Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
-    what follows, and rows with a past shorter than that time are left out. By default the prior's `AerodynamicForce`
-    gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s which missed least in
-    the second before. Without such a prior, or where its time is 0, both come back as they are.
+    what follows, and rows with a past shorter than that time are left out unless `whole`. By default the prior's
+    `AerodynamicForce` gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s
+    which missed least in the second before. Without such a prior, or where its time is 0, both come back as they are.
 
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording that is too short or whose rows are not in order of time.
@@ -56,7 +61,7 @@ def observing(
     system = _with_wrench(posterior.system, frame)
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
-    return posterior.with_system(system), seen.rows(_with_past(dataset, seconds))
+    return posterior.with_system(system), seen if whole else seen.rows(_with_past(dataset, seconds))
 
 
 def in_air(

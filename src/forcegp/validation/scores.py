@@ -1,7 +1,7 @@
 """Scores of one model on held-out rows, and of the motions that it predicts from held-out states."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models import Posterior
+from forcegp.models import Posterior, observing
 from forcegp.robots.manifold import ConfigurationSpace
 
 Rows = Float[np.ndarray, "rows nv"]
@@ -62,11 +62,14 @@ def acceleration_scores(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """All scores of the held-out rows, and what a reader has to know beside them (`evaluation.doubts`).
 
+    Where the model has observers (`forcegp.models.observing`), they see the held-out rows before each one.
     `mass` is the same for every model (`mass_matrices`); rows `outside` of the training range are scored apart, too.
 
     Intervals and densities are those of a measurement: with the noise of the model, or of the Dataset where that is
     larger. What is not a number (a constant target) is None.
     """
+    alone = posterior
+    posterior, test = observing(posterior, test, whole=True)
     predicted = predict_rows(posterior, test)
     a, variance = test.a, predicted.measurement_variance
     forces = force_errors(predicted.mean, a, mass)
@@ -93,7 +96,7 @@ def acceleration_scores(
         "known_physics_mae_per_joint": known,
         "coverage_95_per_joint": covered[LEVELS.index(0.95)],
     }
-    return scores, doubts(posterior, test, shared)
+    return scores, (*doubts(posterior, test, shared), *(() if posterior is alone else (OBSERVED,)))
 
 
 def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[str, list[float | None] | float]:
@@ -157,6 +160,7 @@ def over_joints(score: str, values: Sequence[float | None]) -> float | None:
 
 HORIZONS = (0.1, 0.2, 0.5, 1.0)
 STARTS = 10
+OBSERVED = "wind, and the force that stays unexplained, were observed from the held-out rows before each."
 GAP = 1.5
 """A pause of more than this many median steps is a gap, over which no motion goes."""
 
@@ -165,13 +169,24 @@ GAP = 1.5
 class HeldOutMotions:
     """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing.
 
-    `space` holds the positions, None for vectors.
+    `space` holds the positions, None for vectors; `stretches` the rows that each motion is part of, for observers.
     """
 
     motions: RecordedMotions | None
     horizons: tuple[float, ...]
     notes: tuple[str, ...] = field(default=())
     space: ConfigurationSpace | None = None
+    stretches: tuple[tuple[Dataset, tuple[int, ...]], ...] = ()
+
+    def of(self, posterior: Posterior) -> tuple[Posterior, RecordedMotions]:
+        """The posterior, and the motions with what its observers have seen before each of them."""
+        assert self.motions is not None, "there are motions"
+        pairs = [observing(posterior, rows, whole=True) for rows, _ in self.stretches]
+        if not pairs or pairs[0][0] is posterior:
+            return posterior, self.motions
+        seconds = self.horizons[-1]
+        u = [recorded_motions(seen, at, seconds).u for (_, seen), (_, at) in zip(pairs, self.stretches, strict=True)]
+        return pairs[0][0], replace(self.motions, u=np.concatenate(u))
 
 
 def held_out_motions(
@@ -199,21 +214,21 @@ def held_out_motions(
         notes.append(f"not predicted: {left_out}; held-out stretches last {longest:.3g} s at most, steps {step:.3g} s.")
     if not possible:
         return HeldOutMotions(None, (), tuple(notes))
-    found = []
+    found, parts = [], []
     for rows in stretches:
         if np.ptp(recording.time[rows]) < possible[-1] * (1.0 - EVEN_STEPS):
             continue
         try:
             found.append(recorded_motions(recording.rows(rows), starts, possible[-1]))
+            parts.append((recording.rows(rows), found[-1].rows))
         except InvalidInput as error:
             notes.append(f"motions of one stretch were left out: {error}")
     if not found:
         return HeldOutMotions(None, (), tuple(dict.fromkeys(notes)))
     joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in ("q", "v", "u")}
     rows = tuple(row for each in found for row in each.rows)
-    return HeldOutMotions(
-        RecordedMotions(rows, found[0].dt, **joined), possible, tuple(dict.fromkeys(notes)), space_of(recording)
-    )
+    motions = RecordedMotions(rows, found[0].dt, **joined)
+    return HeldOutMotions(motions, possible, tuple(dict.fromkeys(notes)), space_of(recording), tuple(parts))
 
 
 def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: str = "rk4") -> dict[str, Any] | None:
@@ -224,9 +239,9 @@ def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: st
     had), and `diverged` (horizons,) counts the others. `squared` (horizons, motions) is the mean over joints of the
     squared error of each.
     """
-    motions = held_out.motions
-    if motions is None:
+    if held_out.motions is None:
         return None
+    posterior, motions = held_out.of(posterior)
     rollout = posterior.rollout(
         motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator, baumgarte=None
     )
