@@ -53,6 +53,6 @@ def test_motions_begin_with_what_was_observed_before_them(posterior, log):
     np.testing.assert_allclose(motions.u[4:, 0], seen.u[list(motions.rows[4:])], rtol=1e-12, atol=1e-12)
     assert seeing.system.inputs == seen.system.inputs
     assert held_out.of(unobserved(posterior))[1] is held_out.motions
-    rollout = seeing.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt)
+    rollout = seeing.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator="rk4")
     away = log.system.robot.difference(torch.tensor(motions.q[:, -1]), rollout.q[:, -1]).square().mean(-1)
     np.testing.assert_allclose(motion_scores(posterior, held_out)["squared"][1], away, rtol=1e-9)
