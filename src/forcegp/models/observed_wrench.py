@@ -34,12 +34,16 @@ def observing(
     gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s which missed least in
     the second before. Without such a prior, or where its time is 0, both come back as they are.
 
+    Calibrated intervals of motions go along where neither `seconds` nor `frame` is given.
+
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording that is too short or whose rows are not in order of time.
     """
     prior: ForcePrior | None = getattr(posterior.model, "prior", None)
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
     times = TRIED if seconds is None else (seconds,)
+    # calibrated widths are of what is observed by default
+    widths = posterior.settings.get("motion_intervals") if seconds is None and frame is None else None
     if seconds is None:
         seconds = 0.0 if own is None else LEAST if own.observe is None else own.observe
         times = times if own is None or own.observe is None else (seconds,)
@@ -54,7 +58,10 @@ def observing(
     system = replace(posterior.system, known_forces=(*posterior.system.known_forces, ObservedWrench(frame, NAMES)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
-    return posterior.with_system(system), seen.rows(_with_past(dataset, seconds))
+    posterior = posterior.with_system(system)
+    if widths is not None:
+        posterior = replace(posterior, settings={**posterior.settings, "motion_intervals": widths})
+    return posterior, seen.rows(_with_past(dataset, seconds))
 
 
 def in_wind(prior: ForcePrior, system: MechanicalSystem, dataset: Dataset) -> tuple[AirLaw, ForcePrior, Dataset] | None:
@@ -99,6 +106,14 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
+    return in_observed_wind(posterior, rows)
+
+
+def in_observed_wind(posterior: Posterior, rows: Dataset) -> Dataset:
+    """Those rows of a recording that show a wind, with the wind, for a model whose fit found a law of air.
+
+    Raises InvalidInput where all have less than .1 s of their own past.
+    """
     _, seen = _in_observed_wind(posterior, rows)
     return seen.rows(_with_past(rows, LEAST))
 
