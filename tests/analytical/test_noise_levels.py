@@ -46,5 +46,5 @@ def test_no_levels_are_likelier():
 
 def test_whitened_residuals_are_white():
     residual, M = drawn(4000, ACCELERATION, FORCE)
-    white = (NoiseLevels(ACCELERATION, FORCE).whitening(M) @ residual[..., None])[..., 0]
+    white = (NoiseLevels(ACCELERATION, FORCE).whitening(np.linalg.inv(M)) @ residual[..., None])[..., 0]
     np.testing.assert_allclose(np.cov(white.T), np.eye(2), atol=0.08)

@@ -70,7 +70,7 @@ def test_what_a_system_lists_is_where_the_coordinates_start(names):
         a = dynamics.acceleration_map().offset.numpy()
     force = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K
     np.testing.assert_allclose(rows.needed_torque(parameters, x, a) - rows.force, force, atol=1e-10)
-    predicted, M = rows.acceleration(parameters, x)
+    predicted, M, _ = rows.acceleration(parameters, x)
     np.testing.assert_allclose(M, dynamics.M, atol=1e-12)
     np.testing.assert_allclose(predicted, dynamics.acceleration_map().offset, atol=1e-9)
     again = replace(system, known_forces=(*arm_system(0).known_forces, *terms.known_forces(x)))

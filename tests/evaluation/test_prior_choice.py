@@ -5,15 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.mechanics.test_thrusters import DRONE
 from tests.models.arm import arm_data, arm_system
 from tests.models.test_motion_fit import bump, recording, slide
+from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import JointFriction, MechanicalSystem, Noise, StructuredGP
+from forcegp.errors import InvalidInput
 from forcegp.evaluation import allowing_for_correlation, choose_prior, usual_prior, with_force_noise
 from forcegp.inference import Inducing
-from forcegp.mechanics import Actuation, RigidBodyBias
+from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters, fixed_point
 from forcegp.models import load_posterior, save_posterior
 from forcegp.models.training_data import ACCELERATION, TrainingData
+from forcegp.priors import named_prior
+from forcegp.robots import Robot
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +58,20 @@ def test_in_contact_it_is_the_tool_and_too_few_rows_are_no_look():
     chosen, why = choose_prior(arm_data(2, 0, system), system)
     assert chosen == "tool-friction"
     assert "could not be compared with it" in why
+
+
+def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
+    rotors = Actuation(), Thrusters("body", ((0.2, 0.0, 0.0), (-0.1, 0.2, 0.0), (-0.1, -0.2, 0.0))), RigidBodyBias()
+    robots = [Robot.from_urdf_text(DRONE, base="floating", locked=locked) for locked in ({"tilt": 0.0}, {})]
+    drones = [MechanicalSystem(robot, (), rotors) for robot in robots]
+    limbs = Robot.from_urdf_text(LIMBS, base="floating")
+    walker = MechanicalSystem(limbs, fixed_point("a_foot", switch="a_stands"))
+    found = [usual_prior(system) for system in (*drones, walker)]
+    assert found == ["aerodynamic", "joint-friction + aerodynamic", "joint-friction"]
+    for system, name in zip((*drones, walker), found, strict=True):
+        named_prior(name, system)
+    with pytest.raises(InvalidInput, match="none but its base; leave it out"):
+        named_prior("aerodynamic + joint-friction", drones[0])
 
 
 def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):

@@ -1,5 +1,7 @@
 """Errors of predicted motions against closed forms: a sledge whose mass the model has wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -114,3 +116,27 @@ def test_wrong_horizons_are_refused(horizons):
         held_out_motions(data, data.episode == 0, horizons)
     with pytest.raises(InvalidInput, match="number of starts is 0"):
         held_out_motions(data, data.episode == 0, (0.1,), starts=0)
+
+
+def test_a_base_that_turns_is_off_by_the_angle_whatever_the_sign_of_its_quaternion():
+    """A body thrown in space turns at a constant rate: a recording that began 0.2 rad ahead stays that far ahead."""
+    text = SLEDGE.split("<joint")[0].format(mass=2.0).replace('<link name="base"/>', "") + "</robot>"
+    system = MechanicalSystem(Robot.from_urdf_text(text, base="floating", gravity=(0.0, 0.0, 0.0)))
+    time = STEP * np.arange(51)
+    half = 0.5 * (3.0 * time + 0.4)
+    q = np.zeros((51, 7))
+    q[:, 0], q[:, 5], q[:, 6] = 1.0, np.sin(half), np.cos(half)
+    v = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 3.0], (51, 1))
+    data = Dataset(q=q, v=v, u=np.zeros((51, 0)), a=0.0 * v, time=time, system=system)
+    model = StructuredGP(system, NoForces(), "analytical", 1.0).fit(data, points=5)
+    motions = held_out_motions(data, np.ones(51, dtype=bool), (0.2,), starts=2)
+    right = motion_scores(model, motions)
+    assert np.array(right["rms_per_joint"]).shape == (1, 6)
+    assert right["rms"][0] < 1e-9
+    recorded = motions.motions.q.copy()
+    ahead = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
+    x, y, z, w = np.moveaxis(recorded[:, 1:, 3:], -1, 0)
+    recorded[:, 1:, 5], recorded[:, 1:, 6] = w * ahead[2] + z * ahead[3], w * ahead[3] - z * ahead[2]
+    recorded[:, 1:, 3:] *= -1.0
+    off = motion_scores(model, replace(motions, motions=replace(motions.motions, q=recorded)))
+    np.testing.assert_allclose(off["rms_per_joint"][0][5], 0.2, atol=1e-9)

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from typing_extensions import override
 
-from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
+from forcegp.analytical.identifiability import body_names, body_pseudo_inertias, carrying
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia, standard_basis
@@ -167,7 +167,8 @@ def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
     for a body without mass.
     """
     text, changed = robot.urdf_text, []
-    for body, (pseudo, joint) in enumerate(zip(body_pseudo_inertias(robot).numpy(), robot.layout.bodies, strict=True)):
+    for body, pseudo in zip(carrying(robot), body_pseudo_inertias(robot).numpy(), strict=True):
+        joint = robot.layout.bodies[body]
         mass, center = pseudo[3, 3], pseudo[:3, 3] / (pseudo[3, 3] or 1.0)
         if mass == 0.0:
             raise InvalidInput(
@@ -187,7 +188,7 @@ def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
     return (robot.with_text(text) if changed else robot), tuple(changed)
 
 
-def with_bodies(robot: Robot, wanted: Float[np.ndarray, "nv 4 4"]) -> Robot:
+def with_bodies(robot: Robot, wanted: Float[np.ndarray, "bodies 4 4"]) -> Robot:
     """A robot whose bodies have these pseudo-inertias, in the frames of their joints' child links.
 
     Raises NonPhysicalInertia, naming the bodies, where no body has them.
@@ -199,14 +200,14 @@ def with_bodies(robot: Robot, wanted: Float[np.ndarray, "nv 4 4"]) -> Robot:
             "its torques and accelerations can be predicted all the same. For a robot use inertias='consistent'."
         )
     change = upper_cholesky(wanted) @ np.linalg.inv(upper_cholesky(body_pseudo_inertias(robot).numpy()))
-    text = robot.urdf_text
+    place, text = {body: k for k, body in enumerate(carrying(robot))}, robot.urdf_text
     for name, placement in robot.layout.links.items():
         link = robot.link(name)
         if link.joint is None or link.mass == 0.0:
             continue
         body = placement.body
         offset = np.linalg.inv(robot.layout.child_frames[body]) @ placement.offset
-        there = np.linalg.inv(offset) @ change[body] @ offset
+        there = np.linalg.inv(offset) @ change[place[body]] @ offset
         # a congruence by [[A, t], [0, s]] moves the moments about the centre of mass by A alone: no cancellation
         own = pseudo_inertia(link.mass, np.zeros(3), np.array(link.inertia))[:3, :3]
         A, shift, scale = there[:3, :3], there[:3, 3], there[3, 3]
@@ -223,7 +224,10 @@ def with_joint_dynamics(robot: Robot, damping: np.ndarray | None, friction: np.n
     That of a joint that others mimic includes theirs, which become 0.
     """
     text = robot.urdf_text
-    for joint, drive in zip(robot.layout.bodies, robot.layout.drives, strict=True):
+    free = {body for group in robot.layout.groups for body in range(group.bodies.start, group.bodies.stop)}
+    for body, (joint, drive) in enumerate(zip(robot.layout.bodies, robot.layout.drives, strict=True)):
+        if body in free:
+            continue
         own = float(joint.name == robot.joint_names[drive.joint])
         values = {"damping": damping, "friction": friction}
         given = {name: own * float(value[drive.joint]) for name, value in values.items() if value is not None}

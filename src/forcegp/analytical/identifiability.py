@@ -4,7 +4,8 @@
 
 (Atkeson, An & Hollerbach, "Estimation of inertial parameters of manipulator loads and links", IJRR 1986). A *body* is
 what one joint moves as one: its child link with every link fixed to it; only their sum shows in joint forces. ``pi``
-has the `PARAMETERS` of body after body, about the origin and in the axes of the child link (Pinocchio's order).
+has the `PARAMETERS` of body after body, about the origin and in the axes of the child link (Pinocchio's order). A base
+that moves is one body, whose joint forces are the wrench that the world puts on it.
 
 The columns of the torque regressor are linearly dependent for every motion: a link's mass shows only together with
 others. QR with column pivoting takes independent columns first, ``W P = Q [R1 R2; 0 0]``; the base parameters are
@@ -35,14 +36,19 @@ UNITS = ("kg", *("kg m",) * 3, *("kg m^2",) * 6)
 
 
 def torque_regressor(
-    robot: Robot, q: Float[Tensor, "*#rows nv"], v: Float[Tensor, "*#rows nv"], a: Float[Tensor, "*#rows nv"]
+    robot: Robot, q: Float[Tensor, "*#rows nq"], v: Float[Tensor, "*#rows nv"], a: Float[Tensor, "*#rows nv"]
 ) -> Float[Tensor, "... nv columns"]:
     """Y (..., nv, 10 bodies) with ``Y @ standard_parameters(robot)`` the joint forces in Nm or N, without armature.
 
     Columns are named by `parameter_names`. Differentiable in all arguments. Raises InvalidInput for wrong shapes,
     dtypes or devices.
     """
-    return robot.kinematics(q, v).torque_regressor(a).flatten(-2)
+    return robot.kinematics(q, v).torque_regressor(a)[..., carrying(robot), :].flatten(-2)
+
+
+def carrying(robot: Robot) -> list[int]:
+    """Numbers of the bodies that carry links: of a joint of several degrees of freedom the last one."""
+    return [body for body in range(len(robot.layout.bodies)) if body not in robot.layout.empty]
 
 
 def standard_parameters(robot: Robot) -> Float[Tensor, "columns"]:
@@ -52,13 +58,14 @@ def standard_parameters(robot: Robot) -> Float[Tensor, "columns"]:
 
 def body_pseudo_inertias(robot: Robot) -> Float[Tensor, "bodies 4 4"]:
     """Pseudo-inertia of every body in the frame of its child link."""
-    inverse = torch.linalg.inv(torch.as_tensor(robot.layout.child_frames, device=robot.device))
-    return inverse @ robot.tree.inertias[..., 0] @ inverse.mT
+    own = carrying(robot)
+    inverse = torch.linalg.inv(torch.as_tensor(robot.layout.child_frames[own], device=robot.device))
+    return inverse @ robot.tree.inertias[own, ..., 0] @ inverse.mT
 
 
 def body_names(robot: Robot) -> tuple[str, ...]:
     """What the bodies are called: by the child link of their joint."""
-    return tuple(joint.child for joint in robot.layout.bodies)
+    return tuple(robot.layout.bodies[body].child for body in carrying(robot))
 
 
 def parameter_names(robot: Robot) -> tuple[str, ...]:
@@ -141,11 +148,13 @@ class BaseParameters:
 
 def base_parameters(robot: Robot) -> BaseParameters:
     """The base parameters of a robot, whatever the motion: from random states, the same ones every time."""
-    return excitation(robot, *np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv)))
+    turns, v, a = np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv))
+    q = robot.space.integrate(robot.space.neutral(), torch.tensor(turns)).numpy()
+    return excitation(robot, q, v, a)
 
 
 def excitation(
-    robot: Robot, q: Float[np.ndarray, "rows nv"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
+    robot: Robot, q: Float[np.ndarray, "rows nq"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
 ) -> BaseParameters:
     """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
     states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))

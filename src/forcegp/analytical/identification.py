@@ -45,8 +45,8 @@ def identify_analytical(
     Parameters
     ----------
     dataset: q, v, u and a, filtered alike (`forcegp.data.Preparation`); rows need not be in order of time.
-    system: start and prior: the robot, friction it lists, and forces that are given. In no contact. None takes that of
-        the dataset.
+    system: start and prior: the robot, friction it lists, and forces that are given. None takes that of the dataset.
+        Forces of feet that stand, of loops and of wheels are unknown and left out exactly; other contacts are refused.
     friction: out of "viscous", "coulomb" or "stribeck" or "load" (c + mu |u|), and "offset" and "direction"
         (viscous friction that differs by direction). Velocity scales are estimated, too.
     rotors: "armature": one inertia per joint. "rotor": those of the system's RotorInertia. None: as listed.
@@ -62,13 +62,12 @@ def identify_analytical(
     rows: use so many at most, evenly spread.
     progress: called as progress(round, rms of the residual).
 
-    Raises InvalidInput for options that make no sense and for a system in contact.
+    Raises InvalidInput for options that make no sense and for contacts that slide, whose friction is not measured.
     """
     with usable_arguments("identify_analytical"):
         given = require_type("dataset", dataset, Dataset).system if system is None else system
         system = require_type("system", given, MechanicalSystem, ", for example MechanicalSystem(robot)")
         require_rows("dataset", dataset, system.robot.joint_names, "the robot")
-        system.robot.require_vectors("regressions on torques")
         for name, given, allowed in (
             ("inertias", inertias, ("consistent", "free")),
             ("likelihood", likelihood, ("torque", "acceleration")),
@@ -97,6 +96,9 @@ def identify_analytical(
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)
     split = bodies.size
+    held = recorded.held if likelihood == "torque" and recorded.held.shape[1] else None
+    if held is not None and held.any(-1).sum(1).min() == a.shape[1]:
+        raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")
 
     def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parameters = bodies.parameters(x[:split])
@@ -124,13 +126,14 @@ def identify_analytical(
             r, jacobian = residual(x)
             return (r, jacobian) if whitening is None else ((whitening @ r[..., None])[..., 0], whitening @ jacobian)
 
-        return weighted_least_squares(white, prior, start, bounds, longest=longest, robust=robust, progress=progress)
+        options = {"longest": longest, "robust": robust, "progress": progress}
+        return weighted_least_squares(white, prior, start, bounds, held=held, **options)
 
     fit, noise = search(np.concatenate([np.zeros(split), terms.start()])), None
     for _ in range(REWEIGHTINGS if likelihood == "acceleration" else 0):
-        predicted, M = recorded.acceleration(bodies.parameters(fit.x[:split]), fit.x[split:])
-        noise = NoiseLevels.of(a - predicted, M)
-        fit = search(fit.x, noise.whitening(M))
+        predicted, M, H = recorded.acceleration(bodies.parameters(fit.x[:split]), fit.x[split:])
+        noise = NoiseLevels.of(a - predicted, M, H)
+        fit = search(fit.x, noise.whitening(H))
     return AnalyticalIdentification(
         given=system,
         bodies=bodies,
@@ -139,7 +142,7 @@ def identify_analytical(
         likelihood=likelihood,
         prior_strength=prior_strength,
         episode=dataset.episode[chosen],
-        regressor=regressor,
+        regressor=recorded.without_contacts(regressor),
         thickened=thick,
         noise=noise,
     )
@@ -160,10 +163,11 @@ def joint_terms(
     passive ones are not driven. Inertia is at least what these forces accelerate: the rotor of a wrist has a thousand
     times that of its link.
     """
-    kinematics = system.robot.kinematics(*(torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v)))
+    state = system.state(*(torch.as_tensor(np.array(x), device=system.robot.device) for x in (q, v, u)))
+    kinematics, delivered = state.kinematics, state.delivered.cpu().numpy()
     needed = kinematics.inverse_dynamics(torch.as_tensor(np.array(a), device=system.robot.device)).cpu().numpy()
     mass = system.mass_matrix(kinematics).diagonal(dim1=-2, dim2=-1).mean(0).cpu().numpy()
-    needed, measured, speed = (np.sqrt((x**2).mean(0)) for x in (needed, u, v))
+    needed, measured, speed = (np.sqrt((x**2).mean(0)) for x in (needed, delivered, v))
     torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in (np.maximum(needed, measured), speed))
     mass = np.maximum(mass, torque / np.maximum(np.sqrt((a**2).mean(0)), 1e-12)) if a.any() else mass
     return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)
@@ -187,7 +191,7 @@ def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> No
     require_type("dataset", dataset, Dataset)
     if how.get("inertias", "consistent") != "consistent":
         raise InvalidInput("held-out noise needs a mass matrix that can be inverted; use inertias='consistent'.")
-    residuals, masses = [], []
+    residuals, masses, mobilities = [], [], []
     for left_out in _stretches(dataset):
         kept = np.ones(len(dataset), dtype=bool)
         kept[left_out] = False
@@ -197,7 +201,8 @@ def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> No
         dynamics = found.dynamics(q, v, u)
         residuals.append(rows.a - dynamics.acceleration_map().offset.cpu().numpy())
         masses.append(dynamics.M.cpu().numpy())
-    return NoiseLevels.of(np.concatenate(residuals), np.concatenate(masses))
+        mobilities.append(dynamics.H.cpu().numpy())
+    return NoiseLevels.of(*map(np.concatenate, (residuals, masses, mobilities)))
 
 
 def _stretches(dataset: Dataset) -> list[np.ndarray]:

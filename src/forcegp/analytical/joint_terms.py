@@ -1,7 +1,8 @@
 """Terms of the joint torque beside the rigid bodies: friction, offset, and the inertia of rotors.
 
 A term adds ``f(parameters; v) + B(parameters) a`` to the torque that a motion needs, and becomes a known force of the
-system (which has the opposite sign). A new friction law is one entry in `LAWS`.
+system (which has the opposite sign). A new friction law is one entry in `LAWS`. Joints of several degrees of freedom,
+such as a base that moves, have no terms.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from forcegp.analytical.identifiability import carrying
 from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import (
     Armature,
@@ -139,10 +141,13 @@ class JointTerms:
             raise InvalidInput(f"friction names {' and '.join(dry)}; name one of them, each contains Coulomb friction.")
         if inertia not in (None, *INERTIAS):
             raise InvalidInput(f"rotors are {inertia!r}; give one of {', '.join(INERTIAS)}, or None.")
-        self.laws = [LAWS[name] for name in dict.fromkeys(friction)]
-        self.inertia = inertia
-        self.robot, self.joints = system.robot, system.robot.joint_names
-        self._rest = system.robot.kinematics(torch.zeros_like(system.robot.armature))
+        self.robot, self.joints = system.robot, system.robot.single_joint_names
+        self.laws = [LAWS[name] for name in dict.fromkeys(friction) if self.joints]
+        self.inertia = inertia = inertia if self.joints else None
+        self.bodies = carrying(system.robot)
+        self.rows = np.flatnonzero(np.isin(system.robot.joint_names, self.joints))
+        torque, velocity, mass = torque[self.rows], velocity[self.rows], mass[self.rows]
+        self._rest = system.robot.kinematics(system.robot.space.neutral().to(system.robot.device))
         self.kinds = tuple([law.kind for law in self.laws] + ([INERTIAS[inertia]] if inertia else []))
         listed = {kind: [force for force in system.known_forces if type(force) is kind] for kind in self.kinds}
         twice = next((kind.__name__ for kind, found in listed.items() if len(found) > 1), None)
@@ -155,7 +160,7 @@ class JointTerms:
                 "lists none; add it to known_forces, or use rotors='armature'."
             )
         self.fields = [field for law in self.laws for field in law.fields] + ([INERTIA] if inertia else [])
-        mass = mass / np.maximum((self._transmission().numpy() ** 2).sum(1), 1e-12) if inertia else mass
+        mass = mass / np.maximum((self._transmission().numpy()[self.rows] ** 2).sum(1), 1e-12) if inertia else mass
         sizes = [
             f.size[2] * torque ** f.size[0] * velocity ** f.size[1] * (mass if f is INERTIA else 1.0)
             for f in self.fields
@@ -193,7 +198,8 @@ class JointTerms:
             given = law.read(self._given[law.kind]) if law.kind in self._given else {}
             for field in law.fields:
                 size = self._sizes[len(rows)]
-                value = given.get(field.name, size if field.logarithm else unlisted * size)
+                value = size if field.logarithm else unlisted * size
+                value = given[field.name][self.rows] if field.name in given else value
                 rows.append(np.log(value / size) if field.logarithm else value / size)
         return np.clip(np.array(rows).ravel(), *self.bounds)
 
@@ -202,12 +208,12 @@ class JointTerms:
         spread = np.where(self._logarithms, 1.0, LINEAR_SPREAD) * np.ones_like(self._sizes)
         return self.start(unlisted=0.0), spread.ravel()
 
-    def values(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields nv"]:
+    def values(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields joints"]:
         """The numbers in SI units."""
         x = x.reshape(self._sizes.shape)
         return np.where(self._logarithms, np.exp(np.where(self._logarithms, x, 0.0)), x) * self._sizes
 
-    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields nv"]:
+    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields joints"]:
         """Derivative of each number in its own coordinate."""
         return np.where(self._logarithms, self.values(x), self._sizes)
 
@@ -220,16 +226,15 @@ class JointTerms:
     ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv k"]]:
         """What the terms add to the torque at v and a under actuators of torque `load` = |u|, and derivatives in x."""
         values, slopes = self.values(x), self.slopes(x)
-        total, nv = np.zeros_like(v), len(self.joints)
-        jacobian = np.zeros((*v.shape, len(self.fields), nv))
-        diagonal = np.arange(nv)
-        at_v = torch.tensor(v)
-        state = State(at_v, at_v, torch.tensor(load), self.robot, self._rest)  # laws look at v and u alone
+        total, joints = np.zeros_like(v), len(self.joints)
+        jacobian = np.zeros((*v.shape, len(self.fields), joints))
+        at_v, at_load = (torch.tensor(x[:, self.rows]) for x in (v, load))
+        state = State(at_v, at_v, at_load, self.robot, self._rest)  # laws look at v and u alone
         for law, row, named in self._by_law(values):
             added, derivatives = law.torque(named, state)
-            total = total + added
+            total[:, self.rows] += added
             for k, derivative in enumerate(derivatives, row):
-                jacobian[:, diagonal, k, diagonal] = derivative * slopes[k]
+                jacobian[:, self.rows, k, np.arange(joints)] = derivative * slopes[k]
         if self.inertia:
             moved = np.einsum("pij,nj->nip", self._inertia_basis(), a)
             total = total + moved @ values[-1]
@@ -239,12 +244,14 @@ class JointTerms:
     def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
         """What the rotors add to the mass matrix."""
         if not self.inertia:
-            return np.zeros((len(self.joints),) * 2)
+            return np.zeros((self.robot.nv,) * 2)
         return np.tensordot(self.values(x)[-1], self._inertia_basis(), 1)
 
     def known_forces(self, x: Float[np.ndarray, " k"]) -> tuple[KnownForce, ...]:
         """The terms as known forces of a system."""
-        values = torch.tensor(self.values(x))
+        values = torch.zeros(len(self.fields), self.robot.nv, dtype=torch.float64)
+        values[self._logarithms[:, 0]] = 1.0  # scales of velocity must be positive, also where nothing has friction
+        values[:, self.rows] = torch.tensor(self.values(x))
         forces = [law.force(named) for law, _, named in self._by_law(values)]
         if self.inertia == "armature":
             forces.append(Armature(values[-1]))
@@ -261,12 +268,12 @@ class JointTerms:
 
     def _transmission(self) -> torch.Tensor:
         if self.inertia == "armature":
-            return torch.eye(len(self.joints), dtype=torch.float64)
+            return torch.eye(self.robot.nv, dtype=torch.float64)
         rotors = self._given[RotorInertia]
         assert isinstance(rotors, RotorInertia), "known forces are kept by their class"
         return torch.as_tensor(rotors.transmission)
 
     def _inertia_basis(self) -> np.ndarray:
         """(rotor, nv, nv): inertia added per unit of each rotor's."""
-        T = self._transmission().numpy()
+        T = self._transmission().numpy()[self.rows]
         return T[:, :, None] * T[:, None, :]

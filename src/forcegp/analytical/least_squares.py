@@ -11,6 +11,11 @@ Residuals r_n = a_n - a^_n that have noise of both kinds are normal with covaria
 
 so joints of small inertia count less where the noise is one of forces. The two levels of every joint are those of
 largest likelihood (the model of `forcegp.models.Noise`). One level per joint would let rows of large M^-1 decide.
+Under constraints H of Gauss' principle stands in the place of M^-1.
+
+Joint forces along A^T are those of contacts and unknown. Of whitened residuals w and z = A^T / sigma they take the part
+in the span of z, and what is left, ``(1 - P) w``, has the likelihood in which they are integrated out under a flat
+prior (generalized least squares). Of joint j it has the mean square ``sum_n (1 - P_n)_jj`` where sigma is right.
 """
 
 from collections.abc import Callable
@@ -38,11 +43,20 @@ class NoiseLevels:
     force: Float[np.ndarray, " nv"]
 
     @classmethod
-    def of(cls, residual: Float[np.ndarray, "rows nv"], M: Float[np.ndarray, "rows nv nv"]) -> "NoiseLevels":
-        """Those of largest likelihood, by L-BFGS on their logarithms, each at least `LEAST` of the whole."""
+    def of(
+        cls,
+        residual: Float[np.ndarray, "rows nv"],
+        M: Float[np.ndarray, "rows nv nv"],
+        H: Float[np.ndarray, "rows nv nv"] | None = None,
+    ) -> "NoiseLevels":
+        """Those of largest likelihood, by L-BFGS on their logarithms, each at least `LEAST` of the whole.
+
+        `H` is that of Gauss' principle under constraints; None is M^-1.
+        """
         chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
-        r, inverse = (torch.as_tensor(x) for x in (residual[chosen], np.linalg.inv(M[chosen])))
-        in_force = torch.linalg.solve(inverse, r[..., None])[..., 0]
+        inverse = torch.as_tensor(np.linalg.inv(M[chosen]) if H is None else H[chosen])
+        r = torch.as_tensor(residual[chosen])
+        in_force = (torch.as_tensor(M[chosen]) @ r[..., None])[..., 0]
         whole = torch.stack([x.square().mean(0).sqrt().clamp_min(1e-12) for x in (r, in_force)])
         start = np.full(whole.numel(), np.log(0.5))
 
@@ -62,9 +76,9 @@ class NoiseLevels:
         acceleration, force = whole.numpy() * np.exp(found.x).reshape(whole.shape)
         return cls(acceleration, force)
 
-    def whitening(self, M: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
-        """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance."""
-        inverse = torch.as_tensor(np.linalg.inv(M))
+    def whitening(self, H: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
+        """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance. H as in `of`."""
+        inverse = torch.as_tensor(H)
         S = _covariance(inverse, torch.as_tensor(self.acceleration), torch.as_tensor(self.force))
         return np.linalg.inv(torch.linalg.cholesky(S).numpy())
 
@@ -79,6 +93,8 @@ MOST_EVALUATIONS = 300
 """Of the residuals in one round."""
 CONTENT = 0.01
 """Two steps in a row that lower the objective by less than so many nats end a round."""
+PASSES = 20
+"""Over the noise of residuals, in each round, where unknown forces are left out."""
 LEAST_NOISE = 1e-6
 """Noise that is this fraction of the residual at the start counts as none: the data are exact."""
 SETTLED = 1e-3
@@ -97,7 +113,8 @@ class Fit:
     """Where least squares ended.
 
     `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k) there, `noise` (nv,) in units of the residual, `weight`
-    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and the message of the search.
+    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and the message of the search. `span`
+    (rows, nv, m) are orthonormal directions of whitened residuals that unknown forces have, None for none.
     """
 
     x: Float[np.ndarray, " k"]
@@ -108,10 +125,16 @@ class Fit:
     prior_information: Float[np.ndarray, "k k"]
     evaluations: int
     settled: bool
+    span: Float[np.ndarray, "rows nv m"] | None = None
+
+    @property
+    def white(self) -> Float[np.ndarray, "rows nv"]:
+        """Residuals over their noise, without what unknown forces explain."""
+        return without(self.residual / self.noise, self.span)
 
     def weighted(self, time: Float[np.ndarray, " nv"] | float = 1.0) -> Float[np.ndarray, "n k"]:
         """The Jacobian (rows nv, k) over the noise, for residuals of which one in so many rows is independent."""
-        scaled = self.jacobian * (np.sqrt(self.weight / time) / self.noise)[..., None]
+        scaled = without(self.jacobian / self.noise[:, None], self.span) * np.sqrt(self.weight / time)[..., None]
         return scaled.reshape(-1, scaled.shape[-1])
 
     @property
@@ -129,10 +152,12 @@ def weighted_least_squares(
     longest: Float[np.ndarray, " k"] | float = np.inf,
     robust: bool = False,
     progress: Callable[[int, float], None] | None = None,
+    held: Float[np.ndarray, "rows m nv"] | None = None,
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
-    `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it.
+    `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
+    are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
@@ -144,21 +169,45 @@ def weighted_least_squares(
     low, high = bounds
     x = np.clip(start, low, high)
     r, jacobian = at(x)
-    noise, evaluations, settled, converged = _noise(r, robust), 0, False, False
-    floor = np.maximum(LEAST_NOISE * noise, np.finfo(np.float64).tiny)
+    some = slice(None) if held is None else np.unique(np.linspace(0, len(r) - 1, min(ROWS, len(r))).astype(int))
+    seen = None if held is None else held[some]
+    span = _span(held, np.ones(r.shape[1]))
+    noise, evaluations, settled, converged = _noise(r, robust, span), 0, False, False
+    floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
-        x, nfev, converged = _minimized(at, prior, x, bounds, longest, noise, robust)
+        span = _span(held, noise)
+        x, nfev, converged = _minimized(at, prior, x, bounds, longest, noise, robust, span)
         evaluations += nfev
         r, jacobian = at(x)
-        before, noise = noise, np.maximum(_noise(r, robust), floor)
+        before = noise
+        for _ in range(1 if held is None else PASSES):  # forces of contacts hide most of it at first
+            noise = np.maximum(noise * _noise(r[some] / noise, robust, _span(seen, noise)), floor)
         if progress is not None:
-            progress(round_number, float(np.sqrt((r**2).mean())))
+            progress(round_number, float(np.sqrt((without(r, _span(held, np.ones_like(noise))) ** 2).mean())))
         settled = bool((abs(noise - before) <= SETTLED * before).all())
         if settled:
             break
-    weight = _weights(r / noise, robust)
+    span = _span(held, noise)
+    weight = _weights(without(r / noise, span), robust)
     in_prior = prior(x)[1]
-    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, evaluations, settled and converged)
+    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, evaluations, settled and converged, span)
+
+
+def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:
+    """The part of every row that is orthogonal to these orthonormal columns (or zeros)."""
+    if span is None:
+        return values
+    flat = values.reshape(*values.shape[:2], -1)
+    return (flat - span @ (span.swapaxes(1, 2) @ flat)).reshape(values.shape)
+
+
+def _span(held: np.ndarray | None, noise: np.ndarray) -> np.ndarray | None:
+    """Orthonormal columns for the directions `held` of residuals over this noise."""
+    if held is None:
+        return None
+    directions = held / noise
+    columns = np.linalg.qr(directions.swapaxes(1, 2))[0]
+    return columns * (directions != 0.0).any(-1)[:, None, : columns.shape[-1]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,13 +228,14 @@ def _minimized(
     longest: np.ndarray | float,
     noise: np.ndarray,
     robust: bool,
+    span: np.ndarray | None,
 ) -> tuple[np.ndarray, int, bool]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, and whether it converged.
 
     Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
     """
     low, high = bounds
-    here, damping, idle = _point(at, prior, x, noise, robust), 1e-4, 0
+    here, damping, idle = _point(at, prior, x, noise, robust, span), 1e-4, 0
     for evaluation in range(1, MOST_EVALUATIONS + 1):
         held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
         free = ~held
@@ -199,7 +249,7 @@ def _minimized(
         expected = -float(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
         if abs(expected) <= 1e-3 * CONTENT or idle == 2:
             return here.x, evaluation, True
-        trial = _point(at, prior, there, noise, robust)
+        trial = _point(at, prior, there, noise, robust, span)
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
@@ -211,17 +261,20 @@ def _minimized(
     return here.x, MOST_EVALUATIONS, False
 
 
-def _point(at: Residual, prior: Residual, x: np.ndarray, noise: np.ndarray, robust: bool) -> _Point:
+def _point(
+    at: Residual, prior: Residual, x: np.ndarray, noise: np.ndarray, robust: bool, span: np.ndarray | None
+) -> _Point:
     bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
     with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
         try:
             (r, jacobian), (prior_r, prior_jacobian) = at(x), prior(x)
         except (np.linalg.LinAlgError, NumericalError):  # a mass matrix that rounding made singular
             return bad
-        white = r / noise
+        white = without(r / noise, span)
         weight = _weights(white, robust)
         cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
-        flat = (jacobian * (np.sqrt(weight) / noise)[..., None]).reshape(-1, len(x))
+        flat = without(jacobian / noise[:, None], span) * np.sqrt(weight)[..., None]
+        flat = flat.reshape(-1, len(x))
         gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
         curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
         cost = float(cost + 0.5 * (prior_r**2).sum())
@@ -235,9 +288,11 @@ def _weights(white: np.ndarray, robust: bool) -> np.ndarray:
     return (1.0 + (white / BEND) ** 2) ** -0.5 if robust else np.ones_like(white)
 
 
-def _noise(r: np.ndarray, robust: bool) -> np.ndarray:
+def _noise(r: np.ndarray, robust: bool, span: np.ndarray | None) -> np.ndarray:
+    left = 1.0 if span is None else np.sqrt(np.maximum(1.0 - (span**2).sum(-1).mean(0), 1e-9))
+    r = without(r, span)
     scale = MAD * np.median(abs(r), axis=0) if robust else np.sqrt((r**2).mean(axis=0))
-    return np.maximum(scale, 1e-12)  # data that the start explains exactly
+    return np.maximum(scale / left, 1e-12)  # data that the start explains exactly
 
 
 def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.ndarray, " rows"]) -> np.ndarray:

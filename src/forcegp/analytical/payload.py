@@ -6,7 +6,7 @@ The payload is one more body, fixed to a link, in the equations of `forcegp.anal
 
 with h = 1 in the rows in which the robot holds it and b the body that carries it (Atkeson, An & Hollerbach 1986).
 Equations are averaged over windows of time, which takes noise of the acceleration, under which inertias look too small,
-but leaves friction as sharp as it is. Without a `baseline` the links are those of the URDF. With one they are
+but leaves friction as sharp as it is; forces of feet that stand are left out before (`recorded_rows`). Without a `baseline` the links are those of the URDF. With one they are
 estimated, too, and an error that both logs share is not mistaken for the payload.
 """
 
@@ -119,7 +119,7 @@ def identify_payload(
     dataset: a log with the payload: q, v, u and a, filtered alike (`forcegp.data.Preparation`), in no contact.
     system: the robot without the payload. None takes that of the dataset.
     baseline: a log of the same robot without the payload. None trusts the inertias of the URDF.
-    link: what carries it; None is the last link of the last joint.
+    link: what carries it; None is the last link of the last joint, or a base that moves.
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
 
@@ -159,7 +159,7 @@ def identify_payload(
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)
-    held = regressor[:, :, [placement.body]] * holds[:, None, None, None]
+    held = regressor[:, :, [terms.bodies.index(placement.body)]] * holds[:, None, None, None]
     regressor = np.concatenate([regressor, held], axis=2)
     split, known = bodies.size, len(stated)
     windows = _Windows([log.rows(at) for log, at in zip(logs, chosen, strict=True)])
@@ -168,7 +168,8 @@ def identify_payload(
         parameters = np.concatenate([stated, bodies.parameters(x[:split])])
         r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
         in_bodies = np.einsum("nibp,bpk->nibk", in_parameters[:, :, known:], bodies.derivatives(x[:split]))
-        return windows.mean(r), windows.mean(np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1))
+        jacobian = np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1)
+        return windows.mean(recorded.without_contacts(r)), windows.mean(recorded.without_contacts(jacobian))
 
     center, spread = terms.prior()
     weights = np.concatenate([np.ones(split - 10), np.full(10, WEAK**0.5)])
@@ -196,8 +197,8 @@ def identify_payload(
     payload = there @ found[-1] @ there.T
     bare = robot if baseline is None else with_bodies(robot, found[:-1])
     values = terms.values(fit.x[split:])
-    if rotors == "armature":
-        values[-1] += robot.armature.cpu().numpy()  # which the equations hold already
+    if terms.inertia == "armature":
+        values[-1] += robot.armature.cpu().numpy()[terms.rows]  # which the equations hold already
     return PayloadEstimate(
         link=link,
         pseudo_inertia=payload,
@@ -230,7 +231,12 @@ class _Windows:
 
 
 def _last_link(robot: Robot) -> str:
-    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file."""
+    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file.
+
+    Of a robot whose base moves, the base.
+    """
+    if robot.base != "fixed":
+        return robot.layout.moving[0]
     last = len(robot.layout.bodies) - 1
     return [name for name, place in robot.layout.links.items() if place.body == last][-1]
 

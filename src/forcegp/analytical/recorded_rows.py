@@ -9,6 +9,10 @@ where M_0 is the inertia of what is listed and not estimated. Differentiating M 
 
     dr/dpi = M^-1 Y(q, v, a^),    dr/dx = M^-1 dt/dx (v, a^).
 
+Feet that stand, closed loops and wheels add A^T lambda to Q, with A a = b and unknown lambda. Accelerations are then
+those of Gauss' principle, and H stands in the place of M^-1. Of the torques only the part that is orthogonal to the
+rows of A, row by row of the recording, is an equation without lambda.
+
 Friction g(x; v) |u| under load makes u the solution of u = z + g |u|, with z all other terms:
 
     u = z / (1 - g s),    s = sign z = sign u for |g| < 1,    du/dx = (dz/dx + u s dg/dx) / (1 - g s).
@@ -24,9 +28,21 @@ import torch
 from jaxtyping import Float
 
 from forcegp.analytical.joint_terms import JointTerms
+from forcegp.analytical.least_squares import without
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError, require_type
-from forcegp.mechanics import KnownForce, LoadJointFriction, MechanicalSystem, RigidBodyBias, State
+from forcegp.mechanics import (
+    Contact,
+    Held,
+    KnownForce,
+    LoadJointFriction,
+    LoopClosure,
+    MechanicalSystem,
+    RigidBodyBias,
+    RollingContact,
+)
+from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
+from forcegp.mechanics.thrusters import OBSERVED
 
 
 def motion_residuals(
@@ -34,7 +50,8 @@ def motion_residuals(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    Under contacts the force residual holds the contact forces as well. Under friction that grows with |u| it is what
+    What A^T lambda can explain, the forces of feet that stand, of loops and of wheels, is left out of the force residual;
+    under contacts that slide it holds the contact forces as well. Under friction that grows with |u| it is what
     the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u| shrinks
     the residual of any model.
     """
@@ -44,9 +61,15 @@ def motion_residuals(
     force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]
     for friction in system.known_forces:
         if isinstance(friction, LoadJointFriction):
-            idle, loaded = (friction.force(replace(dynamics.state, u=u)) for u in (0.0 * u, torch.ones_like(u)))
-            without_load = u + (loaded - idle) * u.abs() - force  # z = u - g |u| - force
-            force = u - without_load / (1.0 + (loaded - idle) * without_load.sign())
+            ones, delivered = torch.ones_like(a), dynamics.state.delivered
+            idle, loaded = (
+                friction.force(replace(dynamics.state, u=load, delivered_by=None)) for load in (0.0 * ones, ones)
+            )
+            without_load = delivered + (loaded - idle) * delivered.abs() - force  # z = u - g |u| - force
+            force = dynamics.state.delivered - without_load / (1.0 + (loaded - idle) * without_load.sign())
+    if system.contacts and not any(slides(contact) for contact in system.contacts):
+        held, _ = independent_rows(dynamics.A.cpu().numpy(), dynamics.b.cpu().numpy())
+        return without(force.cpu().numpy(), held.swapaxes(1, 2)), (a - dynamics.acceleration_map().offset).cpu().numpy()
     return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
 
 
@@ -71,12 +94,14 @@ class RecordedRows:
 
     def __init__(self, system: MechanicalSystem, terms: JointTerms, q: Rows, v: Rows, u: Rows):
         robot = system.robot
-        at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
-        state = State.of(robot, at_q, at_v, at_u)
-        self.kinematics, self.terms, self.v = state.kinematics, terms, np.array(v)
-        self.u = np.array(u)
-        self.load = abs(self.u)
         given = kept_forces(system, terms)
+        state = system.state(*(torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u)))
+        self.kinematics, self.terms, self.v = state.kinematics, terms, np.array(v)
+        self.delivered = state.delivered.cpu().numpy()
+        self.load = abs(self.delivered)
+        A, b, _ = system.constraint(state)
+        self.held, self.right = independent_rows(A.cpu().numpy(), b.cpu().numpy())
+        """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
         self.force = np.zeros_like(self.v)
         self.inertia = np.zeros((robot.nv, robot.nv))
         for force in given:
@@ -88,7 +113,11 @@ class RecordedRows:
     def regressor(self, a: Rows) -> Float[np.ndarray, "rows nv bodies 10"]:
         """Y at these states and accelerations."""
         at = torch.as_tensor(np.array(a), device=self.kinematics.robot.device)
-        return self.kinematics.torque_regressor(at).cpu().numpy()
+        return self.kinematics.torque_regressor(at).cpu().numpy()[:, :, self.terms.bodies]
+
+    def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
+        """The part of joint forces (first axis after the rows) that no lambda can explain."""
+        return without(values, self.held.swapaxes(1, 2))
 
     def needed_torque(self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray) -> np.ndarray:
         """The force Q (rows, nv) under which the model accelerates by a."""
@@ -103,25 +132,34 @@ class RecordedRows:
         if LoadJointFriction not in self.terms.kinds:
             return rigid + torque, np.ones_like(self.v), in_x
         loaded, loaded_in_x = self.terms.torque(x, self.v, a, np.ones_like(self.load))
-        others = self.force - self.u
+        others = self.force - self.delivered
         z, g = rigid + torque - others, loaded - torque
         sign = np.sign(z)
         left = 1.0 - g * sign
         u = z / left
         return u + others, 1.0 / left, (in_x + (u * sign)[..., None] * (loaded_in_x - in_x)) / left[..., None]
 
-    def acceleration(self, parameters: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """a^ (rows, nv) and the mass matrices (rows, nv, nv). Raises NumericalError where one is singular."""
-        given = torch.as_tensor(parameters, device=self.kinematics.robot.device)
-        M, bias = (part.cpu().numpy() for part in self.kinematics.dynamics_of_bodies(given))
+    def acceleration(self, parameters: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """a^ (rows, nv), the mass matrices and H (rows, nv, nv). Raises NumericalError where a matrix is singular."""
+        given = torch.zeros(len(self.kinematics.robot.layout.bodies), 10, dtype=torch.float64)
+        given[self.terms.bodies] = torch.as_tensor(parameters)
+        parts = self.kinematics.dynamics_of_bodies(given.to(self.kinematics.robot.device))
+        M, bias = (part.cpu().numpy() for part in parts)
         M = M + self.inertia + self.terms.added_inertia(x)
         torque, _ = self.terms.torque(x, self.v, np.zeros_like(self.v), self.load)
+        A, idle = self.held, ~self.held.any(-1)
         try:
-            return np.linalg.solve(M, (self.force - bias - torque)[..., None])[..., 0], M
+            H = np.linalg.inv(M)
+            through = A @ H
+            among = through @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
+            lifted = np.linalg.solve(among, np.concatenate([through, self.right[..., None]], axis=-1))
         except np.linalg.LinAlgError:
             raise NumericalError(
                 "the mass matrix of the estimates is singular at a row; use inertias='consistent'."
             ) from None
+        acceleration = (through.swapaxes(1, 2) @ lifted[..., -1:])[..., 0]
+        H = H - through.swapaxes(1, 2) @ lifted[..., :-1]
+        return acceleration + (H @ (self.force - bias - torque)[..., None])[..., 0], M, H
 
     def in_torque(
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray, regressor: np.ndarray
@@ -134,25 +172,42 @@ class RecordedRows:
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `in_torque`, of a - a^."""
-        predicted, M = self.acceleration(parameters, x)
+        predicted, _, H = self.acceleration(parameters, x)
         Y = self.regressor(predicted)
         _, in_x = self.terms.torque(x, self.v, predicted, self.load)
-        rows, nv = predicted.shape
-        solved = np.linalg.solve(M, np.concatenate([Y.reshape(rows, nv, -1), in_x], axis=-1))
-        return a - predicted, solved[..., : 10 * nv].reshape(Y.shape), solved[..., 10 * nv :]
+        return a - predicted, (H @ Y.reshape(*predicted.shape, -1)).reshape(Y.shape), H @ in_x
 
 
 def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce, ...]:
-    """Known forces not estimated, less the bias. Raises InvalidInput for systems without it, or in contact."""
-    if system.loops:
-        raise InvalidInput("forces inside closed loops are not measured; identify the robot by StructuredGP.identify.")
-    if system.contacts:
-        frames = ", ".join(contact.frame for contact in system.contacts)
+    """Known forces not estimated, less the bias and what an observer found.
+
+    Raises InvalidInput for systems without a bias, and for contacts that slide.
+    """
+    sliding = ", ".join(dict.fromkeys(contact.frame for contact in system.contacts if slides(contact)))
+    if sliding:
         raise InvalidInput(
-            f"the robot touches something with {frames}, and contact forces are not measured; identify it from a "
+            f"the robot touches something with {sliding} and slides on it, with friction that is not measured; identify it from a "
             "motion in the air (system.with_contacts([])), or use StructuredGP.identify."
         )
     if not any(type(force) is RigidBodyBias for force in system.known_forces):
         raise InvalidInput("the known forces lack RigidBodyBias(); list it, since its parameters are estimated.")
-    skipped: Sequence[type[KnownForce]] = (RigidBodyBias, *terms.kinds)
+    skipped: Sequence[type[KnownForce]] = (RigidBodyBias, *OBSERVED, *terms.kinds)
     return tuple(force for force in system.known_forces if type(force) not in skipped)
+
+
+def slides(contact: Contact) -> bool:
+    """Whether friction can act along the contact: on a surface, other than at held points, loops and wheels."""
+    return not isinstance(contact, LoopClosure | RollingContact) and not isinstance(contact.surface, Held)
+
+
+def independent_rows(
+    A: Float[np.ndarray, "rows m nv"], b: Float[np.ndarray, "rows m"]
+) -> tuple[Float[np.ndarray, "rows r nv"], Float[np.ndarray, "rows r"]]:
+    """``A a = b`` with orthonormal rows, r of the largest rank; of smaller ranks the last ones are zero."""
+    if not A.shape[1]:
+        return A, b
+    left, sizes, right = np.linalg.svd(A, full_matrices=False)
+    counts = sizes > REDUNDANCY_TOLERANCE * np.maximum(sizes[:, :1], np.finfo(np.float64).tiny)
+    most = int(counts.sum(1).max())
+    scaled = (left.swapaxes(1, 2) @ b[..., None])[..., 0] / np.where(counts, sizes, 1.0)
+    return (right * counts[..., None])[:, :most], (scaled * counts)[:, :most]

@@ -30,7 +30,10 @@ Rows = Float[np.ndarray, "rows nv"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AnalyticalIdentification(Summary):
-    """Estimates of `identify_analytical`; `given` is the system that it started from, some bodies `thickened`."""
+    """Estimates of `identify_analytical`; `given` is the system that it started from, some bodies `thickened`.
+
+    `regressor` are equations without forces of contacts (`RecordedRows.without_contacts`).
+    """
 
     given: MechanicalSystem
     bodies: BodyCoordinates
@@ -47,7 +50,7 @@ class AnalyticalIdentification(Summary):
     def facts(self) -> dict[str, object]:
         """The robot, what was estimated and from what."""
         return {
-            "robot": f"{self.given.robot.name!r}, {self.given.robot.nv} joints",
+            "robot": f"{self.given.robot.name!r}, {self.given.robot.nv} degrees of freedom",
             "likelihood": self.likelihood,
             "inertias": self._inertias,
             "learned from": f"{len(self.episode)} rows",
@@ -55,7 +58,7 @@ class AnalyticalIdentification(Summary):
         }
 
     @property
-    def parameters(self) -> Float[np.ndarray, "nv 10"]:
+    def parameters(self) -> Float[np.ndarray, "bodies 10"]:
         """Standard parameters of the bodies, see `forcegp.analytical.identifiability`."""
         return self.bodies.parameters(self._in_bodies)
 
@@ -77,13 +80,12 @@ class AnalyticalIdentification(Summary):
     @property
     def units(self) -> dict[str, str]:
         """By name."""
-        of_bodies = dict(
-            zip(parameter_names(self.given.robot), UNITS * len(self.given.robot.layout.bodies), strict=True)
-        )
+        names = parameter_names(self.given.robot)
+        of_bodies = dict(zip(names, UNITS * (len(names) // len(UNITS)), strict=True))
         return of_bodies | {
             f"{field.name}.{joint.name}": _unit(field.unit, joint.type == "prismatic")
             for field in self.terms.fields
-            for joint in self.given.robot.joints
+            for joint in map(self.given.robot.joint, self.terms.joints)
         }
 
     @property
@@ -108,6 +110,12 @@ class AnalyticalIdentification(Summary):
         return dict(zip(self.names, np.linalg.norm(self._spread, axis=1).tolist(), strict=True))
 
     @cached_property
+    def total_mass(self) -> tuple[float, float]:
+        """Of all bodies, and its standard error, in kg: a base that moves shows it better than the mass of any body."""
+        masses = slice(0, self.parameters.size, len(UNITS))
+        return float(self.parameters[:, 0].sum()), float(np.linalg.norm(self._spread[masses].sum(0)))
+
+    @cached_property
     def centers_of_mass(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
         """Of the bodies in the axes of their child links, and their standard errors (delta method), in m."""
         masses, moments = self.parameters[:, :1], self.parameters[:, 1:4]
@@ -120,7 +128,7 @@ class AnalyticalIdentification(Summary):
     @cached_property
     def _spread(self) -> np.ndarray:
         """S with S S^T the covariance of all numbers, as if only one row in a correlation time were independent."""
-        time = correlation_time(self.fit.residual / self.fit.noise, self.episode)
+        time = correlation_time(self.fit.white, self.episode)
         # by QR, not by normal equations, whose rounding can make a variance negative
         root = np.linalg.qr(
             np.concatenate([self.fit.weighted(time), np.linalg.cholesky(self.fit.prior_information).T]), mode="r"
@@ -156,9 +164,11 @@ class AnalyticalIdentification(Summary):
         return self._recorded(q, v, u).acceleration(self.parameters, self._in_terms)[0]
 
     def torque_residual(self, dataset: Dataset) -> Rows:
-        """Measured u less the joint forces under which the model moves so (Nm or N)."""
+        """Measured joint forces less those under which the model moves so (Nm or N), without what contacts explain."""
         rows = self._recorded(dataset.q, dataset.v, dataset.u)
-        return rows.force - rows.needed_torque(self.parameters, self._in_terms, np.array(dataset.a))
+        return rows.without_contacts(
+            rows.force - rows.needed_torque(self.parameters, self._in_terms, np.array(dataset.a))
+        )
 
     def scores(self, dataset: Dataset) -> dict[str, list[float]]:
         """As `residual_scores`: rms of force and acceleration residuals of `dataset`, and nRMSE, per joint."""
@@ -178,6 +188,7 @@ class AnalyticalIdentification(Summary):
             },
             "noise_std": (self.fit.noise if self.noise is None else self.noise.acceleration).tolist(),
             "force_noise_std": None if self.noise is None else self.noise.force.tolist(),
+            "total_mass": dict(zip(("identified", "standard_error"), self.total_mass, strict=True)),
             "rows": len(self.episode),
             "base_parameters": list(self.base.expressions),
             "condition_number": self.condition_number,

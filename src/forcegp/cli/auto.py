@@ -12,17 +12,19 @@ from typing import Annotated, Any, cast
 
 from rich.table import Table
 from rich.text import Text
+from typing_extensions import override
 from tyro.conf import arg
 
 import forcegp
 import forcegp.analytical
 import forcegp.checks
+import forcegp.data
 import forcegp.evaluation
 import forcegp.recordings
 import forcegp.report
 import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
-from forcegp.cli.auto_answer import METHOD, NAMES, answer_lines, best_sentence, payload_text
+from forcegp.cli.auto_answer import METHOD, NAMES, answer_lines, best_sentence, default_models, payload_text
 from forcegp.cli.command import CONFIG, URDF, Resuming, listed, unless_given
 from forcegp.cli.fit import calibrated_with_progress
 from forcegp.cli.import_log import Import
@@ -32,12 +34,12 @@ from forcegp.cli.terminal import Terminal
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
-MODELS = "the URDF, identified, with friction learned"
+MODELS = "the URDF, identified, with friction or air forces learned"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Auto(Resuming, Import):
-    """From logs and a URDF to a validated model: import, check, prepare, identify, learn, validate, report.
+    """From logs and a robot to a validated model: import, check, prepare, identify, learn, validate, report.
 
     Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
     corrects them at once. The folder gets the model of the recommended kind, learned from all rows: model, for
@@ -47,10 +49,11 @@ class Auto(Resuming, Import):
     For example:
       forcegp auto run.csv --time t --q 'pos{1..6}' --u 'tau{1..6}' --robot arm.urdf --out answer
       forcegp auto run1.csv run2.csv --robot arm.urdf --mapping columns.yaml --correct --out answer
+      forcegp auto walk.csv --mapping columns.yaml --identified dog.json --out answer
     """
 
-    robot: Annotated[Path, URDF, arg(metavar="ARM.urdf")] = field()
-    """The robot that was recorded."""
+    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "that of --identified", Path)] = None
+    """The robot that was recorded. Feet that stand, thrusters and actuators of another kind come with --identified."""
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder of results; an unfinished one resumes."""
     correct: bool = False
@@ -64,7 +67,10 @@ class Auto(Resuming, Import):
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter. auto: the one that predicts held-out torques best."""
     delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
-    """Delay of u in the log, in s."""
+    """Delay of u in the log, in s. auto: estimated where u are the torques of all joints and nothing is touched, else
+    0."""
+    lag: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    """Time constant in s with which actuators follow u. auto: estimated for thrusters, 0 for joints."""
     every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
 
@@ -72,6 +78,8 @@ class Auto(Resuming, Import):
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
+        if self.robot is None and self.identified is None:
+            raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
         begin, preparation = time.process_time(), self._preparation()
         self._require_own_folder()
         system, mapping = self._system(), self._mapping(terminal)
@@ -97,7 +105,7 @@ class Auto(Resuming, Import):
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing and identifying"):
-            rows, recording, settings = self._prepared_rows(dataset, preparation)
+            rows, recording, settings = self._prepared_rows(dataset, self._timed(terminal, preparation, dataset))
             identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
             try:
                 payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
@@ -182,9 +190,30 @@ class Auto(Resuming, Import):
         """The same command with the columns, units and signs of the mapping."""
         stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "robot", "out"}
         others = [name for name in self.options if name not in stated]
-        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), "--robot", str(self.robot)]
+        robot = [] if self.robot is None else ["--robot", str(self.robot)]
+        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *robot]
         return shlex.join([*words, *self.words(*(name for name in others if hasattr(type(self), name))),
                            "--out", str(self.out)])  # fmt: skip
+
+    @override
+    def _preparation(self) -> forcegp.Preparation:
+        return super()._preparation() if self.lag != "auto" else replace(self, lag="0")._preparation()
+
+    def _timed(
+        self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
+    ) -> forcegp.Preparation:
+        """With what can be estimated of this robot: the delay of joint torques in the air, or the lag of thrusters."""
+        system = dataset.system
+        if self.lag == "auto" and forcegp.data.thruster_columns(system):
+            return replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
+        known = forcegp.data.torques_of_joints(dataset) and not (system is not None and system.contacts)
+        if self.delay != "auto" or known:
+            return preparation
+        terminal.note(
+            "u is taken to be on time: delays are estimated where it holds the torques of all joints and nothing is "
+            "touched; give --delay in s where it is late"
+        )
+        return replace(preparation, delay=0.0)
 
     def _prepared_rows(
         self, raw: forcegp.Dataset, wanted: forcegp.Preparation
@@ -214,7 +243,7 @@ class Auto(Resuming, Import):
             restarts=1,
             friction=laws,
         )
-        models = self.models or ("analytical", f"identified-{METHOD}", f"joint-friction@{METHOD}")
+        models = self.models or default_models(system)
         with terminal.progress("validating") as report:
             found = forcegp.validate(
                 comparison, self.out / "validation", models=models, seeds=1, overwrite=self.overwrite, progress=report
@@ -239,7 +268,9 @@ class Auto(Resuming, Import):
         answer: list[tuple[str, str]],
     ) -> None:
         """The page to send around."""
+        posterior, recording = forcegp.models.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
+        following = [forcegp.report.Finding("Record the most informative motion:", command)]
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
                 posterior,
@@ -249,7 +280,7 @@ class Auto(Resuming, Import):
                 findings=[forcegp.report.Finding(*line) for line in answer],
                 pictures=forcegp.report.validation_pictures(content),
                 tables=[forcegp.report.validation_table(content, NAMES)],
-                next_steps=[forcegp.report.Finding("Record the most informative motion:", command)],
+                next_steps=following if command.startswith("forcegp") else [],
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
                 },

@@ -8,12 +8,22 @@ from typing import Any
 import forcegp
 import forcegp.analytical
 import forcegp.checks
+import forcegp.data
 from forcegp.cli.terminal import number
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
 METHOD = "torque-all"
 NAMES = {"analytical": "the URDF", f"identified-{METHOD}": "identified", f"joint-friction@{METHOD}": "friction learned"}
+NAMES |= {"aerodynamic": "air forces learned", "joint-friction + aerodynamic": "friction and air forces learned"}
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+
+
+def default_models(system: forcegp.MechanicalSystem) -> tuple[str, ...]:
+    """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given."""
+    identified, friction = f"identified-{METHOD}", bool(system.robot.single_joint_names)
+    if forcegp.data.thruster_columns(system):
+        return "analytical", identified, "joint-friction + aerodynamic" if friction else "aerodynamic"
+    return "analytical", identified, *([f"joint-friction@{METHOD}"] if friction else [])
 
 
 def answer_lines(
@@ -29,14 +39,26 @@ def answer_lines(
     mistakes = ", ".join(_corrected(each) for each in content["mistakes"]) or "nothing"
     late = prepared["delay"][0]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
-    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else "u shows no delay"
+    on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
+    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
+    lag = max(prepared["lag"])
+    shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
 
     def each(field: str, pattern: str = "{:.3g}") -> str:
-        return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in names)
+        return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in joints)
 
-    units = [dataset.units[name] for name in ("q", "u")]
-    q, force = (unit if isinstance(unit, str) else " or ".join(dict.fromkeys(unit)) for unit in units)
+    joints, moving = identified.terms.joints, identified.given.robot.base != "fixed"
+    freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(names)} joints"
+    kinds = [identified.given.robot.joint(name).type == "prismatic" for name in joints]
+    q, force = (" or ".join(dict.fromkeys(two[kind] for kind in kinds)) for two in (("rad", "m"), ("Nm", "N")))
+    of_joints = [
+        ("dry friction", f"{each('coulomb')} {force}, near rest {each('breakaway')} more"),
+        ("viscous", f"{each('viscous')} {force} per {q}/s"),
+        ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
+    ]
+    mass, error = identified.total_mass
+    q = "rad or m" if moving else q
     models = content["models"]
     scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
     best = content["recommended"]
@@ -44,21 +66,18 @@ def answer_lines(
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
     weak = ", ".join(name for name, _ in content["weak"][:3])
     out = content["out"]
+    command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
+    command = "faster and larger motions, also of what hardly moved" if moving else command
     return [
-        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {len(names)} joints{jitter}"),
+        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
         ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
-        ("dry friction", f"{each('coulomb')} {force}, near rest {each('breakaway')} more"),
-        ("viscous", f"{each('viscous')} {force} per {q}/s"),
-        ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
+        *(of_joints if joints else []),
+        *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg")] if moving else []),
         ("payload", held),
         ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
         ("trust", f"{NAMES.get(best, best)}{intervals}"),
-        (
-            "record next",
-            f"forcegp excite {out}/model --seconds 10 --out next.csv"
-            + (f" (least is known of {weak})" if weak else ""),
-        ),
+        ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]
 

@@ -60,7 +60,7 @@ class Compare(LearningOptions):
             raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         if len(self.priors) < 2:
             given = f"only {self.priors[0]}" if self.priors else "none"
-            raise InvalidInput(f"--priors lists the candidates, and there is {given}; give two or more.")
+            raise InvalidInput(f"--priors lists the candidates, and there is {given}; give two or more, as in a,b.")
         self.require_free(self.out)
 
         dataset = forcegp.Dataset.load(self.data)

@@ -184,8 +184,9 @@ def _report_of_regression(
     tables.append(columns("bodies, ± standard errors; the URDF decides what the data do not hold", header, rows))
     rows = []
     for field in dict.fromkeys(name.partition(".")[0] for name in found.terms.names):
-        rows.append([f"{field.replace('_', ' ')} [{units[f'{field}.{joints[0]}']}]"])
-        for name in (f"{field}.{joint}" for joint in joints):
+        names = [name for name in found.terms.names if name.startswith(f"{field}.")]
+        rows.append([f"{field.replace('_', ' ')} [{units[names[0]]}]"])
+        for name in names:
             rows.append([f"  {name.partition('.')[2]}", f"{values[name]:.4g}", f"{errors[name]:.2g}"])
     if rows:
         tables.append(columns("friction and rotors", ["", "identified", "std. error"], rows))
@@ -196,6 +197,8 @@ def _report_of_regression(
     )
     weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
     lines = [summary, f"Directions that the prior decides, not the data: {weak or 'none'}."]
+    if found.given.robot.base != "fixed":
+        lines.append("Mass of all bodies: {:.4g} ± {:.2g} kg, ± standard error.".format(*found.total_mass))
     if found.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(found.thickened)}.")
     if identified is not None:

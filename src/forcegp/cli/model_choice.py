@@ -23,7 +23,7 @@ LearnFrom = Literal["accelerations", "weak-form"]
 
 POINTS, NETWORK_POINTS = 200, 10_000
 POINTS_HINT = f"{POINTS}; all for functions of one or two inputs, as friction of the joints; networks {NETWORK_POINTS}"
-PREFERRED = "joint-friction, in contact tool-friction, unless left-out rows prefer joint or a sum"
+PREFERRED = "joint-friction, in contact tool-friction, in flight aerodynamic, unless left-out rows prefer another"
 PRIORS = "NAME[:FIELD=VALUE,...],..."
 WINDOW = 0.1
 """Length of a window where none is given, in s."""

@@ -96,7 +96,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
             validation = forcegp.validate(
                 comparison,
                 self.out,
-                models=self.models or forcegp.validation.DEFAULT_MODELS,
+                models=self.models or None,
                 seeds=self.seeds,
                 backend=backend,
                 source=self._source(),

@@ -7,7 +7,7 @@ from .contact_evidence import (
     contact_doubts as contact_doubts,
 )
 from .dataset import Dataset as Dataset
-from .delay import Delay as Delay, estimate_delay as estimate_delay
+from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints
 from .filtering import (
     differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass
     as low_pass, low_pass_gain as low_pass_gain, resample as resample, uniform_step as uniform_step, zero_phase_low_pass
@@ -24,5 +24,5 @@ from .windows import (
     WeakForm as WeakForm, Windows as Windows,
 )
 from .stance import Stance as Stance, estimate_stance as estimate_stance
-from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag
+from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag, thruster_columns as thruster_columns
 from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind

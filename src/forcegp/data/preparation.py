@@ -187,7 +187,10 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
             continue
         if name == "lag" and how == "auto" and thruster_columns(dataset.system):
             seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
-            chosen, reasons[name] = replace(chosen, lag=seconds), f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
+            pushing = thruster_columns(dataset.system)  # joints beside them do not follow so
+            each = tuple(seconds * (column in pushing) for column in range(actuators(dataset)))
+            chosen = replace(chosen, lag=seconds if all(each) else each)
+            reasons[name] = f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
             continue
         found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
         chosen = replace(chosen, **{name: found.significant if how == "auto" else tuple(found.each)})

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from forcegp.analytical.least_squares import correlation_time
-from forcegp.data import Dataset
+from forcegp.analytical.recorded_rows import slides
+from forcegp.data import Dataset, thruster_columns
 from forcegp.errors import DataWarning, ForceGPError
 from forcegp.evaluation.prior_comparison import compare_priors
 from forcegp.inference import Inducing
@@ -20,6 +21,8 @@ from forcegp.priors import named_prior
 
 FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
 IN_CONTACT = "tool-friction", "joint", "tool-friction + joint-friction"
+FLYING = "aerodynamic", "base-wrench"
+FLYING_ARM = "joint-friction + aerodynamic", "joint-friction", "aerodynamic"
 """Priors that are looked at, the one that is taken without a look first."""
 
 FRICTION = tuple(kind for name, kind in KNOWN_FORCES.items() if name.endswith("joint-friction"))
@@ -31,8 +34,17 @@ RESIDUALS_OF_FORCES = 1000  # rows that show where the noise of forces begins
 
 
 def usual_prior(system: MechanicalSystem) -> str:
-    """The prior that is taken without a look: friction of the joints, in contact forces at the tool."""
-    return (IN_CONTACT if system.touching else FREE_MOTION)[0]
+    """The prior that is taken without a look: friction of the joints, in contact forces at the tool, in flight air."""
+    return _looked_at(system)[0][0]
+
+
+def _looked_at(system: MechanicalSystem) -> tuple[tuple[str, ...], str]:
+    """Names of priors, and where the robot moves. Under feet that stand nothing slides, so no friction acts there."""
+    if thruster_columns(system):
+        return FLYING_ARM if system.robot.single_joint_names else FLYING, "in flight"
+    if any(slides(contact) for contact in system.touching):
+        return IN_CONTACT, "in contact"
+    return FREE_MOTION, "where nothing slides" if system.touching else "in free motion"
 
 
 def choose_prior(
@@ -41,13 +53,13 @@ def choose_prior(
     """Name of the prior to learn with, and why, in a sentence.
 
     In free motion friction of the joints, in contact forces at the tool, unless left-out stretches of `LOOK` rows show
-    a force at every joint, or the sum with friction of the joints, to be better (`compare_priors`). `how` are other
+    a force at every joint, or the sum with friction of the joints, to be better (`compare_priors`). Of a robot that
+    flies, what air does; feet that stand are no contact in which something slides. `how` are other
     arguments of that. A system with friction laws was identified: what is missing is the rest of the friction, and
     functions of positions and torques only fit what filters leave. Where nothing can be compared (too few rows), the
     first one is taken as well, and the reason says so.
     """
-    names = IN_CONTACT if system.touching else FREE_MOTION
-    where = "in contact" if system.touching else "in free motion"
+    names, where = _looked_at(system)
     if any(isinstance(force, FRICTION) for force in system.known_forces):
         return names[0], f"{names[0]} {where}, beside the friction laws that the system lists"
     priors = {name: named_prior(name, system) for name in names}

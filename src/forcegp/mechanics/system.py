@@ -214,7 +214,7 @@ class MechanicalSystem(Summary):
         Q_K = torch.zeros_like(state.v)
         for force in self.known_forces:
             Q_K = Q_K + force.force(state)
-        A, b, normals = self._constraint(state)
+        A, b, normals = self.constraint(state)
         batch = M.shape[:-2]  # inertials may carry batch dimensions of their own
         A, normals = (part.expand(*batch, *part.shape[-2:]) for part in (A, normals))
         b, Q_K = b.expand(*batch, -1), Q_K.expand(*batch, -1)
@@ -231,7 +231,7 @@ class MechanicalSystem(Summary):
                 M = M + inertia
         return M
 
-    def _constraint(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
+    def constraint(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """A (..., m, nv), b (..., m) and the surface gradients (..., m, 3)."""
         if not self.contacts:
             *batch, nv = state.v.shape
@@ -243,7 +243,7 @@ class MechanicalSystem(Summary):
 
     def check_states(self, q: Float[Tensor, "N nv"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nv"]) -> None:
         """Raise ContactError, naming row and contact, where contacts cannot constrain or contradict each other."""
-        A, b, _ = self._constraint(self.state(q, v, u))
+        A, b, _ = self.constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         for index, contact in enumerate(self.contacts):
             if isinstance(contact, LoopClosure | RollingContact):  # in a plane some of its rows constrain nothing

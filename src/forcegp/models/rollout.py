@@ -260,7 +260,7 @@ def checked_start(
     if not batch.numel():
         raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
     q, v = (x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in (q, v))
-    forces = forces.expand(*batch, -1, -1).reshape(-1, steps, forces.shape[-1]).movedim(1, 0).contiguous()
+    forces = forces.expand(*batch, -1, -1).reshape(batch.numel(), steps, forces.shape[-1]).movedim(1, 0).contiguous()
     return q, v, forces, batch
 
 

@@ -198,7 +198,11 @@ class PerJointPrior(ForcePrior):
 
     @override
     def check(self, system: MechanicalSystem) -> None:
-        joint_indices(self.joints, system.robot)
+        if not joint_indices(self.joints, system.robot):
+            raise InvalidInput(
+                f"{type(self).__name__} acts in joints, and {system.robot.name} has none but its base; leave it out, or "
+                "use the prior base-wrench or aerodynamic."
+            )
 
     @override
     def mixing(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:

@@ -188,6 +188,12 @@ DEFAULT_MODELS = (
 )
 
 
+def default_models(system: MechanicalSystem) -> tuple[str, ...]:
+    """Models that are compared where none is named: without refinements on motions where the base moves."""
+    fixed = system.robot.space.is_vector_space
+    return tuple(name for name in DEFAULT_MODELS if fixed or not name.endswith(MOTIONS))
+
+
 def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT_IDENTIFICATION) -> Candidate:
     """The model of this name: an entry, `identified-METHOD`, or Gaussian processes with these priors on forces.
 
@@ -197,6 +203,7 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
     if name in CANDIDATES:
         return CANDIDATES[name]
     if name.endswith(MOTIONS):
+        system.robot.require_vectors("refinements on motions")
         base = candidate(name.removesuffix(MOTIONS), system, identification)
         if base.kind in ("black box", "given"):
             raise InvalidInput(f"model {name!r} has no physics to refine on motions, or is the one that was given.")

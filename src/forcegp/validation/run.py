@@ -15,7 +15,7 @@ from forcegp.evaluation.metrics import median_and_range
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.jobs.job import machine
 from forcegp.parallel import Backend, backend_for
-from forcegp.validation.candidates import DEFAULT_MODELS, Candidate, candidates
+from forcegp.validation.candidates import Candidate, candidates, default_models
 from forcegp.validation.comparison import Comparison
 from forcegp.validation.jobs import jobs_of, kept
 from forcegp.validation.page import page
@@ -180,7 +180,7 @@ def validate(
     comparison: Comparison,
     folder: str | Path,
     *,
-    models: Sequence[str] = DEFAULT_MODELS,
+    models: Sequence[str] | None = None,
     seeds: int = 5,
     jobs: int | None = None,
     backend: Backend | str | None = None,
@@ -196,7 +196,7 @@ def validate(
 
     Parameters
     ----------
-    models: names as in `validation.candidates`.
+    models: names as in `validation.candidates`; None takes its `default_models`.
     seeds: how many choices of training rows, numbered from 0.
     jobs, backend: how many pieces at once, and where: in this process, or in several of this machine.
     source: where the data come from, for the page: "title", and "data", a list of lines; plain JSON values.
@@ -213,7 +213,8 @@ def validate(
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     if not 0.0 <= margin < 1.0:
         raise InvalidInput(f"the margin is {margin:g}; it must be at least 0 and below 1, such as {MARGIN}.")
-    chosen = candidates(models, comparison.system, comparison.identification)
+    named = default_models(comparison.system) if models is None else models
+    chosen = candidates(named, comparison.system, comparison.identification)
     configuration = comparison.configuration()
     store = JobStore.open(Path(folder), KIND, configuration, overwrite=overwrite)
     identifications, fits = jobs_of(comparison, chosen, seeds)

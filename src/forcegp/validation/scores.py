@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from forcegp.checks.check_input import plain
 from forcegp.data import Dataset, time_blocks
+from forcegp.data.configurations import space_of
 from forcegp.data.motion_records import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
@@ -17,6 +18,7 @@ from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior
+from forcegp.robots.manifold import ConfigurationSpace
 
 Rows = Float[np.ndarray, "rows nv"]
 Matrices = Float[np.ndarray, "rows nv nv"]
@@ -113,12 +115,18 @@ def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[s
 
 
 def outside_range(train: Dataset, test: Dataset) -> Bool[np.ndarray, " rows"]:
-    """Rows of `test` in which a joint's position or velocity lies beyond all of `train`."""
+    """Rows of `test` in which a joint's position or velocity lies beyond all of `train`.
+
+    Of a base that moves, its height and how it leans count as positions (`Robot.posture`).
+    """
     out = np.zeros(len(test), dtype=bool)
-    for name in ("q", "v"):
-        seen, here = getattr(train, name), getattr(test, name)
+    for seen, here in ((_postures(train), _postures(test)), (train.v, test.v)):
         out |= ((here < seen.min(axis=0)) | (here > seen.max(axis=0))).any(axis=-1)
     return out
+
+
+def _postures(dataset: Dataset) -> np.ndarray:
+    return dataset.q if dataset.system is None else dataset.system.robot.posture(torch.tensor(dataset.q)).cpu().numpy()
 
 
 def _apart(predicted: PredictedRows, test: Dataset, outside: Bool[np.ndarray, " rows"]) -> dict[str, Any]:
@@ -152,11 +160,15 @@ GAP = 1.5
 
 @dataclass(frozen=True, eq=False)
 class HeldOutMotions:
-    """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing."""
+    """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing.
+
+    `space` holds the positions, None for vectors.
+    """
 
     motions: RecordedMotions | None
     horizons: tuple[float, ...]
     notes: tuple[str, ...] = field(default=())
+    space: ConfigurationSpace | None = None
 
 
 def held_out_motions(
@@ -196,14 +208,14 @@ def held_out_motions(
         return HeldOutMotions(None, (), tuple(dict.fromkeys(notes)))
     joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in ("q", "v", "u")}
     rows = tuple(row for each in found for row in each.rows)
-    return HeldOutMotions(RecordedMotions(rows, found[0].dt, **joined), possible, tuple(dict.fromkeys(notes)))
+    return HeldOutMotions(RecordedMotions(rows, found[0].dt, **joined), possible, tuple(dict.fromkeys(notes)), space_of(recording))
 
 
 def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: str = "rk4") -> dict[str, Any] | None:
     """Errors of q at every horizon [s], as plain JSON values; None where there are no motions.
 
-    `rms_per_joint` (horizons, nv) is the root mean square over the motions of |q - q_recorded|, `rms` over joints as
-    well, in rad or m; both over the motions that had not diverged by then (None where all had), and `diverged`
+    `rms_per_joint` (horizons, nv) is the root mean square over the motions of |q - q_recorded|, of a base in its own
+    axes, `rms` over joints as well, in rad or m; both over the motions that had not diverged by then (None where all had), and `diverged`
     (horizons,) counts the others. `squared` (horizons, motions) is the mean over joints of the squared error of each.
     """
     motions = held_out.motions
@@ -212,7 +224,8 @@ def motion_scores(posterior: Posterior, held_out: HeldOutMotions, integrator: st
     rollout = posterior.rollout(
         motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator, baumgarte=None
     )
-    squared = np.square(rollout.q.cpu().numpy() - motions.q)
+    space = held_out.space or ConfigurationSpace(motions.q.shape[-1])
+    squared = np.square(space.difference(torch.tensor(motions.q), rollout.q.cpu()).numpy())
     scores: dict[str, Any] = {"horizons": list(held_out.horizons), "motions": len(motions.q), "integrator": integrator}
     scores |= {"dt": motions.dt, "rms_per_joint": [], "rms": [], "diverged": [], "squared": []}
     for horizon in held_out.horizons:

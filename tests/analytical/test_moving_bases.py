@@ -1,0 +1,229 @@
+"""Regression on torques where the base moves: Pinocchio's regressor, dense algebra, and parameters found again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from tests.mechanics.test_thrusters import DRONE
+from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
+
+from forcegp.analytical import (
+    NoiseLevels,
+    base_parameters,
+    body_names,
+    identify_analytical,
+    identify_payload,
+    standard_parameters,
+    torque_regressor,
+)
+from forcegp.analytical.bodies import ConsistentBodies, with_bodies
+from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.analytical.identification import joint_terms
+from forcegp.analytical.least_squares import weighted_least_squares
+from forcegp.analytical.recorded_rows import RecordedRows
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.mechanics import (
+    Actuation,
+    Armature,
+    CoulombJointFriction,
+    MechanicalSystem,
+    RigidBodyBias,
+    Thrusters,
+    ViscousJointFriction,
+    fixed_point,
+)
+from forcegp.robots import Robot
+
+FEET = (*fixed_point("a_foot", switch="a_stands"), *fixed_point("b_foot", (0.0, 0.0, 0.1), "b_stands"))
+FRICTION = ViscousJointFriction(0.3), CoulombJointFriction(0.5, 0.2)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    return MechanicalSystem(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
+
+
+def rows_of(system, count, seed=0, switches=2):
+    """Random states; feet stand and swing at random."""
+    generator = torch.Generator().manual_seed(seed)
+    robot = system.robot
+    v, u = (torch.randn(count, n, dtype=torch.float64, generator=generator) for n in system.sizes[1:])
+    u[:, u.shape[1] - switches :] = torch.randint(0, 2, (count, switches), generator=generator).double()
+    return robot.random(generator, count), v, u
+
+
+def recorded(system, count, noise=0.0, seed=0, switches=2):
+    q, v, u = rows_of(system, count, seed, switches)
+    a = system.dynamics(q, v, 5.0 * u if not switches else u).acceleration_map().offset
+    a = a + noise * torch.randn(a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 1))
+    time = torch.arange(count, dtype=torch.float64) / 100
+    u = 5.0 * u if not switches else u
+    return Dataset(**{name: x.numpy() for name, x in zip("qvua", (q, v, u, a), strict=True)}, time=time.numpy(),
+                   system=system)  # fmt: skip
+
+
+@pytest.mark.parametrize("base", [base for base in ROOTS if base != "fixed"])
+def test_columns_and_their_rank_are_those_of_pinocchio(base):
+    pair = Pair(base)
+    robot = pair.robot
+    ours = torque_regressor(robot, pair.q, pair.v, pair.a).unflatten(-1, (-1, 10)).numpy()
+    ids = [pair.model.frames[pair.model.getFrameId(link)].parentJoint - 1 for link in body_names(robot)]
+    for k, q, v, a, _ in pair.states():
+        theirs = pin.computeJointTorqueRegressor(pair.model, pair.data, q, v, a).reshape(robot.nv, -1, 10)
+        np.testing.assert_allclose(ours[k], theirs[pair.to_v][:, ids], atol=1e-10 * np.abs(theirs).max())
+    again = torque_regressor(robot, pair.q, pair.v, pair.a) @ standard_parameters(robot)
+    torch.testing.assert_close(again, robot.inverse_dynamics(pair.q, pair.v, pair.a), atol=1e-10, rtol=1e-10)
+    rng = np.random.default_rng(0)
+    stacked = [
+        pin.computeJointTorqueRegressor(pair.model, pair.data, pin.randomConfiguration(pair.model, *limits), v, a)
+        for limits in [(-np.ones(pair.model.nq), np.ones(pair.model.nq))]
+        for v, a in rng.normal(size=(60, 2, robot.nv))
+    ]
+    assert base_parameters(robot).rank == np.linalg.matrix_rank(np.concatenate(stacked), tol=1e-8)
+
+
+@pytest.mark.parametrize("likelihood", ["torque", "acceleration"])
+def test_residuals_and_their_jacobians(walker, likelihood):
+    """At the start they are those of the system's own dynamics; elsewhere slopes are differences of the residual."""
+    system = replace(walker, known_forces=(*walker.known_forces, *FRICTION, Armature(0.05)))
+    q, v, u = (x.numpy() for x in rows_of(system, 5))
+    a = np.random.default_rng(1).normal(size=v.shape)
+    terms = joint_terms(system, ("viscous", "coulomb"), "armature", q, v, u, a)
+    rows = RecordedRows(system, terms, q, v, u)
+    bodies = ConsistentBodies(body_pseudo_inertias(system.robot).numpy())
+    regressor, split = rows.regressor(a), bodies.size
+
+    def residual(x):
+        parameters = bodies.parameters(x[:split])
+        if likelihood == "torque":
+            r, in_parameters, in_terms = rows.in_torque(parameters, x[split:], a, regressor)
+        else:
+            r, in_parameters, in_terms = rows.in_acceleration(parameters, x[split:], a)
+        in_bodies = np.einsum("nibp,bpk->nibk", in_parameters, bodies.derivatives(x[:split])).reshape(*r.shape, -1)
+        jacobian = np.concatenate([in_bodies, in_terms], -1)
+        return (rows.without_contacts(r), rows.without_contacts(jacobian)) if likelihood == "torque" else (r, jacobian)
+
+    start = np.concatenate([np.zeros(split), terms.start()])
+    dynamics = system.dynamics(*(torch.tensor(s) for s in (q, v, u)))
+    if likelihood == "torque":  # H takes out the same directions, along A^T
+        wrong = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K
+        np.testing.assert_allclose((dynamics.H @ wrong[..., None])[..., 0], (dynamics.H.numpy() @ residual(start)[0][..., None])[..., 0], atol=1e-8)  # fmt: skip
+        assert np.abs(dynamics.A.numpy() @ residual(start)[0][..., None]).max() < 1e-9
+    else:
+        np.testing.assert_allclose(residual(start)[0], a - dynamics.acceleration_map().offset.numpy(), atol=1e-8)
+    x = start + np.random.default_rng(2).uniform(0.05, 0.2, len(start))
+    direction = np.random.default_rng(3).normal(size=len(x))
+    numeric = (residual(x + 1e-6 * direction)[0] - residual(x - 1e-6 * direction)[0]) / 2e-6
+    np.testing.assert_allclose(residual(x)[1] @ direction, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+
+
+def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknowns():
+    rng = np.random.default_rng(0)
+    rows, nv, k = 40, 4, 3
+    J, noise, truth = rng.normal(size=(rows, nv, k)), np.array([0.1, 1.0, 0.3, 0.5]), np.array([1.0, -2.0, 0.5])
+    held = rng.normal(size=(rows, 2, nv)) * (rng.integers(0, 3, (rows, 1)) > np.arange(2))[..., None]
+    pushed = (held.swapaxes(1, 2) @ (100.0 * rng.normal(size=(rows, 2, 1))))[..., 0]
+    y = J @ truth + noise * rng.normal(size=(rows, nv)) + pushed
+    prior = lambda x: (1e-3 * x, 1e-3 * np.eye(k))  # noqa: E731
+    bounds = np.full(k, -np.inf), np.full(k, np.inf)
+    fit = weighted_least_squares(lambda x: (J @ x - y, J), prior, np.zeros(k), bounds, held=held)
+    lambdas = np.zeros((rows * nv, 2 * rows))
+    for row in range(rows):
+        lambdas[nv * row : nv * row + nv, 2 * row : 2 * row + 2] = -(held[row] / fit.noise).T
+    dense = np.concatenate([(J / fit.noise[:, None]).reshape(-1, k), lambdas], 1)
+    wanted = np.linalg.lstsq(dense, (y / fit.noise).ravel(), rcond=1e-10)[0][:k]
+    np.testing.assert_allclose(fit.x, wanted, atol=1e-3)
+    hidden = np.linalg.qr(lambdas[:, lambdas.any(0)])[0]
+    left = dense[:, :k] - hidden @ (hidden.T @ dense[:, :k])
+    own = left.T @ left
+    np.testing.assert_allclose(fit.information, own, rtol=1e-8)
+    np.testing.assert_allclose(fit.noise, noise, rtol=0.5)
+
+
+@pytest.mark.parametrize("likelihood", ["torque", "acceleration"])
+def test_a_walker_is_found_again(walker, likelihood):
+    """Feet stand row by row, forces on them unknown: total mass, base parameters and friction come from the rest."""
+    heavier = body_pseudo_inertias(walker.robot).numpy() * np.array([1.5, 1.2, 0.9, 1.1])[:, None, None]
+    truth = replace(walker, robot=with_bodies(walker.robot, heavier), known_forces=(*walker.known_forces, *FRICTION))
+    found = identify_analytical(recorded(truth, 300, noise=1e-3), walker, likelihood=likelihood, prior_strength=1e-3)
+    mass, error = found.total_mass
+    assert abs(mass - heavier[:, 3, 3].sum()) < 5 * error + 1e-2
+    base = found.base
+    assert base.rank == base_parameters(walker.robot).rank
+    own = standard_parameters(truth.robot).numpy()
+    wanted = base.values(own)
+    np.testing.assert_allclose(base.values(found.parameters.ravel()), wanted, atol=0.02 * np.abs(wanted).max())
+    for name, value in {"viscous": 0.3, "coulomb": 0.5}.items():
+        for joint in walker.robot.single_joint_names:
+            assert abs(found.values[f"{name}.{joint}"] - value) < 0.03
+    assert not any("base" in name for name in found.terms.names)
+    test = recorded(truth, 50, seed=9)
+    np.testing.assert_allclose(found.accelerations(test.q, test.v, test.u), test.a, atol=0.05 * np.abs(test.a).max())
+    np.testing.assert_allclose(found.system.sizes, walker.sizes)
+
+
+def test_free_inertias_explain_the_same_rows(walker):
+    found = identify_analytical(recorded(walker, 300), walker, inertias="free", friction=(), rotors=None)
+    assert np.abs(found.torque_residual(recorded(walker, 40, seed=5))).max() < 1e-5
+
+
+def test_a_drone_without_joints(walker):
+    """Nothing but the ten numbers of one body, from thrusts."""
+    places = ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (-0.2, 0.0, 0.0), (0.0, -0.2, 0.1))
+    robot = Robot.from_urdf_text(DRONE, base="floating")
+    locked = Robot.from_urdf_text(DRONE, base="floating", locked=dict.fromkeys(robot.single_joint_names, 0.0))
+    frame = locked.layout.moving[0]
+    rotors = Thrusters(frame, places, torque=(0.02, -0.02, 0.02, -0.02))
+    system = MechanicalSystem(locked, (), (Actuation(), rotors, RigidBodyBias()))
+    heavier = replace(system, robot=with_bodies(locked, 1.3 * body_pseudo_inertias(locked).numpy()))
+    found = identify_analytical(recorded(heavier, 200, switches=0), system)
+    np.testing.assert_allclose(found.parameters.ravel(), standard_parameters(heavier.robot), atol=1e-3)
+    assert found.terms.size == 0
+    assert [type(force) for force in found.system.known_forces] == [type(force) for force in system.known_forces]
+
+
+def test_a_payload_on_the_trunk_of_a_walker(walker):
+    heavier = body_pseudo_inertias(walker.robot).numpy().copy()
+    link = body_names(walker.robot)[0]
+    heavier[0] += np.diag([2e-3, 2e-3, 2e-3, 0.0])
+    heavier[0] += 0.8 * np.outer([0.05, 0.0, 0.1, 1.0], [0.05, 0.0, 0.1, 1.0])
+    truth = replace(walker, robot=with_bodies(walker.robot, heavier))
+    found = identify_payload(recorded(truth, 600), walker, link=link, friction=("viscous",))
+    assert found.mass == pytest.approx(0.8, abs=0.02)
+    np.testing.assert_allclose(found.center_of_mass, [0.05, 0.0, 0.1], atol=0.02)
+
+
+def test_noise_under_constraints_is_that_of_the_rows(walker):
+    q, v, u = rows_of(walker, 400)
+    dynamics = walker.dynamics(q, v, u)
+    rng = np.random.default_rng(0)
+    force, acceleration = np.full(9, 0.5), np.full(9, 0.2)
+    moved = (dynamics.H.numpy() @ (force * rng.normal(size=(400, 9)))[..., None])[..., 0]
+    residual = moved + acceleration * rng.normal(size=(400, 9))
+    H, truth = dynamics.H.numpy(), NoiseLevels(acceleration, force)
+    found = NoiseLevels.of(residual, dynamics.M.numpy(), H)
+    white = (truth.whitening(H) @ residual[..., None])[..., 0]
+    np.testing.assert_allclose(white.T @ white / len(white), np.eye(9), atol=0.25)
+
+    def cost(levels):
+        lower = levels.whitening(H)
+        return 0.5 * ((lower @ residual[..., None]) ** 2).sum() - np.linalg.slogdet(lower)[1].sum()
+
+    assert cost(found) < cost(truth)
+    np.testing.assert_allclose(found.acceleration[:6], acceleration[:6], rtol=0.2)  # a light joint hides its own
+
+
+def test_a_robot_that_cannot_move_teaches_nothing(walker):
+    robot = walker.robot
+    points = [(x, y, 0.1 * x * y) for x in (0.1, -0.1) for y in (0.1, -0.1)]
+    link = robot.layout.moving[0]
+    held = tuple(c for point in points for c in fixed_point(link, point))
+    held += tuple(c for foot in ("a_foot", "b_foot") for point in points for c in fixed_point(foot, point))
+    system = replace(walker, contacts=held)
+    q, v, u = rows_of(walker, 20)
+    rows = Dataset(q=q.numpy(), v=0 * v.numpy(), u=u[:, :3].numpy(), a=0 * v.numpy(), time=np.arange(20.0), system=system)  # fmt: skip
+    with pytest.raises(InvalidInput, match="no equation is left"):
+        identify_analytical(rows)
