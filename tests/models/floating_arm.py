@@ -34,6 +34,12 @@ def satellite(viscous: float = 0.2, dry: float = 0.3, mass: float = 8.0, switch:
     return MechanicalSystem(robot, (), (Actuation(), thrusters, RigidBodyBias(), *friction))
 
 
+def falling() -> MechanicalSystem:
+    """The same in the field of the earth."""
+    system = satellite()
+    return system.with_robot(Robot.from_urdf_text(URDF, base="floating"))
+
+
 def recording(seed: int, seconds: float, given: MechanicalSystem, bump: float = 1.0) -> Dataset:
     """Rows of the satellite with friction .2 Nms, .3 Nm and a bump at .5 rad/s, for a model that is `given`."""
     generator, rows = np.random.default_rng(seed), round(seconds / DT)
