@@ -87,6 +87,15 @@ def has_wind(system: MechanicalSystem) -> bool:
     return any(isinstance(force, ObservedWind) for force in system.known_forces)
 
 
+def require_unobserved(posterior: Posterior, what: str) -> None:
+    """Raise InvalidInput for what `observing` gave, where `what` observes by itself."""
+    if len(posterior.system.inputs) > len(posterior.model.system.inputs):
+        raise InvalidInput(
+            f"{what} include the observers of the model: give the posterior and the recording as they were before "
+            "`observing`."
+        )
+
+
 def without_wind(system: MechanicalSystem) -> MechanicalSystem:
     """The system without columns of wind in u."""
     return replace(system, known_forces=tuple(x for x in system.known_forces if not isinstance(x, ObservedWind)))

@@ -12,7 +12,7 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.data.motion_records import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.models.motion_intervals import DEVIATIONS, MotionIntervals
-from forcegp.models.observed_wrench import in_observed_wind, observing
+from forcegp.models.observed_wrench import in_observed_wind, observing, require_unobserved
 from forcegp.models.rollout import Rollout
 from forcegp.models.training_data import TrainingData
 
@@ -34,11 +34,7 @@ def calibrate_motions(
 ) -> MotionIntervals:
     """What `StructuredPosterior.calibrated_on_motions` documents."""
     require_type("dataset", dataset, Dataset)
-    if posterior.system.held_inputs:
-        raise InvalidInput(
-            "intervals of motions are found with the observers of the model: give the posterior and the recording as "
-            "they were before `observing`, which then carries the intervals over."
-        )
+    require_unobserved(posterior, "intervals of motions")
     wanted = tuple(sorted(set(horizons)))
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
         raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
