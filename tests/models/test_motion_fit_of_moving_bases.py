@@ -46,18 +46,18 @@ def test_derivatives_in_every_unknown_and_start(switched):
             ends.append(fit.whitened(fit.at(*at, noise, noise, here.motions), noise)[0])
         return (ends[0] - ends[1]) / (2.0 * small)
 
-    for k in range(0, 14, 2):
+    for k in (1, 5, 6, 10):
         expected = differences(torch.eye(14, dtype=torch.float64)[k], states)
         torch.testing.assert_close(in_states[..., k], expected, rtol=1e-5, atol=1e-7)
     scale = float(in_x.abs().max())
-    for k in (*range(0, len(x), 7), len(x) - 1):
+    for k in (*range(0, len(x) // 2, 6), len(x) - 1):
         expected = differences(torch.eye(len(x), dtype=torch.float64)[k], x)
         torch.testing.assert_close(in_x[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
 
 
 def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
     given = floating_arm.satellite(0.1, 0.2, mass=7.0)
-    log = floating_arm.recording(1, 4.0, given, bump=0.0)
+    log = floating_arm.recording(1, 3.0, given, bump=0.0)
     rough = StructuredGP(given, NoForces()).fit(log, points=40, restarts=1)
     fits = [rough.refined_on_motions(rows, 0.5) for rows in (log, floating_arm.turned(log))]
     found, again = (refined.settings["motions"]["parameters"] for refined in fits)
@@ -72,7 +72,7 @@ def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
 def test_functions_are_refined_too():
     """Friction that no law describes, from accelerations that are far off."""
     given = floating_arm.satellite()
-    train, test = (floating_arm.recording(seed, 5.0, given) for seed in (1, 2))
+    train, test = (floating_arm.recording(seed, 3.0, given) for seed in (1, 2))
     noisy = train.a + np.random.default_rng(0).standard_normal(train.a.shape)
     rough = StructuredGP(given, JointFriction(("shoulder",))).fit(
         replace(train, a=noisy, noise_std=[1.0] * 7, truth={}), points=60, restarts=1
