@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.models import floating_arm
 from tests.models.test_motion_fit import QUIET, bump, line, recording, slide
 
 from forcegp import JointFriction, NeuralNetwork, NoForces, StructuredGP, load_posterior, save_posterior
 from forcegp.data.motion_records import recorded_motions
 from forcegp.errors import InvalidInput
+from forcegp.evaluation.rollout_scores import interval_about, rollout_errors
 from forcegp.models.motion_intervals import DEVIATIONS, MotionIntervals
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -90,3 +92,68 @@ def test_recordings_that_cannot_teach_it_are_refused(log):
     swapped = replace(log.rows(np.arange(len(log))[::-1]), system=log.system)
     with pytest.raises(InvalidInput, match="not in the order of time"):
         plain.calibrated_on_motions(swapped, HORIZONS)
+
+
+@pytest.fixture(scope="module")
+def floating():
+    """A model of a satellite whose arm has friction that no law describes, and a recording."""
+    log = floating_arm.recording(1, 6.0, floating_arm.satellite())
+    return StructuredGP(log.system, NoForces()).fit(log, points=40, restarts=1), log
+
+
+def test_where_the_base_moves_they_hold_as_steps(floating):
+    fitted, log = floating
+    calibrated = fitted.calibrated_on_motions(log, HORIZONS)
+    fresh = recorded_motions(floating_arm.recording(2, 6.0, log.system), 30, 0.5)
+    robot, recorded = log.system.robot, torch.tensor(fresh.q)
+    found = calibrated.rollout(fresh.q[:, 0], fresh.v[:, 0], fresh.u, fresh.dt, integrator="rk4")
+    low, high = found.interval()
+    assert low.shape == found.v.shape
+    off = robot.difference(found.q, recorded)
+    for horizon in HORIZONS:
+        row = round(horizon / fresh.dt)
+        assert 0.8 <= float(((low <= off) & (off <= high))[:, row].double().mean()) <= 1.0
+    assert float(high[:, -1].square().mean().sqrt()) < 6.0 * float(off[:, -1].square().mean().sqrt())
+    errors = rollout_errors(found, fresh, log.system)
+    np.testing.assert_allclose(errors.spread, high, atol=1e-15)
+    np.testing.assert_array_equal(errors.inside[:, 1:], ((low <= off) & (off <= high)).numpy()[:, 1:])
+
+
+def test_where_the_base_moves_samples_spread_as_steps(floating):
+    fitted, log = floating
+    robot, widths = log.system.robot, MotionIntervals(np.ones(1), np.zeros((1, 2, 7)), np.ones((2, 1, 2, 7)))
+    plain = fitted.rollout(log.q[:3], log.v[:3], log.u[None, :20], 0.01)
+    steps = 0.1 * torch.randn(6, *plain.v.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    samples = replace(plain, q=robot.integrate(plain.q, steps))
+    drawn = replace(plain, samples=samples)
+    torch.testing.assert_close(drawn.std(), steps.std(0))
+    torch.testing.assert_close(
+        torch.stack(drawn.interval()), steps.quantile(torch.tensor([0.025, 0.975]).double(), dim=0)
+    )
+    low, high = replace(drawn, intervals=widths).interval()
+    torch.testing.assert_close(high, DEVIATIONS * steps.std(0))
+    torch.testing.assert_close(low, -high)
+
+
+def test_bands_about_the_start_turn_with_the_base(floating):
+    """By finite differences of the way from there."""
+    fitted, log = floating
+    rms = 0.1 * np.ones((1, 2, 7))
+    widths = MotionIntervals(np.array([0.2]), rms, np.ones((2, 1, 2, 7)))
+    rollout = replace(fitted.rollout(log.q[:1], log.v[:1], log.u[None, :20], 0.01), intervals=widths)
+    robot, start, (_, high) = log.system.robot, rollout.q[:, :1].expand_as(rollout.q), rollout.interval()
+    below, above = interval_about(rollout, start, robot.space)
+    way, small = robot.difference(start, rollout.q), 1e-6 * torch.eye(7, dtype=torch.float64)[:, None, None]
+    moved = [robot.difference(start, robot.integrate(rollout.q, side * small)) for side in (1, -1)]
+    half = (((moved[0] - moved[1]) / 2e-6 * high.movedim(-1, 0)[..., None]) ** 2).sum(0).sqrt()
+    torch.testing.assert_close(above, way + half, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(below, way - half, rtol=1e-7, atol=1e-9)
+
+
+def test_a_turn_of_the_world_changes_no_width(floating):
+    fitted, log = floating
+    one, other = (
+        fitted.calibrated_on_motions(rows, (0.1, 0.2)).motion_intervals for rows in (log, floating_arm.turned(log))
+    )
+    np.testing.assert_allclose(other.rms, one.rms, rtol=1e-6)
+    np.testing.assert_allclose(other.factors, one.factors, rtol=1e-6)

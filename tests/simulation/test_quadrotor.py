@@ -9,7 +9,7 @@ import torch
 
 from forcegp import AerodynamicForce, StructuredGP
 from forcegp.cli.fit import fit_summary
-from forcegp.data import estimate_thruster_lag
+from forcegp.data import estimate_thruster_lag, recorded_motions
 from forcegp.data.delay import lagged
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evaluation.predicted_rows import predict_rows
@@ -202,9 +202,22 @@ def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
     assert export_c(seeing, tmp_path / "c").differences
 
 
-def test_intervals_of_motions_need_a_fixed_base(posterior, train):
-    with pytest.raises(InvalidInput, match="need a base that is fixed"):
-        posterior.calibrated_on_motions(acting(train), (0.2,))
+def test_intervals_of_motions_are_those_of_observed_wind(posterior, train):
+    """They are found, and used, where wind is observed; the model alone, in whatever wind, has none."""
+    rows = acting(train).rows(np.arange(480))
+    calibrated = posterior.calibrated_on_motions(rows, (0.1,))
+    assert calibrated.motion_intervals is None
+    seeing, seen = observing(calibrated, acting(train).rows(np.arange(2400, 3200)))
+    assert seeing.motion_intervals.inputs == seen.system.inputs
+    moved = recorded_motions(seen, 30, 0.1)
+    found = seeing.rollout(moved.q[:, 0], moved.v[:, 0], moved.u, moved.dt, integrator="rk4")
+    low, high = found.interval()
+    off = seen.system.robot.difference(found.q, torch.tensor(moved.q))
+    assert float(((low <= off) & (off <= high))[:, -1].double().mean()) > 0.8
+    other, _ = observing(calibrated, rows, seconds=0.05)
+    assert other.motion_intervals is None
+    with pytest.raises(InvalidInput, match="before `observing`"):
+        seeing.calibrated_on_motions(seen, (0.05,))
 
 
 def test_without_columns_the_air_moves_as_in_the_training(posterior, train):

@@ -84,7 +84,14 @@ def interval_about(rollout: Rollout, q0: Tensor, space: ConfigurationSpace) -> t
     if space.is_vector_space:
         low, high = rollout.interval()
         return low - q0, high - q0
-    assert rollout.samples is not None, "calibrated intervals of motions refuse bases that move"
-    levels = torch.tensor(INTERVAL, dtype=q0.dtype, device=q0.device)
-    low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), levels, dim=0)
-    return low, high
+    if rollout.intervals is None:
+        levels = torch.tensor(INTERVAL, dtype=q0.dtype, device=q0.device)
+        assert rollout.samples is not None, "without them there is no interval"
+        low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), levels, dim=0)
+        return low, high
+    # what steps from the motion change of the way to it: entries of a step are as if independent
+    way, (_, wide) = apart_from(q0, rollout.q, space), rollout.interval()
+    axes = torch.eye(space.nv).to(way).expand(*way.shape, -1)
+    changes = space.chart_velocity(way[..., None, :].expand_as(axes), axes)
+    half = (changes.square() * wide.square()[..., None]).sum(-2).sqrt()
+    return way - half, way + half

@@ -12,6 +12,10 @@ whose pass gives new guesses of all middles, and the derivatives of the motion i
 it is Newton's method on all steps of all windows at once (the lifted or multiple-shooting method of Bock & Plitt 1984;
 Albersmeyer & Diehl, "The lifted Newton method", SIAM J. Optim. 2010): accelerations are asked for all steps together,
 and a motion that explicit steps would lose is found, because the guess comes from a recording.
+
+Where a base moves, q+ = q exp(m(h v_m)), with the acceleration that belongs to this step (`midpoint_step`,
+`midpoint_acceleration`). Positions then follow from the guessed v_m exactly, and the recursion runs over steps from
+them in body axes: those at the end of a step are X dq + Y dv_m, those at its middle alike, with the exact derivatives.
 """
 
 from collections.abc import Callable
@@ -21,7 +25,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.integration.integrators import find_roots
+from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, find_roots
+from forcegp.robots.manifold import ConfigurationSpace
 
 MOST_PASSES = 20
 TOLERANCE = 1e-9
@@ -30,7 +35,10 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Accelerations (n, nv) at states, and derivatives in q, v (n, nv, nv) and parameters (n, nv, P)."""
+    """Accelerations (n, nv) at states, and derivatives in q, v (n, nv, nv) and parameters (n, nv, P).
+
+    Where a base moves, the derivative in q is that in a step from there.
+    """
 
     a: Float[Tensor, "n nv"]
     a_q: Float[Tensor, "n nv nv"]
@@ -42,18 +50,20 @@ class Linear:
 class Accelerations:
     """The accelerations of states (q, v, u), each (n, nv), which torch can differentiate, and their `Linear`.
 
-    `linear` is asked with and without derivatives in the parameters.
+    `linear` is asked with and without derivatives in the parameters; `space` is that of q.
     """
 
     mean: Callable[[Tensor, Tensor, Tensor], Tensor]
     linear: Callable[[Tensor, Tensor, Tensor, bool], Linear]
+    space: ConfigurationSpace = VECTORS
 
 
 @dataclass(frozen=True, eq=False)
 class WindowMotions:
     """Motions of K windows of T steps: states, the middles of the steps, whether Newton's method found them.
 
-    `in_start` and `in_parameters` are the derivatives of q in (q_0, v_0) and in p.
+    `in_start` and `in_parameters` are the derivatives of q in (q_0, v_0) and in p; where a base moves, of steps from q
+    in steps from q_0.
     """
 
     q: Float[Tensor, "K T+1 nv"]
@@ -78,15 +88,14 @@ def window_motions(
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
-    Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
+    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
     left = torch.arange(len(q0), device=q0.device)
     for _ in range(MOST_PASSES):  # of those that are not found: a turn of dry friction is met one pass after the other
-        at = _at(accelerations, middle_q[left], middle_v[left], u[left], False)
-        q, v, _ = _pass(at, q0[left], v0[left], middle_q[left], middle_v[left], h)
-        there_q, there_v = (q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / h
+        middles = middle_q[left], middle_v[left]
+        there_q, there_v = _pass(accelerations, q0[left], v0[left], u[left], middles, h, False)[2:4]
         change = (there_v - middle_v[left]).abs().flatten(1).amax(1)
         middle_q[left], middle_v[left] = there_q, there_v
         found[left] = change <= TOLERANCE * (1.0 + there_v.abs().flatten(1).amax(1))
@@ -97,11 +106,10 @@ def window_motions(
         there_q, there_v, ended = _step_by_step(accelerations, q0[left], v0[left], u[left], h)
         found[left] = ended
         middle_q[left[ended]], middle_v[left[ended]] = there_q[ended], there_v[ended]
-    at = _at(accelerations, middle_q, middle_v, u, derivatives)
-    q, v, slopes = _pass(at, q0, v0, middle_q, middle_v, h)
+    q, v, *_, slopes = _pass(accelerations, q0, v0, u, (middle_q, middle_v), h, derivatives)
     if not derivatives:
         return WindowMotions(q, v, middle_q, middle_v, found)
-    start = 2 * q0.shape[-1]
+    start = 2 * v0.shape[-1]
     return WindowMotions(q, v, middle_q, middle_v, found, slopes[..., :start], slopes[..., start:])
 
 
@@ -110,16 +118,22 @@ def _step_by_step(
 ) -> tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"], Bool[Tensor, " K"]]:
     """The middles of motions, by Newton's method with shorter steps, and which of them have an end."""
     positions, velocities, ended = [], [], torch.ones(len(q), dtype=torch.bool, device=q.device)
+    space = accelerations.space
     for force in u.unbind(1):
-        residual, linearize = _step(accelerations, q, v, force, h)
-        middle, found = find_roots(residual, v, linearize)
+        if space.is_vector_space:
+            residual, linearize = _step(accelerations, q, v, force, h)
+            middle, found = find_roots(residual, v, linearize)
+        else:
+            moved = ImplicitMidpoint(space).step(lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
+            middle, found = 0.5 * (v + moved.v), moved.found
         ended &= found
         middle = torch.where(ended[:, None], middle, v)  # the others only stay finite
-        positions.append(q + 0.5 * h * middle)
+        step = space.midpoint_step(h * middle)
+        positions.append(space.integrate(q, 0.5 * step))
         velocities.append(middle)
-        q, v = q + h * middle, 2.0 * middle - v
+        q, v = space.integrate(q, step), 2.0 * middle - v
         if not bool(ended.any()):
-            return u.new_zeros(u.shape), u.new_zeros(u.shape), ended
+            return q[:, None], v[:, None], ended
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1), ended
 
 
@@ -146,17 +160,80 @@ def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameter
     return Linear(a, a_q, a_v, None if found.a_p is None else found.a_p.unflatten(0, q.shape[:2]))
 
 
+def _along(
+    accelerations: Accelerations, q0: Tensor, u: Tensor, w: Tensor, h: float, parameters: bool
+) -> tuple[Tensor, Tensor, Linear, Tensor, Tensor]:
+    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations of the steps, X and Y (K, T, ...).
+
+    Derivatives of these accelerations are in the step from where a step begins and in its w.
+    """
+    space, nv = accelerations.space, w.shape[-1]
+    steps, path = space.midpoint_step(h * w), [q0]
+    for step in steps.unbind(1):
+        path.append(space.integrate(path[-1], step))
+    q = torch.stack(path, dim=1)
+    start, end, middle = q[:, :-1], q[:, 1:], space.integrate(q[:, :-1], 0.5 * steps)
+
+    def moved(z: Tensor) -> Tensor:
+        at, step = space.integrate(start, z[..., :nv]), space.midpoint_step(h * (w + z[..., nv:]))
+        ends = (
+            space.difference(middle, space.integrate(at, 0.5 * step)),
+            space.difference(end, space.integrate(at, step)),
+        )
+        return torch.cat(ends, dim=-1)
+
+    def accelerated(z: Tensor) -> Tensor:
+        at, a, still = z.split(nv, dim=-1)
+        return space.midpoint_acceleration(h * at, a, still)
+
+    _, slopes = _jacobian(moved, w.new_zeros(*w.shape[:2], 2 * nv), 2 * nv)
+    half, whole = slopes.split(nv, dim=-2)
+    both = _at(accelerations, *(torch.cat(x) for x in ((middle, middle), (w, torch.zeros_like(w)), (u, u))), parameters)
+    parts = ([None] * 2 if x is None else x.chunk(2) for x in (both.a, both.a_q, both.a_v, both.a_p))
+    fast, still = (Linear(*each) for each in zip(*parts, strict=True))
+    a, slopes = _jacobian(accelerated, torch.cat([w, fast.a, still.a], dim=-1), nv)
+    of_w, of_fast, of_still = slopes.split(nv, dim=-1)
+    at_middle = of_fast @ fast.a_q + of_still @ still.a_q
+    a_q, a_w = (at_middle @ part for part in half.split(nv, dim=-1))
+    a_p = None if fast.a_p is None or still.a_p is None else of_fast @ fast.a_p + of_still @ still.a_p
+    at = Linear(a, a_q, a_w + of_w + of_fast @ fast.a_v, a_p)
+    return q, middle, at, *whole.split(nv, dim=-1)
+
+
+def _jacobian(function: Callable[[Tensor], Tensor], x: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """As `rows_jacobian`, of any batch and in one backward pass of all `size` entries: quick functions are called."""
+    with torch.enable_grad():
+        copies = x.detach().expand(size, *x.shape).clone().requires_grad_()
+        y = function(copies)
+        (slopes,) = torch.autograd.grad(y.diagonal(dim1=0, dim2=-1).sum(), copies)
+    return y[0].detach(), slopes.movedim(0, -2)
+
+
 def _pass(
-    at: Linear, q0: Tensor, v0: Tensor, middle_q: Tensor, middle_v: Tensor, h: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """q, v (K, T+1, nv) of the linearised steps, and the derivatives of q (K, T+1, nv, 2 nv + P)."""
-    nv, half = q0.shape[-1], 0.5 * h
+    accelerations: Accelerations,
+    q0: Tensor,
+    v0: Tensor,
+    u: Tensor,
+    middles: tuple[Tensor, Tensor],
+    h: float,
+    parameters: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """q, v (K, T+1, nv) of the linearised steps, their middles, and the derivatives of q (K, T+1, nv, 2 nv + P)."""
+    nv, half, space = v0.shape[-1], 0.5 * h, accelerations.space
     identity = torch.eye(nv, dtype=q0.dtype, device=q0.device)
-    inverse = torch.linalg.inv(identity - half * at.a_v - half**2 * at.a_q)
-    constant = half * (at.a - (at.a_q @ middle_q[..., None] + at.a_v @ middle_v[..., None])[..., 0])
+    middle_q, middle_v = middles
+    path, ends = None, None
+    if space.is_vector_space:
+        at = _at(accelerations, middle_q, middle_v, u, parameters)
+        slope, q = at.a_v + half * at.a_q, q0[..., None]
+        constant = half * (at.a - (at.a_q @ middle_q[..., None] + at.a_v @ middle_v[..., None])[..., 0])
+    else:  # q is the step from the path, and the middle velocity what is added to that of the guess
+        path, middle_q, at, *moves = _along(accelerations, q0, u, middle_v, h, parameters)
+        ends = list(zip(*(x.unbind(1) for x in (*moves, middle_v)), strict=True))
+        slope, q, constant = at.a_v, torch.zeros_like(v0)[..., None], half * at.a - middle_v
+    inverse = torch.linalg.inv(identity - half * slope)
     # columns: the state, and where parameters are asked for its derivatives in q0, v0 and p
-    q, v = q0[..., None], v0[..., None]
-    inputs = constant[..., None]
+    v, inputs = v0[..., None], constant[..., None]
     if at.a_p is not None:
         nothing = q0.new_zeros(len(q0), nv, at.a_p.shape[-1])
         eye, zero = identity.expand(len(q0), nv, nv), q0.new_zeros(len(q0), nv, nv)
@@ -165,12 +242,21 @@ def _pass(
         inputs = torch.cat([inputs, wide, half * at.a_p], dim=-1)
     # v_m = Z (v + h/2 a_q q + inputs): products that do not depend on the state first, for all steps at once
     of_q, of_inputs = half * inverse @ at.a_q, inverse @ inputs
-    rows_q, rows_v = [q], [v[..., 0]]
-    for Z, Z_q, given in zip(inverse.unbind(1), of_q.unbind(1), of_inputs.unbind(1), strict=True):
+    rows_q, rows_v, added = [q], [v[..., 0]], []
+    for k, (Z, Z_q, given) in enumerate(zip(inverse.unbind(1), of_q.unbind(1), of_inputs.unbind(1), strict=True)):
         middle = Z @ v + Z_q @ q + given
-        q = q + h * middle
         v = 2.0 * middle - v
+        if ends is None:
+            q = q + h * middle
+        else:
+            X, Y, guessed = ends[k]
+            q = X @ q + Y @ middle
+            v[..., 0] += 2.0 * guessed
+            added.append(middle[..., 0])
         rows_q.append(q)
         rows_v.append(v[..., 0])
-    all_q = torch.stack(rows_q, dim=1)
-    return all_q[..., 0], torch.stack(rows_v, dim=1), all_q[..., 1:]
+    all_q, all_v = torch.stack(rows_q, dim=1), torch.stack(rows_v, dim=1)
+    q, slopes = all_q[..., 0], all_q[..., 1:]
+    if path is None:
+        return q, all_v, (q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / h, slopes
+    return space.integrate(path, q), all_v, middle_q, middle_v + torch.stack(added, dim=1), slopes

@@ -26,11 +26,16 @@ DEVIATIONS = 1.959963984540054  # of a normal distribution, which hold 95 % of i
 
 @dataclass(frozen=True, eq=False)
 class MotionIntervals:
-    """Widths by horizon [s], of q and v: `rms` in their units, `factors` with samples of functions and without."""
+    """Widths by horizon [s], of q and v: `rms` in their units, `factors` with samples of functions and without.
+
+    Where a base moves, those of q belong to steps in its axes. `inputs` are the columns of u of these motions: some may
+    hold what an observer found.
+    """
 
     horizons: Float[np.ndarray, " H"]
     rms: Float[np.ndarray, "H 2 nv"]
     factors: Float[np.ndarray, "2 H 2 nv"]
+    inputs: tuple[str, ...] = ()
 
     def half_width(self, quantity: str, time: Tensor, spread: Tensor | None) -> Float[Tensor, "*batch rows nv"]:
         """Of the 95 % interval; `spread` is the standard deviation of samples (..., T+1, nv)."""
@@ -47,9 +52,11 @@ class MotionIntervals:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
-        return {name: getattr(self, name).tolist() for name in ("horizons", "rms", "factors")}
+        arrays = {name: getattr(self, name).tolist() for name in ("horizons", "rms", "factors")}
+        return arrays | {"inputs": list(self.inputs)}
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        return cls(*(np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors")))
+        arrays = (np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors"))
+        return cls(*arrays, tuple(stored.get("inputs", ())))

@@ -41,12 +41,16 @@ def observing(
     `AerodynamicForce` gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s
     which missed least in the second before. Without such a prior, or where its time is 0, both come back as they are.
 
+    Calibrated intervals of motions go along where neither `seconds` nor `frame` is given.
+
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording that is too short or whose rows are not in order of time.
     """
     prior: ForcePrior | None = getattr(posterior.model, "prior", None)
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
     times = TRIED if seconds is None else (seconds,)
+    # calibrated widths are of what is observed by default
+    widths = posterior.settings.get("motion_intervals") if seconds is None and frame is None else None
     if seconds is None:
         seconds = 0.0 if own is None else LEAST if own.observe is None else own.observe
         times = times if own is None or own.observe is None else (seconds,)
@@ -61,7 +65,10 @@ def observing(
     system = _with_wrench(posterior.system, frame)
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
-    return posterior.with_system(system), seen if whole else seen.rows(_with_past(dataset, seconds))
+    posterior = posterior.with_system(system)
+    if widths is not None:
+        posterior = replace(posterior, settings={**posterior.settings, "motion_intervals": widths})
+    return posterior, seen if whole else seen.rows(_with_past(dataset, seconds))
 
 
 def in_air(
@@ -105,6 +112,15 @@ def unobserved(system: MechanicalSystem) -> MechanicalSystem:
     return replace(system, known_forces=tuple(x for x in system.known_forces if getattr(x, "names", ()) not in own))
 
 
+def require_unobserved(posterior: Posterior, what: str) -> None:
+    """Raise InvalidInput for what `observing` gave, where `what` observes by itself."""
+    if len(posterior.system.inputs) > len(posterior.model.system.inputs):
+        raise InvalidInput(
+            f"{what} include the observers of the model: give the posterior and the recording as they were before "
+            "`observing`."
+        )
+
+
 def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     """Rows to `update` with as the system has them that the model was trained on: with the wind, where that has it.
 
@@ -120,8 +136,18 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
-    if "air" not in posterior.settings:
+    return in_own_air(posterior, rows)
+
+
+def in_own_air(posterior: Posterior, rows: Dataset) -> Dataset:
+    """Rows of a recording with the columns that the model's own rows have: their wind, or the force that stays.
+
+    Rows that show none are left out. Raises InvalidInput where all have less than .1 s of their own past.
+    """
+    if "steady_forces" in posterior.settings:
         return observing(posterior, rows)[1]
+    if "air" not in posterior.settings:
+        return rows
     _, seen = _in_observed_wind(posterior, rows)
     return seen.rows(_with_past(rows, LEAST))
 

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
-from forcegp.integration.integrators import ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
+from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop, fused, steps_of
 from forcegp.models.motion_intervals import MotionIntervals
 from forcegp.models.search import blas_threads
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
+from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
 """Steps of some milliseconds each; fewer are done before a program is compiled."""
@@ -68,6 +69,8 @@ class Rollout:
     samples: with samples=S, the same for S functions drawn from the model's posterior, shapes (S, ..., T+1, nv);
         None without. Each sample is one function: it answers the same state always with the same force.
     intervals: calibrated widths of intervals, of the model; None without.
+    space: of the positions. Where a base moves they do not add up, so deviations of q are steps (nv,) from the q here,
+        in the axes of the base: `robot.difference(rollout.q, other)`.
     """
 
     time: Float[Tensor, " rows"]
@@ -82,29 +85,34 @@ class Rollout:
     baumgarte: Baumgarte | None
     samples: "Rollout | None" = None
     intervals: MotionIntervals | None = None
+    space: ConfigurationSpace = VECTORS
 
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
         """Lower and upper ends (..., T+1, nv) of the 95 % interval.
 
         Of a model with calibrated intervals (`Posterior.calibrated_on_motions`) those, centred on the mean; else the
-        quantiles of the samples. Raises InvalidInput where there is neither.
+        quantiles of the samples. Where a base moves, ends of q are steps from q: another motion lies within where
+        `low <= robot.difference(rollout.q, other) <= high`. Raises InvalidInput where there is neither.
         """
         if self.intervals is None:
             low, high = self.quantiles((0.025, 0.975), quantity)
             return low, high
         center, enough = getattr(self, quantity), self.samples is not None and len(self.samples.q) > 1
+        if quantity == "q" and not self.space.is_vector_space:
+            center = torch.where(center.isnan().any(-1, keepdim=True), torch.nan, 0.0)
         half = self.intervals.half_width(quantity, self.time, self.std(quantity) if enough else None)
         return center - half, center + half
 
     def std(self, quantity: Quantity = "q") -> Tensor:
         """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.
 
+        Of q where a base moves, that of steps (..., T+1, nv).
         Raises InvalidInput for a rollout with fewer than two samples.
         """
         return self._sampled(quantity, least=2).std(0)
 
     def quantiles(self, levels: Sequence[float] = (0.025, 0.5, 0.975), quantity: Quantity = "q") -> Tensor:
-        """Quantiles (levels, ...) over the samples; NaN from where one sample diverged.
+        """Quantiles (levels, ...) over the samples; NaN from where one sample diverged. Where a base moves, of steps.
 
         Raises InvalidInput for a rollout without samples, or levels outside 0 to 1.
         """
@@ -119,7 +127,9 @@ class Rollout:
             raise InvalidInput(
                 f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
             )
-        return getattr(self.samples, quantity)
+        values: Tensor = getattr(self.samples, quantity)
+        on_manifold = quantity == "q" and not self.space.is_vector_space
+        return self.space.difference(self.q, values) if on_manifold else values
 
 
 def roll_out(
@@ -172,7 +182,7 @@ def roll_out(
         correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
         time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
         moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
-        return Rollout(time, *moved, integrator, model.baumgarte)
+        return Rollout(time, *moved, integrator, model.baumgarte, space=robot.space)
 
     with torch.set_grad_enabled(grad), blas_threads(0):
         mean = run(model.mean(), (), "rollouts", 0)

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from forcegp.data import Dataset, recorded_motions
 from forcegp.evaluation.plots import style
-from forcegp.evaluation.rollout_scores import rollout_errors
+from forcegp.evaluation.rollout_scores import apart_from, rollout_errors
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
 
@@ -40,7 +40,8 @@ def motion_bands_figure(
     figure = style.new_figure(11.0, 1.0 + 1.55 * -(-joints // columns))
     names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "q")
     panels = style.joint_panels(figure, joints, columns)
-    signed = rollout.q.cpu().numpy() - recorded.q
+    there = torch.as_tensor(recorded.q.copy(), device=rollout.q.device)
+    signed = apart_from(there, rollout.q, rollout.space).cpu().numpy()
     for joint, (axes, lowest) in enumerate(panels):
         axes.axhline(0.0, color="#B8BCC2", linewidth=0.8)
         for motion, row in enumerate(recorded.rows):

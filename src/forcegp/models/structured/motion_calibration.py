@@ -6,11 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.motion_records import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.models.motion_intervals import DEVIATIONS, MotionIntervals
+from forcegp.models.observed_wrench import in_own_air, observing, require_unobserved
 from forcegp.models.rollout import Rollout
 from forcegp.models.training_data import TrainingData
 
@@ -32,27 +34,26 @@ def calibrate_motions(
 ) -> MotionIntervals:
     """What `StructuredPosterior.calibrated_on_motions` documents."""
     require_type("dataset", dataset, Dataset)
-    posterior.system.robot.require_vectors("intervals of motions")
+    require_unobserved(posterior, "intervals of motions")
     wanted = tuple(sorted(set(horizons)))
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
         raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
     parts = _folds(dataset, wanted[-1])
-    errors, spreads, kept = [], [], wanted
+    errors, spreads, kept, inputs = [], [], wanted, posterior.system.inputs
     for number, inside in enumerate(parts):
         if report is not None:
             report(number, len(parts))
-        motions = _motions(dataset.rows(inside), wanted[-1])
+        other, rows = observing(_without(posterior, dataset.rows(~inside)), dataset.rows(inside))
+        motions = _motions(rows, wanted[-1])
         kept = tuple(h for h in wanted if h >= motions.dt)
-        other = _without(posterior, dataset.rows(~inside))
         how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES if len(other.latent_names) else 0}
         rollout: Rollout = other.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, **how)
-        rows = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
-        error, spread = [], []
-        for name in ("q", "v"):
-            there = getattr(rollout, name)[:, rows]
-            error.append(np.abs(there.cpu().numpy() - getattr(motions, name)[:, rows]))
-            sampled = rollout.samples is not None
-            spread.append(rollout.std(name)[:, rows].cpu().numpy() if sampled else np.zeros_like(error[-1]))
+        at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
+        inputs, sampled = other.system.inputs, rollout.samples is not None
+        true_q, true_v = (torch.tensor(x[:, at], device=rollout.q.device) for x in (motions.q, motions.v))
+        away = {"q": rollout.space.difference(rollout.q[:, at], true_q), "v": true_v - rollout.v[:, at]}
+        error = [each.abs().cpu().numpy() for each in away.values()]
+        spread = [rollout.std(name)[:, at].cpu().numpy() if sampled else np.zeros_like(error[0]) for name in away]
         errors.append(np.stack(error, axis=2))
         spreads.append(np.stack(spread, axis=2))
     error, spread = np.concatenate(errors), np.concatenate(spreads)  # (motions, H, 2, nv)
@@ -64,7 +65,7 @@ def calibrate_motions(
     level = min(1.0, LEVEL * (1.0 + 1.0 / len(error)))
     scores = [error / np.sqrt(np.square(s) + np.square(rms)) for s in (spread, np.zeros_like(spread))]
     factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
-    return MotionIntervals(np.array(kept), rms, factors)
+    return MotionIntervals(np.array(kept), rms, factors, inputs)
 
 
 def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
@@ -113,6 +114,7 @@ def _without(posterior: Structured, rest: Dataset) -> Structured:
     if refined is not None:
         return posterior.refined_on_motions(rest, refined["seconds"], inertias=refined["inertias"])
     own = posterior.training
+    rest = in_own_air(posterior, rest)
     rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
     given = replace(TrainingData.of(rows, own.q.device), reference=own.reference or own)
     model, parameters = posterior.model, posterior.parameters

@@ -36,7 +36,9 @@ from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError, req
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.engines import InducingWeights
 from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
+from forcegp.models.observed_wrench import in_own_air, require_unobserved, unobserved
 from forcegp.models.structured.motion_unknowns import SCALES, Structured, Unknowns
+from forcegp.robots.manifold import ConfigurationSpace
 
 Report = Callable[[int, float], None]
 STEP = 0.005
@@ -83,7 +85,7 @@ class MotionFit:
         return self.stride * self.recorded.dt
 
     @cached_property
-    def q(self) -> Float[Tensor, "K T+1 nv"]:
+    def q(self) -> Float[Tensor, "K T+1 nq"]:
         """Recorded positions at the ends of the steps."""
         return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
 
@@ -94,8 +96,18 @@ class MotionFit:
 
     @cached_property
     def start(self) -> Float[Tensor, "K 2*nv"]:
-        """Recorded initial states."""
-        return torch.as_tensor(np.concatenate([self.recorded.q[:, 0], self.recorded.v[:, 0]], axis=-1))
+        """Recorded initial states; where a base moves, the step 0 from the recorded position stands for that."""
+        q, v = self.recorded.q[:, 0], self.recorded.v[:, 0]
+        return torch.as_tensor(np.concatenate([q if self.space.is_vector_space else np.zeros_like(v), v], axis=-1))
+
+    @cached_property
+    def space(self) -> ConfigurationSpace:
+        """Of positions."""
+        return self.unknowns.start.system.robot.space
+
+    def residual(self, motions: WindowMotions) -> Float[Tensor, "K T+1 nv"]:
+        """Steps that lead from the recorded positions to those of the motions."""
+        return self.space.difference(self.q, motions.q)
 
     def spread(self, sigma: Tensor) -> Float[Tensor, " 2*nv"]:
         """Standard deviations of initial states about the recorded ones."""
@@ -104,11 +116,14 @@ class MotionFit:
 
     def at(self, x: Tensor, states: Tensor, noise: Tensor, sigma: Tensor, near: WindowMotions | None) -> _Point:
         """The point, its motions sought from those of another; infinitely bad where there are none."""
-        q, nv = self.q, self.q.shape[-1]
-        guess = ((q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / self.h)
+        q, space = self.q, self.space
+        steps = space.difference(q[:, :-1], q[:, 1:])
+        guess = space.integrate(q[:, :-1], 0.5 * steps), steps / self.h
         if near is not None:
             guess = near.middle_q, near.middle_v
-        q0, v0 = states.split(nv, dim=-1)
+        q0, v0 = states.split(steps.shape[-1], dim=-1)
+        if not space.is_vector_space:
+            q0 = space.integrate(q[:, 0], q0)
         try:
             accelerations = self.unknowns.accelerations(x)
             # a trial step that leads to motions so far from these is too long, whatever they are
@@ -117,7 +132,7 @@ class MotionFit:
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
             nowhere = torch.full_like(q, math.nan)
             motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
-        residual = (motions.q - q) / noise
+        residual = self.residual(motions) / noise
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
         cost = 0.5 * float(residual.square().sum() + away.square().sum() + from_prior.square().sum())
@@ -126,10 +141,22 @@ class MotionFit:
 
     def whitened(self, here: _Point, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Residuals of the windows (K, n) and their Jacobians in states (K, n, 2 nv) and unknowns (K, n, P)."""
-        motions = here.motions
-        parts = (motions.q - self.q)[..., None], motions.in_start, motions.in_parameters
+        motions, r = here.motions, self.residual(here.motions)
+        in_start, in_parameters = motions.in_start, motions.in_parameters
+        if not self.space.is_vector_space and in_start is not None and in_parameters is not None:
+            # steps from the motions change those from the recording, and steps of the start those from its motion
+            turned, start = self._chart(r), in_start.clone()
+            nv = r.shape[-1]
+            start[..., :nv] @= torch.linalg.inv(self._chart(here.states[:, :nv]))[:, None]
+            in_start, in_parameters = turned @ start, turned @ in_parameters
+        parts = r[..., None], in_start, in_parameters
         r, A, B = ((part / noise[:, None]).flatten(1, 2) for part in parts if part is not None)
         return r[..., 0], A, B
+
+    def _chart(self, step: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv nv"]:
+        """Derivative of a step in one more step from its end."""
+        axes = torch.eye(step.shape[-1], dtype=step.dtype).expand(*step.shape, -1)
+        return self.space.chart_velocity(step[..., None, :].expand_as(axes), axes).mT
 
     def curvature(
         self, here: _Point, noise: Tensor, sigma: Tensor, damping: float = 0.0
@@ -194,7 +221,7 @@ class MotionFit:
             damping = max(0.2 * damping, 1e-9) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
             if gain > 0.0:
                 here = there
-                report(float((self.q - here.motions.q).square().mean().sqrt()))
+                report(float(self.residual(here.motions).square().mean().sqrt()))
         return here, damping
 
     def solved(self, report: Callable[[float], None], x: Tensor) -> tuple["MotionFit", _Point, Tensor, Tensor]:
@@ -202,7 +229,7 @@ class MotionFit:
 
         Raises NumericalError where no motion is found near the recorded one.
         """
-        one = torch.ones(self.q.shape[-1], dtype=x.dtype)
+        one = torch.ones(self.space.nv, dtype=x.dtype)
         here, damping = self.at(x, self.start, one, one, None), 1e-3
         if not math.isfinite(here.cost):
             raise NumericalError(
@@ -231,7 +258,7 @@ class MotionFit:
 
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
         """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
-        residual = motions.q - self.q
+        residual = self.residual(motions)
         sigma = residual.square().mean((0, 1)).sqrt().clamp_min(1e-12)
         window = np.repeat(np.arange(len(residual)), residual.shape[1])
         time = torch.as_tensor(correlation_time((residual / sigma).flatten(0, 1).numpy(), window))
@@ -250,7 +277,7 @@ def _refine(
     posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None
 ) -> Structured:
     require_type("dataset", dataset, Dataset)
-    posterior.model.system.robot.require_vectors("refinements on motions")
+    require_unobserved(posterior, "refinements on motions")
     if isinstance(seconds, bool) or not (isinstance(seconds, int | float) and 0.0 < seconds < math.inf):
         raise InvalidInput(f"seconds is {seconds!r}; give the length of the windows as a positive number, such as 1.0.")
     if posterior.model.mean != "analytical":
@@ -263,8 +290,11 @@ def _refine(
             "the model learned physical parameters with its accelerations; fit a model of the identified system "
             "(forcegp fit --identified RUN), and refine that one."
         )
-    recorded, stride = all_motions(dataset, seconds, STEP)
-    unknowns = Unknowns.of(posterior, dataset, inertias)
+    seen = in_own_air(posterior, dataset)
+    if seen is not dataset:
+        posterior = posterior.with_system(seen.system)
+    recorded, stride = all_motions(seen, seconds, STEP)
+    unknowns = Unknowns.of(posterior, seen, inertias)
     done = 0
 
     def say(rms: float) -> None:
@@ -274,7 +304,8 @@ def _refine(
             report(done, rms)
 
     fit = MotionFit(recorded, stride, unknowns)
-    return _refined(*fit.solved(say, unknowns.first), seconds)
+    found = _refined(*fit.solved(say, unknowns.first), seconds)
+    return found if seen is dataset else replace(found, target=unobserved(found.system))
 
 
 def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float) -> Structured:

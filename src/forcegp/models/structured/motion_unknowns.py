@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
-from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.analytical.identifiability import body_pseudo_inertias, carrying
 from forcegp.analytical.identification import joint_terms
 from forcegp.analytical.joint_terms import INERTIAS, LAWS
 from forcegp.data import Dataset
@@ -145,19 +145,26 @@ class Unknowns:
         """The mean acceleration and its derivatives, in x as well."""
         posterior, (in_terms, in_bodies, _) = self.posterior(x), self.split(x)
         mean, nv = posterior.accelerations(None).mean(), posterior.system.robot.nv
+        space, own = posterior.system.robot.space, carrying(posterior.system.robot)
         prior, standardize = posterior.model.prior, posterior.likelihood.standardization
 
         def at(q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
-            a, slopes = rows_jacobian(lambda state: mean(*state.split(nv, dim=-1), u), torch.cat([q, v], dim=-1))
+            def moved(z: Tensor) -> Tensor:
+                step, speed = z.split(nv, dim=-1)
+                return mean(step if space.is_vector_space else space.integrate(q, step), speed, u)
+
+            origin = q if space.is_vector_space else torch.zeros_like(v)
+            a, slopes = rows_jacobian(moved, torch.cat([origin, v], dim=-1))
             a_q, a_v = slopes.split(nv, dim=-1)
             if not parameters:
                 return Linear(a, a_q, a_v)
             with torch.no_grad():
                 dynamics = posterior.dynamics(q, v, u)
-                _, added = self.terms.torque(in_terms, v.numpy(), a.numpy(), u.abs().numpy())
+                load = dynamics.state.delivered.abs().numpy()
+                _, added = self.terms.torque(in_terms, v.numpy(), a.numpy(), load)
                 columns = [-torch.as_tensor(added)]
                 if self.bodies is not None:
-                    Y = dynamics.state.kinematics.torque_regressor(a)
+                    Y = dynamics.state.kinematics.torque_regressor(a)[:, :, own]
                     of_bodies = torch.einsum("nibp,bpk->nibk", Y, torch.as_tensor(self.bodies.derivatives(in_bodies)))
                     columns.append(-of_bodies.flatten(2))
                 if self.space.count:
@@ -166,7 +173,7 @@ class Unknowns:
                     columns += [mixing[..., c : c + 1] * f.mT[:, None] for c, f in enumerate(phi)]
                 return Linear(a, a_q, a_v, dynamics.H @ torch.cat(columns, dim=-1))
 
-        return Accelerations(mean, at)
+        return Accelerations(mean, at, space)
 
 
 def _space(posterior: Structured) -> WeightSpace:

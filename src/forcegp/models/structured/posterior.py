@@ -315,7 +315,9 @@ class StructuredPosterior(Posterior):
     @override
     def motion_intervals(self) -> MotionIntervals | None:
         stored = self.settings.get("motion_intervals")
-        return None if stored is None else MotionIntervals.from_dict(stored)
+        found = None if stored is None else MotionIntervals.from_dict(stored)
+        # widths of motions that an observer's columns were part of are not those of motions without
+        return None if found is None or found.inputs not in ((), self.system.inputs) else found
 
     @override
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
