@@ -100,5 +100,7 @@ def test_windows_without_an_end_are_reported(given):
         a, slope = rows_jacobian(lambda v: away(q, v, u), v)
         return Linear(a, torch.zeros_like(slope), slope)
 
-    found = window_motions(Accelerations(away, linear, system.robot.space), q0, v0.abs(), u, H, guess, derivatives=False)
+    found = window_motions(
+        Accelerations(away, linear, system.robot.space), q0, v0.abs(), u, H, guess, derivatives=False
+    )
     assert not bool(found.found.any())

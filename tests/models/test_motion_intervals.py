@@ -127,7 +127,9 @@ def test_where_the_base_moves_samples_spread_as_steps(floating):
     samples = replace(plain, q=robot.integrate(plain.q, steps))
     drawn = replace(plain, samples=samples)
     torch.testing.assert_close(drawn.std(), steps.std(0))
-    torch.testing.assert_close(torch.stack(drawn.interval()), steps.quantile(torch.tensor([0.025, 0.975]).double(), dim=0))
+    torch.testing.assert_close(
+        torch.stack(drawn.interval()), steps.quantile(torch.tensor([0.025, 0.975]).double(), dim=0)
+    )
     low, high = replace(drawn, intervals=widths).interval()
     torch.testing.assert_close(high, DEVIATIONS * steps.std(0))
     torch.testing.assert_close(low, -high)

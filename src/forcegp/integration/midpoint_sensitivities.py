@@ -88,7 +88,8 @@ def window_motions(
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
-    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
+    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that
+    `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
@@ -176,7 +177,10 @@ def _along(
 
     def moved(z: Tensor) -> Tensor:
         at, step = space.integrate(start, z[..., :nv]), space.midpoint_step(h * (w + z[..., nv:]))
-        ends = space.difference(middle, space.integrate(at, 0.5 * step)), space.difference(end, space.integrate(at, step))
+        ends = (
+            space.difference(middle, space.integrate(at, 0.5 * step)),
+            space.difference(end, space.integrate(at, step)),
+        )
         return torch.cat(ends, dim=-1)
 
     def accelerated(z: Tensor) -> Tensor:
