@@ -88,7 +88,8 @@ def window_motions(
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
-    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
+    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that
+    `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
@@ -188,7 +189,7 @@ def _along(
 
     _, slopes = _jacobian(moved, w.new_zeros(*w.shape[:2], 2 * nv), 2 * nv)
     half, whole = slopes.split(nv, dim=-2)
-    both = _at(accelerations, *(torch.cat(x) for x in ((middle, middle), (w, torch.zeros_like(w)), (u, u))), parameters)
+    both = _at(accelerations, torch.cat([middle] * 2), torch.cat([w, 0.0 * w]), torch.cat([u] * 2), parameters)
     parts = ([None] * 2 if x is None else x.chunk(2) for x in (both.a, both.a_q, both.a_v, both.a_p))
     fast, still = (Linear(*each) for each in zip(*parts, strict=True))
     a, slopes = _jacobian(accelerated, torch.cat([w, fast.a, still.a], dim=-1), nv)
@@ -197,7 +198,7 @@ def _along(
     a_q, a_w = (at_middle @ part for part in half.split(nv, dim=-1))
     a_p = None if fast.a_p is None or still.a_p is None else of_fast @ fast.a_p + of_still @ still.a_p
     at = Linear(a, a_q, a_w + of_w + of_fast @ fast.a_v, a_p)
-    return q, middle, at, *whole.split(nv, dim=-1)
+    return q, middle, at, whole[..., :nv], whole[..., nv:]
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], x: Tensor, size: int) -> tuple[Tensor, Tensor]:

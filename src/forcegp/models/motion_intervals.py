@@ -58,5 +58,5 @@ class MotionIntervals:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        arrays = (np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors"))
-        return cls(*arrays, tuple(stored.get("inputs", ())))
+        arrays = {name: np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors")}
+        return cls(**arrays, inputs=tuple(stored.get("inputs", ())))

@@ -37,6 +37,8 @@ class MotionModel(ABC):
         inertias: also those of the bodies, near the ones that the system has.
         report: called as report(step, rms of q in rad or m).
 
+        Where a base moves, errors of positions are steps in its axes. Observed wind counts as known.
+
         The result predicts for the refined system, `posterior.system`: friction and rotors that it lists are refined.
         Its `settings["motions"]` hold what was found, with standard errors, and what the motions did not tell.
         Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
@@ -58,6 +60,7 @@ class MotionModel(ABC):
 
         For each of four stretches the model is made again from the other rows at the same hyper-parameters (refined on
         their motions if it was), and predicts motions in the stretch. `rollout(...).interval()` then uses the widths.
+        Of a model that observes wind, those are of what `observing` gives for this model and a recording.
 
         Parameters
         ----------

@@ -67,7 +67,7 @@ def observing(
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
     posterior = posterior.with_system(system)
     if widths is not None:
-        posterior = replace(posterior, settings={**posterior.settings, "motion_intervals": widths})
+        posterior = posterior.with_settings(motion_intervals=widths)
     return posterior, seen if whole else seen.rows(_with_past(dataset, seconds))
 
 

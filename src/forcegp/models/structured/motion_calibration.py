@@ -51,9 +51,10 @@ def calibrate_motions(
         at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
         inputs, sampled = other.system.inputs, rollout.samples is not None
         true_q, true_v = (torch.tensor(x[:, at], device=rollout.q.device) for x in (motions.q, motions.v))
-        away = {"q": rollout.space.difference(rollout.q[:, at], true_q), "v": true_v - rollout.v[:, at]}
-        error = [each.abs().cpu().numpy() for each in away.values()]
-        spread = [rollout.std(name)[:, at].cpu().numpy() if sampled else np.zeros_like(error[0]) for name in away]
+        away = rollout.space.difference(rollout.q[:, at], true_q), true_v - rollout.v[:, at]
+        error = [each.abs().cpu().numpy() for each in away]
+        stds = (rollout.std("q"), rollout.std("v")) if sampled else ()
+        spread = [std[:, at].cpu().numpy() for std in stds] or [np.zeros_like(each) for each in error]
         errors.append(np.stack(error, axis=2))
         spreads.append(np.stack(spread, axis=2))
     error, spread = np.concatenate(errors), np.concatenate(spreads)  # (motions, H, 2, nv)
