@@ -58,6 +58,16 @@ def test_preparations_take_it_and_report_why():
     assert "held-out" not in alone["why"]["cutoff"]
 
 
+def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
+    """Where no torque acts, every cut-off explains all of it."""
+    rows = raw(3, 1e-4)
+    still = replace(rows, u=0.0 * rows.u)
+    passive, alone = (Preparation(cutoff="auto").apply(x).report for x in (still, replace(still, system=None)))
+    assert passive["cutoff"] == alone["cutoff"]
+    with pytest.raises(DatasetError, match="no torque acts"):
+        held_out_cutoff(still, ROBOT, 6.0)
+
+
 def test_short_logs_are_refused():
     with pytest.raises(DatasetError, match="too few to choose a cut-off"):
         held_out_cutoff(raw(1, 1e-4).rows(slice(0, 300)), ROBOT, 6.0)

@@ -39,7 +39,7 @@ def held_out_cutoff(
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
     Shares are geometric means over the joints, in time that was held out and below the lowest cut-off. `source` and
-    `order` are those of `Preparation`. Raises DatasetError for logs too short for that.
+    `order` are those of `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
     """
     best, shares = _judged(dataset, robot, cutoff, source, order)
     if best in (min(shares), max(shares)):  # the best may lie beyond
@@ -58,6 +58,8 @@ def _judged(
     tried = [cutoff * factor for factor in FACTORS if cutoff * factor < 0.4 / step]
     if len(log) < 5 * FOLDS * columns // robot.nv or len(tried) < 2:
         raise DatasetError(f"{len(log)} rows are too few to choose a cut-off by prediction.")
+    if not log.u.any():
+        raise DatasetError("no torque acts, so none shows a cut-off.")
     signals: tuple[Signal, ...] = ("q", "u") if source == "q" else ("q", "v", "u")
 
     def behind(frequency: float) -> Dataset:
