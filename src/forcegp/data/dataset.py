@@ -66,9 +66,9 @@ class Dataset(Summary):
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
     __no_type_check__: ClassVar[bool] = True
 
-    q: Float[np.ndarray, "rows nv"]
+    q: Float[np.ndarray, "rows nq"]
     v: Float[np.ndarray, "rows nv"]
-    u: Float[np.ndarray, "rows nv"]
+    u: Float[np.ndarray, "rows nu"]
     a: Float[np.ndarray, "rows nv"]
     time: Float[np.ndarray, " rows"]
     joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
