@@ -392,6 +392,7 @@ class MechanicalSystem(Summary):
 
 
 def _stored_contact(entry: Mapping[str, Any]) -> Contact:
+    entry = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
     place, switch = (entry["frame"], tuple(entry["point"])), entry.get("switch")
     surface = object_from_dict("surface", SURFACES, entry["surface"])
     for kind, names in ((LoopClosure, SECOND), (RollingContact, WHEEL)):

@@ -213,9 +213,9 @@ def derivatives_of(
     return [*found, *gradient.view(*call.own, len(parameters), 10).unbind(-2)]
 
 
-def _split(call: _Call, tensors: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+def _split(call: _Call, each: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
     count = len(ARGUMENTS[call.function])
-    return tensors[:count], tensors[count:]
+    return each[:count], each[count:]
 
 
 def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> list[Tensor]:
