@@ -78,9 +78,7 @@ class CompiledRobot:
         """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
         return self._evaluate("mass_matrix", inertials, q=q)[0]
 
-    def bias_forces(
-        self, q: Positions, v: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.bias_forces <forcegp.robots.Robot.bias_forces>`."""
         return self._evaluate("bias_forces", inertials, q=q, v=v)[0]
 

@@ -402,9 +402,7 @@ class Robot(RobotStructure):
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         return self.kinematics(q).mass_matrix(inertials)
 
-    def bias_forces(
-        self, q: Positions, v: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
         return self.kinematics(q, v).bias_forces(inertials)
 

@@ -253,9 +253,7 @@ class UnrolledKinematics:
             A.append(np.column_stack([_turning(wi, dwi), acceleration]))
         return A
 
-    def _joint_forces(
-        self, v: _Values | None, a: _Values | None, inertias: Sequence[Scalars] | None
-    ) -> Scalars:
+    def _joint_forces(self, v: _Values | None, a: _Values | None, inertias: Sequence[Scalars] | None) -> Scalars:
         assert v is not None, "forces that depend on velocities need some"
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
         forces, moments = ([scalars([0.0] * 3) for _ in range(n)] for _ in range(2))
