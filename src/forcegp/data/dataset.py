@@ -132,8 +132,8 @@ class Dataset(Summary):
     @overload
     def __getitem__(self, index: str) -> np.ndarray: ...
     @overload
-    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Dataset: ...
-    def __getitem__(self, index: str | int | slice | Sequence[int] | np.ndarray) -> np.ndarray | Dataset:
+    def __getitem__(self, index: int | np.integer | slice | Sequence[int] | np.ndarray) -> Dataset: ...
+    def __getitem__(self, index: str | int | np.integer | slice | Sequence[int] | np.ndarray) -> np.ndarray | Dataset:
         """`dataset["q"]` is a column, `dataset[10:20]`, `dataset[mask]`, `dataset[[3, 1]]`, `dataset[5]` are `rows`.
 
         Raises InvalidInput for a column or row that is not there.

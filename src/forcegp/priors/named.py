@@ -166,7 +166,13 @@ def _value(name: str, key: str, text: str, default: Any) -> Any:
             return tuple(number(part) for part in text.split("/"))
     except ValueError:
         example = "/".join(map(str, several))
-        kind = f"{'whole ' * (number is int)}numbers as in {example}" if numbers else "a whole number" if isinstance(default, int) else "a number"
+        kind = (
+            f"{'whole ' * (number is int)}numbers as in {example}"
+            if numbers
+            else "a whole number"
+            if isinstance(default, int)
+            else "a number"
+        )
         raise InvalidInput(f"prior {name!r} has {key}={text}; give {kind}") from None
     if isinstance(default, tuple) or key == "joints":
         return tuple(part.strip() for part in text.split("/"))

@@ -312,7 +312,7 @@ def difference(kind: str, start: Float[Tensor, "*batch positions"], end: Float[T
 
 
 def chart_velocity(
-    kind: str, step: Float[Tensor, "*batch velocities"], v: Float[Tensor, "*batch velocities"]
+    kind: str, step: Float[Tensor, "*#batch velocities"], v: Float[Tensor, "*#batch velocities"]
 ) -> Tensor:
     """d step / dt where `q0 integrated by step` moves with body velocity v: ad / (1 - exp(-ad)) v.
 
