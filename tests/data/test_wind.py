@@ -105,7 +105,7 @@ def test_nothing_is_found_where_rows_do_not_show_it(case, seed):
     if case == "out of order":
         dataset = dataset.rows(np.random.default_rng(0).permutation(len(dataset)))
     if case == "contact":
-        dataset = replace(dataset, system=dataset.system.with_contacts(fixed_point("body", (0, 0, 0))))
+        dataset = replace(dataset, system=dataset.system.with_contacts(fixed_point("body", (0.0, 0.0, 0.0))))
     assert find_wind(dataset) is None
 
 

@@ -21,6 +21,7 @@ from forcegp.inference.one_input_functions import (
     value_and_slope,
 )
 from forcegp.inference.pathwise import draw_functions
+from forcegp.inference.posterior import LatentPosterior
 from forcegp.priors.kernels import kernel_of
 
 EXACT = [
@@ -57,6 +58,7 @@ EACH(exp) EACH(tanh) EACH(asinh) EACH(sqrt)
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 
 
+@LatentPosterior.register
 @dataclass
 class Latents:
     """What the forms need of a posterior, with weights of our choice."""

@@ -11,7 +11,9 @@ def test_feet_that_stand_resist_their_own_sliding_and_no_other():
     held = simulate_quadruped(QuadrupedConfig(seconds=0.1)).system
     robot: Robot = held.robot
     feet = ("front_left", "rear_right")
-    contacts = tuple(Contact(f"{leg}_foot", (0.0, 0.0, 0.0), Plane((0, 0, 1), 0.0), f"{leg}_stands") for leg in feet)
+    contacts = tuple(
+        Contact(f"{leg}_foot", (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.0), f"{leg}_stands") for leg in feet
+    )
     system = MechanicalSystem(robot, contacts, held.known_forces)
     generator = torch.Generator().manual_seed(0)
     q = robot.random(generator, 3)

@@ -83,6 +83,7 @@ MISTAKES = {
     "joint-ripple:period=nan": "PeriodicJointForces period is nan; give a positive number",
     "tool-friction:point=0/0": "a point of three numbers",
     "tool-friction:point=0/0/x": r"prior 'tool-friction' has point=0/0/x; give numbers as in 0.0/0.0/0.0",
+    "foot-friction:contacts=0.5/1": r"prior 'foot-friction' has contacts=0.5/1; give whole numbers as in 0/1/2/3",
     "tool-friction:axes=sideways": "give axes 'world' or 'tool' or 'surface'",
     "joint:inputs=q/torque": "give one or more of 'q', 'v', 'u', each once",
     "joint:angles=cos": "give 'plain' or 'sin-cos'",

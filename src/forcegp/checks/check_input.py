@@ -143,7 +143,7 @@ class CheckInput:
         """Whether a joint turns; others slide."""
         return _angular(self.log)
 
-    def named(self, joints: Iterable[int]) -> tuple[str, ...]:
+    def named(self, joints: Iterable[int] | np.ndarray) -> tuple[str, ...]:
         """The names of the joints with these numbers."""
         return tuple(self.names[joint] for joint in joints)
 

@@ -47,6 +47,7 @@ LONGEST, INSIDE = 120.0, 0.95  # s, for the memory of all samples; of the positi
 STATES, MOST_ROWS = 150, 150  # where the spread is computed; those learned so far that take part in the search
 DRY = 0.05  # velocity in rad/s (m/s) within which the dry friction of a robot without learned forces turns
 Values = Float[np.ndarray, "n nv"]
+AtTimes = Float[np.ndarray, "*times nv"]
 
 
 class Motion(NamedTuple):
@@ -169,7 +170,7 @@ class Excitation(Summary):
         teaches = {"spread": rounded(spread), "condition": self.condition}
         return {name: f"{x.max():.0%} of limit" for name, x in self.usage.items()} | teaches
 
-    def trajectory(self, t: Any) -> tuple[Values, Values, Values]:
+    def trajectory(self, t: Any) -> tuple[AtTimes, AtTimes, AtTimes]:
         """q, v and a (n, nv) at times t (n,) in s, or (nv,) at one; at rest before and after."""
         q, v, a = (spline(np.clip(t, 0.0, self.seconds)) @ self.motion.points for spline in self.basis)
         return self.start + q, v, a

@@ -59,7 +59,9 @@ def following(
     return turn, (np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1))
 
 
-def through(space: ConfigurationSpace, q: Positions, change: Callable[[np.ndarray], np.ndarray]) -> Positions:
+def through(
+    space: ConfigurationSpace, q: Positions, change: Callable[[np.ndarray], np.ndarray]
+) -> Float[np.ndarray, "_ nq"]:
     """Positions behind a linear filter or interpolation `change` (rows, nq) -> (any rows, nq).
 
     Raises DatasetError for turns faster than the filter passes.

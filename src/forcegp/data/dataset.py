@@ -66,9 +66,9 @@ class Dataset(Summary):
     # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
     __no_type_check__: ClassVar[bool] = True
 
-    q: Float[np.ndarray, "rows nv"]
+    q: Float[np.ndarray, "rows nq"]
     v: Float[np.ndarray, "rows nv"]
-    u: Float[np.ndarray, "rows nv"]
+    u: Float[np.ndarray, "rows nu"]
     a: Float[np.ndarray, "rows nv"]
     time: Float[np.ndarray, " rows"]
     joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
@@ -132,8 +132,8 @@ class Dataset(Summary):
     @overload
     def __getitem__(self, index: str) -> np.ndarray: ...
     @overload
-    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Dataset: ...
-    def __getitem__(self, index: str | int | slice | Sequence[int] | np.ndarray) -> np.ndarray | Dataset:
+    def __getitem__(self, index: int | np.integer | slice | Sequence[int] | np.ndarray) -> Dataset: ...
+    def __getitem__(self, index: str | int | np.integer | slice | Sequence[int] | np.ndarray) -> np.ndarray | Dataset:
         """`dataset["q"]` is a column, `dataset[10:20]`, `dataset[mask]`, `dataset[[3, 1]]`, `dataset[5]` are `rows`.
 
         Raises InvalidInput for a column or row that is not there.

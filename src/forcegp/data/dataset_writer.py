@@ -98,7 +98,16 @@ class DatasetWriter:
             raise error
         return self._stack.__exit__(kind, error, trace)
 
-    def append(self, *, q: Rows, v: Rows, u: Rows, a: Rows, time: Float[np.ndarray, " rows"], episode: int) -> None:
+    def append(
+        self,
+        *,
+        q: Float[np.ndarray, "rows nq"],
+        v: Rows,
+        u: Float[np.ndarray, "rows nu"],
+        a: Rows,
+        time: Float[np.ndarray, " rows"],
+        episode: int,
+    ) -> None:
         """Add rows of one episode after those that are there. Raises DatasetError as a Dataset does."""
         given = {"q": q, "v": v, "u": u, "a": a}
         block = {name: finite_columns(name, values, self.columns[name], len(q)) for name, values in given.items()}

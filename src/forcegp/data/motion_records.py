@@ -22,9 +22,9 @@ class RecordedMotions:
 
     rows: tuple[int, ...]
     dt: float
-    q: Float[np.ndarray, "motions rows nv"]
+    q: Float[np.ndarray, "motions rows nq"]
     v: Float[np.ndarray, "motions rows nv"]
-    u: Float[np.ndarray, "motions steps nv"]
+    u: Float[np.ndarray, "motions steps nu"]
 
     @property
     def time(self) -> Float[np.ndarray, " rows"]:

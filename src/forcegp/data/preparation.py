@@ -229,9 +229,9 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     return shifted(dataset, shifts, lags)
 
 
-def seconds_of(given: float | tuple[float, ...] | str) -> tuple[float, ...]:
+def seconds_of(given: float | tuple[float, ...] | str) -> tuple[Any, ...]:
     """Numbers of a delay or lag, one or one per joint; of text, itself."""
-    return given if isinstance(given, tuple) else (given,)  # type: ignore[return-value]  # text is refused before
+    return given if isinstance(given, tuple) else (given,)
 
 
 def _per_actuator(given: float | tuple[float, ...] | str, dataset: Dataset) -> list[float]:

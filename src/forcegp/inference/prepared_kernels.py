@@ -155,7 +155,7 @@ class SharedCenters:
         variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])
         return cls(latents, centers, centers.mean(0), precisions, variances)
 
-    def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, "1 G"]:
+    def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, " G"]:
         """k_c(z, z_j) - s_c from the features themselves: with long length scales k is nearly s, and sums cancel."""
         z, center = z - self.shift, center - self.shift  # or what cancels would be large
         scaled = z * self.precisions

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -88,7 +89,7 @@ class Actuation(KnownForce):
     Couplings and differentials are columns with several entries, without unit or in rad/rad.
     """
 
-    matrix: Sequence[Sequence[float]] | Tensor | None = None
+    matrix: Sequence[Sequence[float]] | np.ndarray | Tensor | None = None
     names: tuple[str, ...] = ()
 
     @override

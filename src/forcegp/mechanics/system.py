@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -26,7 +26,7 @@ from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_di
 from forcegp.mechanics.thrusters import OBSERVED, Thrusters
 from forcegp.mechanics.wheels import WHEEL, RollingContact
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import Inertials, JointValues
+from forcegp.robots.arguments import Inertials, JointValues, Positions
 from forcegp.robots.mjcf import is_mjcf
 from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.urdf_file import read_text
@@ -47,6 +47,9 @@ class MechanicalSystem(Summary):
     URDF enter only where listed, for example `ViscousJointFriction.from_robot(robot)`.
     Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
     """
+
+    # This constructor takes other sequences, too, and is the check, with messages for people.
+    __no_type_check__: ClassVar[bool] = True
 
     robot: Robot
     contacts: tuple[Contact, ...] = ()
@@ -202,7 +205,7 @@ class MechanicalSystem(Summary):
         return sum(pushing, self.actuation.force(state))
 
     def dynamics(
-        self, q: JointValues, v: JointValues, u: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, u: Float[Tensor, "*#batch nu"], inertials: Inertials | None = None
     ) -> ConstrainedDynamics:
         """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
 
@@ -241,7 +244,7 @@ class MechanicalSystem(Summary):
         )
         return torch.stack(rows, dim=-2), torch.stack(right, dim=-1), torch.stack(normals, dim=-2)
 
-    def check_states(self, q: Float[Tensor, "N nv"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nv"]) -> None:
+    def check_states(self, q: Float[Tensor, "N nq"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nu"]) -> None:
         """Raise ContactError, naming row and contact, where contacts cannot constrain or contradict each other."""
         A, b, _ = self.constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
@@ -389,6 +392,7 @@ class MechanicalSystem(Summary):
 
 
 def _stored_contact(entry: Mapping[str, Any]) -> Contact:
+    entry = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
     place, switch = (entry["frame"], tuple(entry["point"])), entry.get("switch")
     surface = object_from_dict("surface", SURFACES, entry["surface"])
     for kind, names in ((LoopClosure, SECOND), (RollingContact, WHEEL)):

@@ -14,6 +14,10 @@ from forcegp.summary import Summary, listed
 
 Rows = Float[Tensor, "rows nv"]
 """One number per state and joint."""
+Positions = Float[Tensor, "rows nq"]
+"""One state per row; more numbers than joints where some have a quaternion, or cos and sin."""
+Inputs = Float[Tensor, "rows nu"]
+"""One number per state and input of the system."""
 AnyGaussian = TypeVar("AnyGaussian", bound="Gaussian")  # beartype cannot check Self where a module is hooked
 
 

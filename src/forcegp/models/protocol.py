@@ -18,7 +18,7 @@ from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.motion_models import MotionModel
-from forcegp.models.prediction import Prediction, Rows, join_predictions
+from forcegp.models.prediction import Inputs, Positions, Prediction, Rows, join_predictions
 from forcegp.models.predictor import Predictor
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel, Rollout, roll_out
 from forcegp.models.search import FitProgress
@@ -80,7 +80,7 @@ class Posterior(MotionModel, Summary, ABC):
         """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
 
     @abstractmethod
-    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
+    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
         """`predict` for one block of checked states."""
 
     @override
@@ -114,7 +114,7 @@ class Posterior(MotionModel, Summary, ABC):
         return False
 
     def dynamics(
-        self, q: Float[Tensor, "*batch nv"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nv"]
+        self, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nu"]
     ) -> ConstrainedDynamics:
         """The constrained dynamics of these states, with the model's inertial parameters."""
         return self.system.dynamics(q, v, u)
@@ -181,7 +181,7 @@ class Posterior(MotionModel, Summary, ABC):
             "process."
         )
 
-    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Rows], torch.Size]:
+    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
         """States as rows of float64 tensors on the model's device, and their batch dimensions.
 
         Raises InvalidInput for wrong shapes or values that are not finite.

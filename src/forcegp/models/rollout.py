@@ -74,7 +74,7 @@ class Rollout:
     """
 
     time: Float[Tensor, " rows"]
-    q: Float[Tensor, "*batch rows nv"]
+    q: Float[Tensor, "*batch rows nq"]
     v: Float[Tensor, "*batch rows nv"]
     a: Float[Tensor, "*batch steps nv"]
     constraint: Float[Tensor, "*batch rows m"]

@@ -34,9 +34,9 @@ class TrainingData:
     many rows count as one: the covariance of each in the likelihood is so many times that of its noise.
     """
 
-    q: Float[Tensor, "N nv"]
+    q: Float[Tensor, "N nq"]
     v: Float[Tensor, "N nv"]
-    u: Float[Tensor, "N nv"]
+    u: Float[Tensor, "N nu"]
     a: Float[Tensor, "N nv"]
     noise_std: Float[Tensor, "N nv"] | None = None
     reference: "TrainingData | None" = None

@@ -353,5 +353,5 @@ def foot_friction(contacts: tuple[int, ...] = (0, 1, 2, 3)) -> ForcePrior:
     switch is 0 there is neither normal force nor friction. Points that are held (`fixed_point`) do not slide.
     Raises InvalidInput for no contact.
     """
-    feet = tuple(ContactFriction(contact=int(contact), load=True) for contact in contacts)
+    feet = tuple(ContactFriction(contact=contact, load=True) for contact in contacts)
     return feet[0] if len(feet) == 1 else SumPrior(feet)

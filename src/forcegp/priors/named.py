@@ -158,14 +158,21 @@ def _value(name: str, key: str, text: str, default: Any) -> Any:
         return text == "true"
     several = default if isinstance(default, tuple) else ()
     numbers = bool(several) and all(isinstance(entry, int | float) for entry in several)
+    number = int if all(isinstance(entry, int) for entry in several) else float
     try:
         if isinstance(default, int | float):
             return type(default)(text)
         if numbers:
-            return tuple(float(part) for part in text.split("/"))
+            return tuple(number(part) for part in text.split("/"))
     except ValueError:
         example = "/".join(map(str, several))
-        kind = f"numbers as in {example}" if numbers else "a whole number" if isinstance(default, int) else "a number"
+        kind = (
+            f"{'whole ' * (number is int)}numbers as in {example}"
+            if numbers
+            else "a whole number"
+            if isinstance(default, int)
+            else "a number"
+        )
         raise InvalidInput(f"prior {name!r} has {key}={text}; give {kind}") from None
     if isinstance(default, tuple) or key == "joints":
         return tuple(part.strip() for part in text.split("/"))

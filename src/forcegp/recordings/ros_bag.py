@@ -169,13 +169,13 @@ def _require_plausible_chunks(path: Path, reader: Any) -> None:
                 require_plausible_size(path, "a chunk", chunk.uncompressed_size, chunk.compressed_size)
 
 
-def numbers(message: Any, fields: Collection[str] | None = None) -> dict[str, float]:
+def numbers(message: Any, fields: Collection[str] | None = None) -> dict[str, int | float]:
     """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, joints of a JointState by name.
 
     Texts and vectors of more than `LONGEST_VECTOR` numbers are left out; with `fields`, all but these fields of the
     message. Raises FileFormatError for a JointState whose names and values differ in number.
     """
-    found: dict[str, float] = {}
+    found: dict[str, int | float] = {}
     for name, value in vars(message).items():
         if fields is not None and name not in fields:
             continue
@@ -190,7 +190,7 @@ def numbers(message: Any, fields: Collection[str] | None = None) -> dict[str, fl
     return found
 
 
-def _collect(value: Any, path: str, found: dict[str, float]) -> None:
+def _collect(value: Any, path: str, found: dict[str, int | float]) -> None:
     if isinstance(value, NUMBER):
         found[path] = value
     elif isinstance(value, ARRAY):

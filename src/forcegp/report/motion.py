@@ -72,14 +72,14 @@ class Arrows:
 class RecordedScene:
     """Rows of a recording, ready to be drawn.
 
-    `time` (rows,) in s from the first; `q` (rows, nv); `poses` (rows, links, 4, 4) of `shapes` in the world; `arrows`;
+    `time` (rows,) in s from the first; `q` (rows, nq); `poses` (rows, links, 4, 4) of `shapes` in the world; `arrows`;
     `paths` (contacts, rows, 3) of the contact points in m; `size` the reach of the robot in m; `doubts` what could not
     be drawn.
     """
 
     robot: Robot
     time: Float[np.ndarray, " rows"]
-    q: Float[np.ndarray, "rows nv"]
+    q: Float[np.ndarray, "rows nq"]
     shapes: list[LinkShape]
     poses: Float[np.ndarray, "rows links 4 4"]
     arrows: list[Arrows]

@@ -105,6 +105,8 @@ Vector = Sequence[float | int] | np.ndarray | Tensor
 Inertials = Mapping[str, Tensor]
 JointValues = Float[Tensor, "*#batch nv"]
 """One value per joint, float64 (..., nv); the batch dimensions of several arguments broadcast."""
+Positions = Float[Tensor, "*#batch nq"]
+"""Positions, float64 (..., nq): more than joints where some have a quaternion, or cos and sin."""
 
 
 def checked_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> Tensor:

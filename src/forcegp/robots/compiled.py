@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.arguments import Inertials, JointValues, broadcast_batch
+from forcegp.robots.arguments import Inertials, JointValues, Positions, broadcast_batch
 from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request, compiled_program
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.structure import RobotStructure
@@ -74,35 +74,33 @@ class CompiledRobot:
                 self.program(Request(name, inertials, keeps=True))
         return self
 
-    def mass_matrix(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
         return self._evaluate("mass_matrix", inertials, q=q)[0]
 
-    def bias_forces(
-        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.bias_forces <forcegp.robots.Robot.bias_forces>`."""
         return self._evaluate("bias_forces", inertials, q=q, v=v)[0]
 
     def mass_matrix_and_bias(
-        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, inertials: Inertials | None = None
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """As :meth:`Robot.mass_matrix_and_bias <forcegp.robots.Robot.mass_matrix_and_bias>`."""
         mass, bias = self._evaluate("mass_matrix_and_bias", inertials, q=q, v=v)
         return mass, bias
 
-    def gravity_forces(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.gravity_forces <forcegp.robots.Robot.gravity_forces>`."""
         return self._evaluate("gravity_forces", inertials, q=q)[0]
 
     def inverse_dynamics(
-        self, q: JointValues, v: JointValues, a: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, a: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.inverse_dynamics <forcegp.robots.Robot.inverse_dynamics>`."""
         return self._evaluate("inverse_dynamics", inertials, q=q, v=v, a=a)[0]
 
     def forward_dynamics(
-        self, q: JointValues, v: JointValues, tau: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, tau: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
         return self._evaluate("forward_dynamics", inertials, q=q, v=v, tau=tau)[0]
@@ -213,9 +211,9 @@ def derivatives_of(
     return [*found, *gradient.view(*call.own, len(parameters), 10).unbind(-2)]
 
 
-def _split(call: _Call, tensors: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+def _split(call: _Call, each: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
     count = len(ARGUMENTS[call.function])
-    return tensors[:count], tensors[count:]
+    return each[:count], each[count:]
 
 
 def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> list[Tensor]:

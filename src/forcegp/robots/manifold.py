@@ -278,7 +278,7 @@ def integrated(kind: str, q: Float[Tensor, "*batch positions"], step: Float[Tens
     return torch.cat([origin, turned], -1) if kind == "floating" else turned
 
 
-def velocity_of(kind: str, q: Float[Tensor, "*batch positions"], v: Float[Tensor, "*batch velocities"]) -> Tensor:
+def velocity_of(kind: str, q: Float[Tensor, "*#batch positions"], v: Float[Tensor, "*#batch velocities"]) -> Tensor:
     """dq/dt under the body velocity v."""
     motion = MOTIONS[kind]
     linear, angular = _parts(motion, v)
@@ -312,7 +312,7 @@ def difference(kind: str, start: Float[Tensor, "*batch positions"], end: Float[T
 
 
 def chart_velocity(
-    kind: str, step: Float[Tensor, "*batch velocities"], v: Float[Tensor, "*batch velocities"]
+    kind: str, step: Float[Tensor, "*#batch velocities"], v: Float[Tensor, "*#batch velocities"]
 ) -> Tensor:
     """d step / dt where `q0 integrated by step` moves with body velocity v: ad / (1 - exp(-ad)) v.
 

@@ -352,7 +352,7 @@ class CompiledModel:
                 self._lose("constraints of other kinds than joint, connect and weld", self._equality(k))
 
 
-def _any(model: Any, name: str, row: int) -> bool:
+def _any(model: Any, name: str, row: int | np.integer) -> bool:
     return bool(np.any(getattr(model, name, np.zeros((row + 1, 1)))[row]))
 
 

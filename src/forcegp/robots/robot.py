@@ -16,6 +16,7 @@ from forcegp.errors import InvalidInput, RobotFileWarning, UnstatedBase, usable_
 from forcegp.robots.arguments import (
     Inertials,
     JointValues,
+    Positions,
     Vector,
     armature_values,
     broadcast_batch,
@@ -351,7 +352,7 @@ class Robot(RobotStructure):
             write_text(text, Path(path))
         return text
 
-    def kinematics(self, q: JointValues, v: JointValues | None = None) -> Kinematics:
+    def kinematics(self, q: Positions, v: JointValues | None = None) -> Kinematics:
         """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""
         q = self.checked_input("q", q)
         if v is None:
@@ -362,11 +363,11 @@ class Robot(RobotStructure):
             q, v = q.expand(*batch, -1), v.expand(*batch, -1)
         return Kinematics.of(self, q, v)
 
-    def integrate(self, q: Float[Tensor, "*#batch nq"], step: JointValues) -> Float[Tensor, "... nq"]:
+    def integrate(self, q: Positions, step: JointValues) -> Float[Tensor, "... nq"]:
         """q after the constant velocity ``step`` (..., nv) has acted for one second: ``q + step`` on a fixed base."""
         return self.space.integrate(self.checked_input("q", q), self.checked_input("step", step))
 
-    def difference(self, q0: Float[Tensor, "*#batch nq"], q1: Float[Tensor, "*#batch nq"]) -> Float[Tensor, "... nv"]:
+    def difference(self, q0: Positions, q1: Positions) -> Float[Tensor, "... nv"]:
         """The constant velocity (..., nv) that leads from ``q0`` to ``q1`` in one second, by the shorter turn."""
         return self.space.difference(self.checked_input("q", q0), self.checked_input("q", q1))
 
@@ -397,34 +398,32 @@ class Robot(RobotStructure):
             q[:, group.places][:, group.motion.turn] = turn
         return self.space.normalized(q).to(self.device)
 
-    def mass_matrix(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         return self.kinematics(q).mass_matrix(inertials)
 
-    def bias_forces(
-        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
         return self.kinematics(q, v).bias_forces(inertials)
 
     def mass_matrix_and_bias(
-        self, q: JointValues, v: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, inertials: Inertials | None = None
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """:meth:`mass_matrix` and :meth:`bias_forces` from one kinematics pass."""
         return self.kinematics(q, v).mass_matrix_and_bias(inertials)
 
-    def gravity_forces(self, q: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
         return self.kinematics(q).gravity_forces(inertials)
 
     def inverse_dynamics(
-        self, q: JointValues, v: JointValues, a: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, a: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
         return self.kinematics(q, v).inverse_dynamics(a, inertials)
 
     def forward_dynamics(
-        self, q: JointValues, v: JointValues, tau: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues, tau: JointValues, inertials: Inertials | None = None
     ) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``, by Cholesky.
 
@@ -432,16 +431,16 @@ class Robot(RobotStructure):
         """
         return self.kinematics(q, v).forward_dynamics(tau, inertials)
 
-    def frame_pose(self, q: Float[Tensor, "*batch nv"], frame: str) -> Float[Tensor, "*batch 4 4"]:
+    def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
         return self.kinematics(q).frame_pose(frame)
 
-    def frame_jacobian(self, q: JointValues, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
+    def frame_jacobian(self, q: Positions, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
 
     def frame_bias_acceleration(
-        self, q: JointValues, v: JointValues, frame: str, point: Vector | None = None
+        self, q: Positions, v: JointValues, frame: str, point: Vector | None = None
     ) -> Float[Tensor, "... 6"]:
         """Acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``, classical, without gravity.
 

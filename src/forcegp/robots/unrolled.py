@@ -34,6 +34,7 @@ from forcegp.robots.structure import RobotStructure
 
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
 """Floats and expressions; the operators of NumPy are theirs, entry by entry."""
+_Values: TypeAlias = Sequence[Any] | Scalars
 
 # What is smaller in a rotation matrix or an inertia is rounding, as of the turn onto the joint axis: sin(pi) = 1e-16.
 ROUNDING = 1e-15
@@ -200,7 +201,7 @@ class UnrolledKinematics:
         """Joint forces (nv,) that hold the robot still."""
         return self._joint_forces([0.0] * len(self.unrolled.joints), None, inertias)
 
-    def _of_bodies(self, values: Sequence[Any] | Scalars) -> Any:
+    def _of_bodies(self, values: _Values) -> Any:
         """Velocities or accelerations of the joints of all bodies."""
         if not self.unrolled.coupled:
             return values
@@ -215,7 +216,7 @@ class UnrolledKinematics:
             out[joint.drive.joint] = out[joint.drive.joint] + row * joint.drive.multiplier
         return out
 
-    def _accelerations(self, v: Sequence[Any], a: Sequence[Any] | None) -> list[Scalars]:
+    def _accelerations(self, v: _Values, a: _Values | None) -> list[Scalars]:
         """Accelerations A (3, 4) of all bodies at joint accelerations ``a`` (0 if None), less that of free fall."""
         base = scalars([[0.0, 0.0, 0.0, -g] for g in self.unrolled.gravity])
         w: list[Scalars] = []
@@ -252,9 +253,7 @@ class UnrolledKinematics:
             A.append(np.column_stack([_turning(wi, dwi), acceleration]))
         return A
 
-    def _joint_forces(
-        self, v: Sequence[Any] | None, a: Sequence[Any] | None, inertias: Sequence[Scalars] | None
-    ) -> Scalars:
+    def _joint_forces(self, v: _Values | None, a: _Values | None, inertias: Sequence[Scalars] | None) -> Scalars:
         assert v is not None, "forces that depend on velocities need some"
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
         forces, moments = ([scalars([0.0] * 3) for _ in range(n)] for _ in range(2))
@@ -274,7 +273,7 @@ class UnrolledKinematics:
                 forces[parent], moments[parent] = forces[parent] + force, moments[parent] + moment
         return self._of_joints(scalars(out))
 
-    def _six(self, joint: UnrolledJoint, values: Sequence[Any] | None) -> list[Scalars]:
+    def _six(self, joint: UnrolledJoint, values: _Values | None) -> list[Scalars]:
         """Linear and angular entries (3,) of ``values`` along the axes of a joint of several; 0 if None."""
         six = scalars([0.0] * 6)
         if values is not None:

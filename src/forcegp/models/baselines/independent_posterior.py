@@ -22,7 +22,7 @@ from forcegp.inference import (
 )
 from forcegp.inference.pathwise import StackedFunctions, draw_functions
 from forcegp.mechanics import Baumgarte
-from forcegp.models.prediction import Prediction, Rows
+from forcegp.models.prediction import Inputs, Positions, Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
@@ -56,7 +56,7 @@ class IndependentLikelihood:
         """From the inputs of the training states."""
         return Standardization.of([self._columns(self.training.q, self.training.v, self.training.u)])
 
-    def features(self, q: Rows, v: Rows, u: Rows) -> Float[Tensor, "rows d"]:
+    def features(self, q: Positions, v: Rows, u: Inputs) -> Float[Tensor, "rows d"]:
         """Standardised inputs, the same for every joint."""
         return self.standardization([self._columns(q, v, u)])[0]
 
@@ -169,7 +169,7 @@ class IndependentPosterior(Posterior):
             return LeaveOut.of_independent_outputs([leave_blocks_out(x.system, noise, blocks) for x, noise in each])
 
     @override
-    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
+    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
         z = [self.likelihood.features(q, v, u)]
         mean = torch.cat([latent.mean(z) for latent in self.latents], dim=-1)
         variance = None

@@ -15,7 +15,7 @@ from typing_extensions import override
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import Engine, OptimizationResult
-from forcegp.models.prediction import Prediction, Rows
+from forcegp.models.prediction import Inputs, Positions, Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.search import (
     check_search_numbers,
@@ -144,7 +144,7 @@ class NetworkPosterior(Posterior):
         return float(0.5 * (squared / variance + variance.log() + math.log(2.0 * math.pi)).sum())
 
     @override
-    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
+    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
         mean, variance, scatter = self._moments(q, v, u)
         noise = scatter
         if self._known_variance is not None:
@@ -157,6 +157,6 @@ class NetworkPosterior(Posterior):
         return self.model.moments(self, (inputs(q, v, u) - shift) / scale)
 
 
-def inputs(q: Rows, v: Rows, u: Rows) -> Float[Tensor, "rows d"]:
+def inputs(q: Positions, v: Rows, u: Inputs) -> Float[Tensor, "rows d"]:
     """What a network sees of a state."""
     return torch.cat([q, v, u], dim=-1)

@@ -32,7 +32,7 @@ from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
 from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
 from forcegp.models.observed_wrench import rows_of_own_system
-from forcegp.models.prediction import Gaussian, Prediction, Rows
+from forcegp.models.prediction import Gaussian, Inputs, Positions, Prediction, Rows
 from forcegp.models.predictor import Predictor
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
@@ -106,12 +106,12 @@ class StructuredPosterior(Posterior):
 
     @override
     def dynamics(
-        self, q: Float[Tensor, "*batch nv"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nv"]
+        self, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nu"]
     ) -> ConstrainedDynamics:
         return self.system.dynamics(q, v, u, inertials_of(self.parameters) or None)
 
     @override
-    def predict_rows(self, q: Rows, v: Rows, u: Rows, covariance: bool) -> Prediction:
+    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
         dynamics = self.dynamics(q, v, u)
         known = self.model.mean == "analytical"
         B = self.model.prior.mixing(dynamics)
