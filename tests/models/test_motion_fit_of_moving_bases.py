@@ -57,7 +57,7 @@ def test_derivatives_in_every_unknown_and_start(switched):
 
 def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
     given = floating_arm.satellite(0.1, 0.2, mass=7.0)
-    log = floating_arm.recording(1, 3.0, given, bump=0.0)
+    log = floating_arm.recording(1, 2.0, given, bump=0.0)
     rough = StructuredGP(given, NoForces()).fit(log, points=40, restarts=1)
     fits = [rough.refined_on_motions(rows, 0.5) for rows in (log, floating_arm.turned(log))]
     found, again = (refined.settings["motions"]["parameters"] for refined in fits)
@@ -72,7 +72,7 @@ def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
 def test_functions_are_refined_too():
     """Friction that no law describes, from accelerations that are far off."""
     given = floating_arm.satellite()
-    train, test = (floating_arm.recording(seed, 3.0, given) for seed in (1, 2))
+    train, test = (floating_arm.recording(seed, 2.0, given) for seed in (1, 2))
     noisy = train.a + np.random.default_rng(0).standard_normal(train.a.shape)
     rough = StructuredGP(given, JointFriction(("shoulder",))).fit(
         replace(train, a=noisy, noise_std=[1.0] * 7, truth={}), points=60, restarts=1
