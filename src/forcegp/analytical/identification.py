@@ -126,7 +126,7 @@ def identify_analytical(
             r, jacobian = residual(x)
             return (r, jacobian) if whitening is None else ((whitening @ r[..., None])[..., 0], whitening @ jacobian)
 
-        options = {"longest": longest, "robust": robust, "progress": progress}
+        options: dict[str, Any] = {"longest": longest, "robust": robust, "progress": progress}
         return weighted_least_squares(white, prior, start, bounds, held=held, **options)
 
     fit, noise = search(np.concatenate([np.zeros(split), terms.start()])), None
