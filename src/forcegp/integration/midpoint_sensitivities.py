@@ -32,10 +32,10 @@ TOLERANCE = 1e-9
 class Linear:
     """Accelerations (n, nv) at states, and derivatives in q, v (n, nv, nv) and parameters (n, nv, P)."""
 
-    a: Float[Tensor, "n nv"]
-    a_q: Float[Tensor, "n nv nv"]
-    a_v: Float[Tensor, "n nv nv"]
-    a_p: Float[Tensor, "n nv P"] | None = None
+    a: Float[Tensor, "*n nv"]
+    a_q: Float[Tensor, "*n nv nv"]
+    a_v: Float[Tensor, "*n nv nv"]
+    a_p: Float[Tensor, "*n nv P"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,13 @@ class WindowMotions:
     `in_start` and `in_parameters` are the derivatives of q in (q_0, v_0) and in p.
     """
 
-    q: Float[Tensor, "K T+1 nv"]
-    v: Float[Tensor, "K T+1 nv"]
+    q: Float[Tensor, "K rows nv"]
+    v: Float[Tensor, "K rows nv"]
     middle_q: Float[Tensor, "K T nv"]
     middle_v: Float[Tensor, "K T nv"]
     found: Bool[Tensor, " K"]
-    in_start: Float[Tensor, "K T+1 nv 2*nv"] | None = None
-    in_parameters: Float[Tensor, "K T+1 nv P"] | None = None
+    in_start: Float[Tensor, "K rows nv 2*nv"] | None = None
+    in_parameters: Float[Tensor, "K rows nv P"] | None = None
 
 
 def window_motions(

@@ -83,7 +83,7 @@ class MotionFit:
         return self.stride * self.recorded.dt
 
     @cached_property
-    def q(self) -> Float[Tensor, "K T+1 nv"]:
+    def q(self) -> Float[Tensor, "K rows nv"]:
         """Recorded positions at the ends of the steps."""
         return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
 
@@ -93,11 +93,11 @@ class MotionFit:
         return torch.as_tensor(self.recorded.u.copy()).unflatten(1, (-1, self.stride)).mean(2)
 
     @cached_property
-    def start(self) -> Float[Tensor, "K 2*nv"]:
+    def start(self) -> Float[Tensor, "K state"]:
         """Recorded initial states."""
         return torch.as_tensor(np.concatenate([self.recorded.q[:, 0], self.recorded.v[:, 0]], axis=-1))
 
-    def spread(self, sigma: Tensor) -> Float[Tensor, " 2*nv"]:
+    def spread(self, sigma: Tensor) -> Float[Tensor, " state"]:
         """Standard deviations of initial states about the recorded ones."""
         speed = torch.as_tensor(self.recorded.v.copy()).square().mean((0, 1)).sqrt()
         return torch.cat([sigma, (SPEED * speed).clamp_min(1e-9)])
