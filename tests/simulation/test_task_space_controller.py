@@ -35,6 +35,7 @@ def test_small_and_large_angles_keep_their_digits(angle):
     np.testing.assert_allclose(rotation_vector(aim, present), [angle, 0, 0], rtol=1e-7, atol=1e-15)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_law_is_the_published_one_with_the_pseudo_inverse():
     rng = np.random.default_rng(0)
     orientation = np.array([0.0, -1.0, 0.0, 0.0])

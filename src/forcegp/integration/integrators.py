@@ -30,7 +30,7 @@ MOST_ITERATIONS = 25
 class ProjectedPosition:
     """Positions q with c(q) = 0 (where `converged`), A at them, L^-1 of M = L L^T at the given q, and iterations."""
 
-    q: Float[Tensor, "n nv"]
+    q: Float[Tensor, "n nq"]
     A: Float[Tensor, "n m nv"]
     inverse_lower: Float[Tensor, "n nv nv"]
     converged: Bool[Tensor, " n"]
@@ -48,7 +48,7 @@ class ConstraintManifold:
     system: MechanicalSystem
 
     def violation(
-        self, q: Float[Tensor, "*batch nv"], v: Float[Tensor, "*batch nv"]
+        self, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"]
     ) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
         """c(q) in m and A(q) v in m/s, for surfaces that are signed distances; NaN where q is."""
         space = self.system.robot.space
@@ -59,7 +59,7 @@ class ConstraintManifold:
         rate = (A @ v[..., None])[..., 0]
         return (c, rate) if lost is None else (c.masked_fill(lost, torch.nan), rate.masked_fill(lost, torch.nan))
 
-    def project_position(self, q: Float[Tensor, "n nv"]) -> ProjectedPosition:
+    def project_position(self, q: Float[Tensor, "n nq"]) -> ProjectedPosition:
         """The positions on all surfaces that Newton's method finds from q: dq = -M^-1 A^T (A M^-1 A^T)^+ c, M fixed.
 
         Source: Hairer, Lubich & Wanner (2006), Geometric Numerical Integration, sections IV.4 and VII.1.4, with the
@@ -100,8 +100,8 @@ class ConstraintManifold:
         return v
 
     def project(
-        self, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"]
-    ) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
+        self, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"]
+    ) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
         """Both. Raises NumericalError, naming the state, where no position on all surfaces is found near q."""
         at = self.project_position(q)
         if not bool(at.converged.all()):
@@ -239,7 +239,7 @@ Acceleration = Callable[[Tensor, Tensor], Tensor]
 class Step:
     """The state after one step, the acceleration at its beginning, and whether there is such a state (`failure`)."""
 
-    q: Float[Tensor, "n nv"]
+    q: Float[Tensor, "n nq"]
     v: Float[Tensor, "n nv"]
     a: Float[Tensor, "n nv"]
     found: Bool[Tensor, " n"]
@@ -254,13 +254,13 @@ class Integrator(ABC):
     """Why a step can have no end, for a warning."""
 
     def start(
-        self, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"]
-    ) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
+        self, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"]
+    ) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
         """The state at which a motion from (q, v) begins: itself, unless the method needs another."""
         return q, v
 
     @abstractmethod
-    def step(self, acceleration: Acceleration, q: Float[Tensor, "n nv"], v: Float[Tensor, "n nv"], dt: float) -> Step:
+    def step(self, acceleration: Acceleration, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"], dt: float) -> Step:
         """The state `dt` seconds later."""
 
 

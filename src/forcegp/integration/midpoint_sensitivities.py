@@ -40,10 +40,10 @@ class Linear:
     Where a base moves, the derivative in q is that in a step from there.
     """
 
-    a: Float[Tensor, "n nv"]
-    a_q: Float[Tensor, "n nv nv"]
-    a_v: Float[Tensor, "n nv nv"]
-    a_p: Float[Tensor, "n nv P"] | None = None
+    a: Float[Tensor, "*n nv"]
+    a_q: Float[Tensor, "*n nv nv"]
+    a_v: Float[Tensor, "*n nv nv"]
+    a_p: Float[Tensor, "*n nv P"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +66,13 @@ class WindowMotions:
     in steps from q_0.
     """
 
-    q: Float[Tensor, "K T+1 nv"]
-    v: Float[Tensor, "K T+1 nv"]
+    q: Float[Tensor, "K rows nv"]
+    v: Float[Tensor, "K rows nv"]
     middle_q: Float[Tensor, "K T nv"]
     middle_v: Float[Tensor, "K T nv"]
     found: Bool[Tensor, " K"]
-    in_start: Float[Tensor, "K T+1 nv 2*nv"] | None = None
-    in_parameters: Float[Tensor, "K T+1 nv P"] | None = None
+    in_start: Float[Tensor, "K rows nv 2*nv"] | None = None
+    in_parameters: Float[Tensor, "K rows nv P"] | None = None
 
 
 def window_motions(

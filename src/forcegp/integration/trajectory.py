@@ -32,7 +32,7 @@ class Trajectory:
     to the end; `not_found` marks those that the integrator could not carry on.
     """
 
-    q: Float[Tensor, "rows n nv"]
+    q: Float[Tensor, "rows n nq"]
     v: Float[Tensor, "rows n nv"]
     a: Float[Tensor, "steps n nv"]
     diverged_at: Int[Tensor, " n"]
@@ -42,9 +42,9 @@ class Trajectory:
 def integrate(
     integrator: Integrator,
     acceleration: Callable[[Tensor, Tensor, Tensor], Tensor],
-    q0: Float[Tensor, "n nv"],
+    q0: Float[Tensor, "n nq"],
     v0: Float[Tensor, "n nv"],
-    u: Float[Tensor, "steps n nv"],
+    u: Float[Tensor, "steps n nu"],
     dt: float,
     *,
     feedback: Feedback | None = None,

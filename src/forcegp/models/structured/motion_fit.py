@@ -85,7 +85,7 @@ class MotionFit:
         return self.stride * self.recorded.dt
 
     @cached_property
-    def q(self) -> Float[Tensor, "K T+1 nq"]:
+    def q(self) -> Float[Tensor, "K rows nq"]:
         """Recorded positions at the ends of the steps."""
         return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
 
@@ -95,7 +95,7 @@ class MotionFit:
         return torch.as_tensor(self.recorded.u.copy()).unflatten(1, (-1, self.stride)).mean(2)
 
     @cached_property
-    def start(self) -> Float[Tensor, "K 2*nv"]:
+    def start(self) -> Float[Tensor, "K state"]:
         """Recorded initial states; where a base moves, the step 0 from the recorded position stands for that."""
         q, v = self.recorded.q[:, 0], self.recorded.v[:, 0]
         return torch.as_tensor(np.concatenate([q if self.space.is_vector_space else np.zeros_like(v), v], axis=-1))
@@ -105,11 +105,11 @@ class MotionFit:
         """Of positions."""
         return self.unknowns.start.system.robot.space
 
-    def residual(self, motions: WindowMotions) -> Float[Tensor, "K T+1 nv"]:
+    def residual(self, motions: WindowMotions) -> Float[Tensor, "K rows nv"]:
         """Steps that lead from the recorded positions to those of the motions."""
         return self.space.difference(self.q, motions.q)
 
-    def spread(self, sigma: Tensor) -> Float[Tensor, " 2*nv"]:
+    def spread(self, sigma: Tensor) -> Float[Tensor, " state"]:
         """Standard deviations of initial states about the recorded ones."""
         speed = torch.as_tensor(self.recorded.v.copy()).square().mean((0, 1)).sqrt()
         return torch.cat([sigma, (SPEED * speed).clamp_min(1e-9)])
