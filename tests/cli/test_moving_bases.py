@@ -89,14 +89,9 @@ def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("identify walk.h5 --model consistent --motions 1 --out x", "refinements on motions need a base that is fixed"),
-        (
-            "validate walk.h5 --models joint-friction/motions --points 30 --out x",
-            "refinements on motions need a base that is fixed",
-        ),
         ("auto flight.csv --out x", "give --robot ARM.urdf, or --identified"),
         ("compare walk.h5", "give two or more, as in a,b"),
-        ("fit walk.h5 --motions 1 --prior joint-friction --out x", "refinements on motions need a base that is fixed"),
+        ("fit walk.h5 --motions 0 --prior joint-friction --out x", "--motions is 0; give the length of the windows"),
     ],
 )
 def test_what_cannot_be_is_one_line_before_the_work(folder, forcegp, words, message):

@@ -11,12 +11,16 @@ from tests.models.arm import arm_system
 from torch import tensor
 
 from forcegp import Dataset, JointForces, StructuredGP
+from forcegp.errors import DataWarning
+from forcegp.inference import OptimizerOptions
+from forcegp.models import Noise
 from forcegp.models.structured.refinement import independent_rows
 
+QUICK = OptimizerOptions(iterations=2)
 CUTOFF = 4.0  # Hz, so that rows within 1/12 s are alike
 
 
-def filtered(rows: int = 240, seed: int = 0, cutoff: float | None = CUTOFF) -> Dataset:
+def filtered(rows: int = 480, seed: int = 0, cutoff: float | None = CUTOFF) -> Dataset:
     """An arm without unknown forces whose accelerations have errors of .5 rad/s^2 that a filter has made smooth."""
     system, time = arm_system(0), 0.01 * np.arange(rows)
     draw = np.random.default_rng(seed)
@@ -31,23 +35,25 @@ def filtered(rows: int = 240, seed: int = 0, cutoff: float | None = CUTOFF) -> D
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_kept_rows_lie_apart_and_every_other_row_is_near_an_earlier_one(seed, episodes):
     draw = np.random.default_rng(seed)
-    whole = filtered(60)
-    order = draw.permutation(60)
+    whole = filtered(200)
+    order = draw.permutation(200)
     log = Dataset(
         **{name: getattr(whole, name)[order] for name in ("q", "v", "u", "a", "time")},
-        episode=draw.integers(0, episodes, 60),
+        episode=draw.integers(0, episodes, 200),
         system=whole.system,
         metadata=whole.metadata,
         time_ordered=False,
     )
-    kept = independent_rows(log)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        kept = independent_rows(log)
     apart = 1.0 / (3.0 * CUTOFF) - 1e-9
     rows = [int(np.flatnonzero(log.time == time)[0]) for time in kept.time]
     near = (np.abs(log.time[:, None] - log.time) < apart) & (log.episode[:, None] == log.episode)
     assert near[np.ix_(rows, rows)].sum() == len(rows)
-    for row in set(range(60)) - set(rows):
+    for row in set(range(200)) - set(rows):
         assert any(near[row, other] and other < row for other in rows)
-    assert independent_rows(filtered(60, cutoff=None)).time.tolist() == whole.time.tolist()
+    assert independent_rows(filtered(200, cutoff=None)).time.tolist() == whole.time.tolist()
 
 
 def test_learned_noise_is_not_lost_in_smooth_errors():
@@ -55,13 +61,35 @@ def test_learned_noise_is_not_lost_in_smooth_errors():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found, alike = (
-            StructuredGP(arm_system(0), JointForces()).fit(filtered(cutoff=cutoff), points=120, restarts=1)
+            StructuredGP(arm_system(0), JointForces()).fit(filtered(cutoff=cutoff), points=200, restarts=1)
             for cutoff in (CUTOFF, None)
         )
     assert float(found.noise_std.min()) > 0.2
     assert float(alike.noise_std.max()) < 0.1
-    assert found.settings["correlated_rows"] == pytest.approx(120 / found.settings["learning_points"])
-    assert "correlated_rows" not in alike.settings
+    assert len(found.training) == found.settings["points"] < 80
+    assert len(alike.training) == 200
+
+
+def test_rows_that_are_left_out_are_warned_of():
+    model, quick = (
+        StructuredGP(arm_system(0), JointForces(), noise=Noise(None, learn=True)),
+        {"restarts": 1, "options": QUICK},
+    )
+    with pytest.warns(DataWarning, match=r"of 200 rows lie 0\.083 s apart.*from which alone noise is learned"):
+        model.fit(filtered(), points=200, **quick)
+    with pytest.warns(DataWarning, match="so few that all are taken, and learned noise may be none"):
+        few = model.fit(filtered(60), points=50, **quick)
+    assert few.settings["points"] == 50
+
+
+def test_all_rows_are_taken_where_no_number_is_given():
+    """Hyper-parameters come from rows that lie apart; as many of these as are asked for."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = StructuredGP(arm_system(0), JointForces())
+        posterior = model.fit(filtered(), restarts=1, options=QUICK, learning_points=25)
+    assert posterior.settings["points"] == 480
+    assert posterior.settings["learning_points"] == 25
 
 
 def test_stated_noise_is_taken_as_it_is():

@@ -18,6 +18,7 @@ from forcegp.errors import (
 )
 from forcegp.robots import Robot
 from forcegp.robots.problems import LISTED, Problems
+from forcegp.robots.xml_text import without_comments
 
 FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'
 FRAME = '<link name="frame"/><joint name="slip" type="prismatic"><parent link="FL_foot"/><child link="frame"/></joint>'
@@ -183,6 +184,21 @@ def test_what_other_readers_take_though_it_is_no_xml(what):
     assert robot.joint_names == ("hinge",)
     assert Robot.from_urdf_text(robot.to_urdf()).tree.equals(robot.tree)
     assert pin.buildModelFromXML(text).nv == 1
+
+
+def test_comments_are_cut_in_linear_time_and_keep_their_lines():
+    assert without_comments("a<!-- 1\n2 -->b<!--") == "a\nb<!--"
+    assert without_comments("<!--->-->") == ""
+    assert len(without_comments("<!--" * 200_000)) == 800_000  # each start was searched to the end of the text before
+
+
+def test_a_link_that_stands_still_needs_no_inertia():
+    text = changed('<link name="base"/>', '<link name="base"><inertial><mass value="3"/></inertial></link>')
+    robot = Robot.from_urdf_text(text)
+    assert not torch.tensor(robot.link("base").inertia).any()
+    assert "nan" not in robot.to_mjcf().lower()
+    frame = changed('<link name="base"/>', '<link name="base"><inertial><mass value="0"/></inertial></link>')
+    assert Robot.from_urdf_text(frame).nv == robot.nv
 
 
 def test_comments_need_not_have_the_encoding_of_the_file(tmp_path):

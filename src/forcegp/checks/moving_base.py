@@ -75,8 +75,11 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     for group in robot.layout.groups[:1]:
         if group.kind != "floating" or system.contacts or thruster_columns(system) or not weight:
             continue
-        q, v, a = (torch.tensor(each[rows], device=robot.device) for each in (dataset.q, dataset.v, dataset.a))
-        force = robot.inverse_dynamics(q, v, a)[:, group.rows][:, :3]
+        inputs = dataset.u if dataset.u.shape[1] == len(system.inputs) else np.zeros((len(dataset), len(system.inputs)))
+        given = (dataset.q, dataset.v, inputs, dataset.a)
+        q, v, u, a = (torch.tensor(each[rows], device=robot.device) for each in given)
+        dynamics = system.dynamics(q, v, u)
+        force = ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :3]
         size = float(torch.linalg.vector_norm(force, dim=-1).median())
         if size > CARRIED * weight:
             yield wrong(

@@ -57,8 +57,6 @@ class Fit(ModelOptions):
         start = time.monotonic()
         dataset = forcegp.Dataset.load(self.data)
         system = self._system(dataset)
-        if self.motions is not None:
-            system.robot.require_vectors("refinements on motions")
         self._check(terminal, dataset, system, self.learn_from == "accelerations")
         recording, rows_note = dataset, None
         if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact

@@ -86,8 +86,6 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
     dataset = forcegp.Dataset.load(command.data)
     test = None if command.test is None else forcegp.Dataset.load(command.test)
     system = command._system(dataset)
-    if command.motions is not None:
-        system.robot.require_vectors("refinements on motions")
     with terminal.progress("identifying", may_end_early=True) as report:
         found = forcegp.identify_analytical(
             dataset,

@@ -156,5 +156,11 @@ def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
 
 
 def actuators(dataset: Dataset) -> int:
-    """How many columns of u are forces; those behind them are switches of contacts, which no filter may touch."""
+    """How many columns of u are forces. Those of observers and switches follow, which no filter may touch."""
     return dataset.u.shape[1] if dataset.system is None else len(dataset.system.actuators)
+
+
+def switches(dataset: Dataset) -> list[int]:
+    """Which columns of u are switches of contacts."""
+    own = [] if dataset.system is None else [contact.switch for contact in dataset.system.contacts]
+    return [] if dataset.system is None else [k for k, name in enumerate(dataset.system.inputs) if name in own]

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.special import beta
 
-from forcegp.data.configurations import actuators, as_vectors, chart_acceleration, space_of
+from forcegp.data.configurations import as_vectors, chart_acceleration, space_of, switches
 from forcegp.data.dataset import Dataset
 from forcegp.data.filtering import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
@@ -161,11 +161,10 @@ class WeakForm:
             return np.stack(means, axis=1).reshape(-1, values.shape[-1])
 
         v, u = at_nodes(dataset.v[rows]), at_nodes(dataset.u[rows])
-        switches = actuators(dataset)
-        u[:, switches:] = np.repeat(
-            dataset.u[rows[:, 0], switches:], self.nodes, axis=0
-        )  # means are not exactly 0 or 1
-
+        held = switches(dataset)
+        u[:, held] = np.repeat(
+            dataset.u[rows[:, 0]][:, held], self.nodes, axis=0
+        )  # their means were not exactly 0 or 1
         repeat = {name: np.repeat(values, self.nodes, axis=0) for name, values in (("a", observed), ("noise", noise))}
         nodes = replace(
             dataset,
@@ -222,7 +221,7 @@ def _window_rows(dataset: Dataset, how: WeakForm) -> Int[np.ndarray, "N m"]:
         at = np.flatnonzero(dataset.episode == number)
         blocks = at[: len(at) // length * length].reshape(-1, length) if length else at[:0].reshape(0, 1)
         gaps = np.diff(dataset.time[blocks], axis=1) > LONGEST_STEP * median
-        switched = np.diff(dataset.u[blocks][..., actuators(dataset) :], axis=1).any(axis=2)
+        switched = np.diff(dataset.u[blocks][..., switches(dataset)], axis=1).any(axis=2)
         found.append(blocks[~(gaps | switched).any(axis=1)])
     every = np.concatenate(found)
     if not len(every):

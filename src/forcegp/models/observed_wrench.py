@@ -90,11 +90,12 @@ def in_air(
         law, wind = found
         windy = [replace(term, wind=law.wind) if isinstance(term, AerodynamicForce) else term for term in terms]
         return {"air": law.to_dict()}, windy[0] if len(windy) == 1 else SumPrior(tuple(windy)), with_wind(rows, wind)
-    if (forces := steady_forces(rows)) is None:
+    frame = of_air[0].link(system.robot)
+    if frame != AerodynamicForce().link(system.robot) or (forces := steady_forces(rows)) is None:
         return None
     columns = np.concatenate([rows.u, forces, np.zeros_like(forces)], axis=1)
     each = {str(number): forces[rows.episode == number][0].tolist() for number in rows.episodes}
-    seen = replace(rows, u=columns, system=_with_wrench(system, of_air[0].link(system.robot)))
+    seen = replace(rows, u=columns, system=_with_wrench(system, frame))
     return {"steady_forces": each}, prior, seen
 
 
@@ -136,20 +137,30 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
+    if "steady_forces" in posterior.settings:  # what is new in their flight is to be learned
+        return _with_forces(posterior, rows, {})
     return in_own_air(posterior, rows)
 
 
 def in_own_air(posterior: Posterior, rows: Dataset) -> Dataset:
-    """Rows of a recording with the columns that the model's own rows have: their wind, or the force that stays.
+    """Rows of the recording of a fit with the columns that the model's own rows have: wind, or the force that stays.
 
-    Rows that show none are left out. Raises InvalidInput where all have less than .1 s of their own past.
+    Rows that show no wind are left out. Raises InvalidInput where all have less than .1 s of their own past.
     """
-    if "steady_forces" in posterior.settings:
-        return observing(posterior, rows)[1]
+    if (steady := posterior.settings.get("steady_forces")) is not None:
+        return _with_forces(posterior, rows, steady)
     if "air" not in posterior.settings:
         return rows
     _, seen = _in_observed_wind(posterior, rows)
     return seen.rows(_with_past(rows, LEAST))
+
+
+def _with_forces(posterior: Posterior, rows: Dataset, each: Mapping[str, Sequence[float]]) -> Dataset:
+    """Rows with the force of each episode, none where it is not named, in the columns of the fit's `ObservedWrench`."""
+    frame = next(x.frame for x in posterior.model.system.known_forces if isinstance(x, ObservedWrench))
+    wrench = np.array([[*each.get(str(number), (0.0,) * 3), 0.0, 0.0, 0.0] for number in rows.episode])
+    columns = np.concatenate([rows.u, wrench], axis=1)
+    return replace(rows, u=columns, system=_with_wrench(posterior.system, frame), truth={})
 
 
 def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:

@@ -262,8 +262,9 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     products = [] if entries is None else [key for key in ("ixy", "ixz", "iyz") if key not in entries.attrib]
     if products:
         place.problems.ignore("a product of inertia that is not given is 0", place.owner, f"no {', '.join(products)}")
+    missing = np.nan if mass else 0.0
     ixx, ixy, ixz, iyy, iyz, izz = (
-        np.nan
+        missing
         if entries is None
         else 0.0
         if key in products

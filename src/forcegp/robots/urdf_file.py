@@ -25,7 +25,9 @@ from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
 from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import RobotDescription, parse_urdf
+from forcegp.robots.xml_text import without_comments
 
+UNREADABLE = "\ufffd"
 LARGEST_FILE = 16 << 20
 """Bytes; robot files have some hundred thousand."""
 
@@ -57,7 +59,8 @@ def read_text(path: str | Path) -> str:
         return data.decode(encoding)
     except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
         with contextlib.suppress(ValueError, LookupError):  # comments are written in any language
-            return re.sub(rb"<!--.*?-->", b"", data, flags=re.DOTALL).decode(encoding)
+            if UNREADABLE not in (text := without_comments(data.decode(encoding, errors="replace"))):
+                return text
         raise UnreadableRobotFile(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'
@@ -263,8 +266,10 @@ def with_chosen_inertias(
             "an inertia that no body has is replaced by the nearest one that a body has",
             f"link {name!r}: {objection}; changed by {relative:.2g} %",
         )
-    if changed:
-        return text, parse_urdf(text, Problems(source))
+    links = dict(parse_urdf(text, Problems(source)).links) if changed else links
+    for name, inertial in links.items():
+        if inertial is not None and name not in layout.moving and np.isnan(inertial.inertia).all():
+            links[name] = replace(inertial, inertia=np.zeros((3, 3)))  # of a link that never moves
     return text, replace(description, links=links)
 
 

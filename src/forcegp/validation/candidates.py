@@ -203,7 +203,6 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
     if name in CANDIDATES:
         return CANDIDATES[name]
     if name.endswith(MOTIONS):
-        system.robot.require_vectors("refinements on motions")
         base = candidate(name.removesuffix(MOTIONS), system, identification)
         if base.kind in ("black box", "given"):
             raise InvalidInput(f"model {name!r} has no physics to refine on motions, or is the one that was given.")

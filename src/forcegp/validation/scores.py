@@ -69,7 +69,8 @@ def acceleration_scores(
     larger. What is not a number (a constant target) is None.
     """
     alone = posterior
-    posterior, test = observing(posterior, test, whole=True)
+    if test.time_ordered:
+        posterior, test = observing(posterior, test, whole=True)
     predicted = predict_rows(posterior, test)
     a, variance = test.a, predicted.measurement_variance
     forces = force_errors(predicted.mean, a, mass)

@@ -240,12 +240,12 @@ class StructuredGP(StructuredModel):
             chosen.require_memory(self.problem_size(len(all_rows)), self.system.robot.device)
         if search.learn is not None and learning_points is None:
             learning_points = len(all_rows)
-        rows = learning_rows(all_rows, learning_points, ordered=len(all_rows) < len(dataset))
+        ordered = len(all_rows) < len(dataset)
+        rows = independent_rows(all_rows) if learns_noise(self.noise, dataset) else all_rows
+        if points is not None:  # which rows these are is not the caller's choice
+            all_rows = rows
+        rows = learning_rows(rows, learning_points, ordered=ordered)
         described = described_rows(all_rows, dataset)
-        if learns_noise(self.noise, dataset) and len(apart := independent_rows(rows)) < len(rows):
-            if len(rows) == len(all_rows):
-                described["correlated_rows"] = len(rows) / len(apart)
-            rows = apart
         search = replace(search, start=self._continuation(rows, dataset, search))
         fitted = widened(self._fit_with_loads(rows, dataset, search), search.hyperprior)
         warn_of_contacts(self.system, dataset)  # last: what refuses the rows comes first

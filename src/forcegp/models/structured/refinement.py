@@ -15,7 +15,7 @@ import torch
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.preparation import memory
-from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
 from forcegp.inference import (
     Choice,
     Engine,
@@ -41,6 +41,7 @@ from forcegp.priors import ForcePrior
 from forcegp.priors.contact_friction import JAMMING, TabulatedCurve, refined_loads
 from forcegp.robots.arguments import whole_number
 
+FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
 
@@ -68,7 +69,8 @@ def independent_rows(rows: Dataset) -> Dataset:
     """Those that lie further apart in time than a filter makes them alike; of two, the one that comes first.
 
     Noise that is learned is taken for independent. Where rows of a filtered log lie close together, errors that change
-    slowly would look like forces, and the noise like none.
+    slowly would look like forces, and the noise like none. Warns where many rows are left out, and where so few are
+    left that all stay.
     """
     seconds = memory(rows.metadata) * (1.0 - 1e-9)
     if seconds == 0.0:
@@ -79,7 +81,13 @@ def independent_rows(rows: Dataset) -> Dataset:
         if all(abs(found.get((episode, place + k), np.inf) - time) >= seconds for k in (-1, 0, 1)):
             found[episode, place] = time
             kept.append(row)
-    return rows.rows(np.array(kept))
+    if len(kept) > WARNED_OF * len(rows):
+        return rows.rows(np.array(kept))
+    alike = f"{len(kept)} of {len(rows)} rows lie {seconds:.2g} s apart, which the filter of the log makes alike"
+    few = len(kept) < FEWEST_INDEPENDENT
+    what = "so few that all are taken, and learned noise may be none" if few else "from which alone noise is learned"
+    warnings.warn(f"{alike}: {what}; give a longer log, or `noise` if it is known", DataWarning, stacklevel=4)
+    return rows if few else rows.rows(np.array(kept))
 
 
 def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
@@ -111,9 +119,7 @@ def on_all_rows(
     reference = fitted.training
     training = reference
     if len(rows) != len(reference.q):
-        correlated = described.get("correlated_rows", 1.0)
-        training = TrainingData.of(rows, reference.q.device)
-        training = replace(training, reference=reference, correlated_rows=correlated)
+        training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
     likelihood = replace(fitted.likelihood, training=training)
     fitted.model.system.check_states(training.q, training.v, training.u)
     if training is not reference:
