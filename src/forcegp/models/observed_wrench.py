@@ -91,7 +91,7 @@ def in_air(
         windy = [replace(term, wind=law.wind) if isinstance(term, AerodynamicForce) else term for term in terms]
         return {"air": law.to_dict()}, windy[0] if len(windy) == 1 else SumPrior(tuple(windy)), with_wind(rows, wind)
     frame = of_air[0].link(system.robot)
-    if frame != AerodynamicForce().link(system.robot) or (forces := steady_forces(rows)) is None:
+    if (forces := steady_forces(rows)) is None or frame != AerodynamicForce().link(system.robot):
         return None
     columns = np.concatenate([rows.u, forces, np.zeros_like(forces)], axis=1)
     each = {str(number): forces[rows.episode == number][0].tolist() for number in rows.episodes}
