@@ -14,7 +14,6 @@ import argparse
 import csv
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,6 +73,21 @@ def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
     return float(share.mean()), float(np.sqrt(np.square(away).sum(1).mean()))
 
 
+def compared(system: MechanicalSystem, train: Dataset, test: Dataset, points: int) -> dict[str, tuple[float, float]]:
+    linear = StructuredGP(system, AerodynamicForce(kernel="linear", observe=0.0))
+    usual = replace(linear, prior=AerodynamicForce(kernel="linear"))
+    parametric, own = (each.fit(train, points=min(1000, len(train)), restarts=1) for each in (linear, usual))
+    seconds = min(TIMES, key=lambda each: training_error(parametric, train, each))
+    force = StructuredGP(system, AerodynamicForce()).fit(train, points=min(points, len(train)), restarts=1)
+    independent = IndependentGP(system).fit(train, points=min(points, len(train)), restarts=1)
+    return {
+        "force prior": scores(*observing(force, test)),
+        "parametric with our observers": scores(*observing(own, test)),
+        "parametric": scores(*observing(parametric, test, seconds=seconds)),
+        "independent GP": scores(independent, test),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("flights", type=Path, nargs="+")
@@ -87,22 +101,11 @@ def main() -> None:
     results = []
     for k, test in enumerate(flights):
         train = joined([each for other, each in enumerate(flights) if other != k])
-        points = min(options.rows, len(train))
-        linear = StructuredGP(system, AerodynamicForce(kernel="linear", observe=0.0))
-        usual = replace(linear, prior=AerodynamicForce(kernel="linear"))
-        parametric = linear.fit(train, points=min(1000, len(train)), restarts=1)
-        seconds = min(TIMES, key=lambda each: training_error(parametric, train, each))
-        made: dict[str, Callable[[], Posterior]] = {
-            "force prior": lambda: StructuredGP(system, AerodynamicForce()).fit(train, points=points, restarts=1),  # noqa: B023
-            "parametric with our observers": lambda: usual.fit(train, points=min(1000, len(train)), restarts=1),  # noqa: B023
-        }
-        found = {name: scores(*observing(make(), test)) for name, make in made.items()}
-        found["parametric"] = scores(*observing(parametric, test, seconds=seconds))
-        found["independent GP"] = scores(IndependentGP(system).fit(train, points=points, restarts=1), test)
+        found = compared(system, train, test, options.rows)
         results.append(found)
         for name, (share, away) in found.items():
             print(f"{options.flights[k].stem:32} {name:30} {share:.3f} {away:.3f} m", flush=True)
-    for name in results[0]:
+    for name in list(results[0])[1:]:
         ours, other = (np.square([found[each] for found in results]).mean(0) for each in ("force prior", name))
         print(f"force prior over {name}: accelerations, position: {np.sqrt(ours / other).round(3)}")
 

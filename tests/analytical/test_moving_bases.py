@@ -128,7 +128,10 @@ def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknow
     held = rng.normal(size=(rows, 2, nv)) * (rng.integers(0, 3, (rows, 1)) > np.arange(2))[..., None]
     pushed = (held.swapaxes(1, 2) @ (100.0 * rng.normal(size=(rows, 2, 1))))[..., 0]
     y = J @ truth + noise * rng.normal(size=(rows, nv)) + pushed
-    prior = lambda x: (1e-3 * x, 1e-3 * np.eye(k))  # noqa: E731
+
+    def prior(x):
+        return 1e-3 * x, 1e-3 * np.eye(k)
+
     bounds = np.full(k, -np.inf), np.full(k, np.inf)
     fit = weighted_least_squares(lambda x: (J @ x - y, J), prior, np.zeros(k), bounds, held=held)
     lambdas = np.zeros((rows * nv, 2 * rows))

@@ -21,7 +21,7 @@ from forcegp.robots.manifold import Group
 
 CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
-itself below this share of the speed."""
+itself below this share of the speed; and by how much the share that it explains may differ from 1."""
 SURE = 20.0
 """Standard errors of independent rows by which other axes have to fit better: successive rows are not independent."""
 TINY = 1e-24
@@ -69,7 +69,7 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
 
 
 def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """A base that floats and does not fall, although no foot, thruster or actuator of the system acts on it."""
+    """A base that floats and does not fall, although no foot, thruster or known force of the system carries it."""
     robot, rows = system.robot, np.linspace(0, len(dataset) - 1, min(len(dataset), MOST_ROWS)).astype(int)
     weight = float(torch.linalg.vector_norm(robot.gravity)) * sum(robot.link(name).mass for name in robot.layout.moving)
     for group in robot.layout.groups[:1]:
@@ -84,8 +84,8 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
         if size > CARRIED * weight:
             yield wrong(
                 subject="base force",
-                seen=f"{group.name!r} does not fall: it moves under {size:.3g} N (the robot weighs {weight:.3g} N), "
-                "and nothing in the system acts on it, no foot that stands and no thruster.",
+                seen=f"{group.name!r} does not fall: it moves under {size:.3g} N that nothing in the system explains, "
+                f"no foot that stands and no thruster (the robot weighs {weight:.3g} N).",
                 remedy="Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
                 "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
                 numbers={"force": size, "weight": weight},

@@ -196,9 +196,8 @@ class LearningOptions(BackendOptions, RobotOptions):
         if self.checks:
             # without a system it compares no torques; those of moving bases are never compared
             without = not (accelerations or system.robot.layout.groups)
-            found = forcegp.checks.quick_check(
-                *((replace(dataset, system=None), None) if without else (dataset, system))
-            )
+            looked_at = (replace(dataset, system=None), None) if without else (dataset, system)
+            found = forcegp.checks.quick_check(*looked_at)
             of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
             used = [each for each in found if each.subject not in of_accelerations]
             # check has no --contact: it would find nothing wrong with the contacts of the data

@@ -27,8 +27,8 @@ class Payload(PreparationOptions, RobotOptions):
     """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
 
     The log is a motion of 20 s or more that turns every joint in both directions, without contact but for feet that
-    stand. Without --baseline,
-    errors of the URDF's links count as payload. With one, the links are estimated from both logs.
+    stand. Without --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both
+    logs.
 
     For example:
       forcegp payload loaded.h5 --robot arm.urdf

@@ -103,10 +103,10 @@ def chart_acceleration(
 ) -> Float[np.ndarray, "*batch nv"]:
     """a of a path whose `step` from a fixed position has these first and second derivatives `rate` and `bend` in time.
 
-    With step' = D(step) v (`ConfigurationSpace.chart_velocity`), a = D^-1 (step'' - D' v).
+    With step' = D(step) v (`ConfigurationSpace.chart_matrix`), a = D^-1 (step'' - D' v).
     """
     at, moving, bent = (torch.tensor(x) for x in (step, rate, bend))
-    D = space.chart_velocity(at[..., None, :], torch.eye(space.nv).to(at).expand(*at.shape, -1)).mT
+    D = space.chart_matrix(at)
     v = torch.linalg.solve(D, moving)
     changed = torch.func.jvp(lambda x: space.chart_velocity(x, v), (at,), (moving,))[1]
     return torch.linalg.solve(D, bent - changed).numpy()

@@ -144,8 +144,10 @@ def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
 
 
 def _flies(dataset: Dataset) -> bool:
-    groups = () if dataset.system is None else dataset.system.robot.layout.groups
-    return bool(groups) and groups[0].kind == "floating" and not dataset.system.contacts  # type: ignore[union-attr]
+    if dataset.system is None or dataset.system.contacts:
+        return False
+    groups = dataset.system.robot.layout.groups
+    return bool(groups) and groups[0].kind == "floating"
 
 
 @dataclass(frozen=True)

@@ -133,10 +133,10 @@ class WeakForm:
         """The `points` windows whose mean states (q, v, u) lie farthest apart; all of them for None.
 
         Windows follow each other without sharing a row, so their noise is independent; none holds a row at which a
-        contact is switched. Rows must be in order of time,
-        at the rate of the sensors and unfiltered: noise of filtered signals is not white (a DataWarning reports it).
-        Raises DatasetError for rows in another order, positions that jump by a turn and logs without a window;
-        InvalidInput for more points than windows, windows of too few rows and more nodes than rows.
+        contact is switched. Rows must be in order of time, at the rate of the sensors and unfiltered: noise of filtered
+        signals is not white (a DataWarning reports it). Raises DatasetError for rows in another order, positions that
+        jump by a turn and logs without a window; InvalidInput for more points than windows, windows of too few rows and
+        more nodes than rows.
         """
         rows = _window_rows(dataset, self)
         _warn_of_filtered(dataset)
@@ -162,9 +162,8 @@ class WeakForm:
 
         v, u = at_nodes(dataset.v[rows]), at_nodes(dataset.u[rows])
         held = switches(dataset)
-        u[:, held] = np.repeat(
-            dataset.u[rows[:, 0]][:, held], self.nodes, axis=0
-        )  # their means were not exactly 0 or 1
+        first = dataset.u[rows[:, 0]][:, held]  # means would not be exactly 0 or 1
+        u[:, held] = np.repeat(first, self.nodes, axis=0)
         repeat = {name: np.repeat(values, self.nodes, axis=0) for name, values in (("a", observed), ("noise", noise))}
         nodes = replace(
             dataset,

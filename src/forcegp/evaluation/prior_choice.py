@@ -53,11 +53,11 @@ def choose_prior(
     """Name of the prior to learn with, and why, in a sentence.
 
     In free motion friction of the joints, in contact forces at the tool, unless left-out stretches of `LOOK` rows show
-    a force at every joint, or the sum with friction of the joints, to be better (`compare_priors`). Of a robot that
-    flies, what air does; feet that stand are no contact in which something slides. `how` are other
-    arguments of that. A system with friction laws was identified: what is missing is the rest of the friction, and
-    functions of positions and torques only fit what filters leave. Where nothing can be compared (too few rows), the
-    first one is taken as well, and the reason says so.
+    a force at every joint, or the sum with friction of the joints, to be better (`compare_priors`, whose other
+    arguments are `how`). Of a robot that flies, what air does; feet that stand are no contact in which something
+    slides. A system with friction laws was identified: what is missing is the rest of the friction, and functions of
+    positions and torques only fit what filters leave. Where nothing can be compared (too few rows), the first one is
+    taken as well, and the reason says so.
     """
     names, where = _looked_at(system)
     if any(isinstance(force, FRICTION) for force in system.known_forces):

@@ -91,7 +91,5 @@ def interval_about(rollout: Rollout, q0: Tensor, space: ConfigurationSpace) -> t
         return low, high
     # what steps from the motion change of the way to it: entries of a step are as if independent
     way, (_, wide) = apart_from(q0, rollout.q, space), rollout.interval()
-    axes = torch.eye(space.nv).to(way).expand(*way.shape, -1)
-    changes = space.chart_velocity(way[..., None, :].expand_as(axes), axes)
-    half = (changes.square() * wide.square()[..., None]).sum(-2).sqrt()
+    half = (space.chart_matrix(way).square() * wide.square()[..., None, :]).sum(-1).sqrt()
     return way - half, way + half

@@ -166,13 +166,8 @@ def _value(name: str, key: str, text: str, default: Any) -> Any:
             return tuple(number(part) for part in text.split("/"))
     except ValueError:
         example = "/".join(map(str, several))
-        kind = (
-            f"{'whole ' * (number is int)}numbers as in {example}"
-            if numbers
-            else "a whole number"
-            if isinstance(default, int)
-            else "a number"
-        )
+        whole = "whole " if (number if numbers else type(default)) is int else ""
+        kind = f"{whole}numbers as in {example}" if numbers else f"a {whole}number"
         raise InvalidInput(f"prior {name!r} has {key}={text}; give {kind}") from None
     if isinstance(default, tuple) or key == "joints":
         return tuple(part.strip() for part in text.split("/"))

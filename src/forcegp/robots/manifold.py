@@ -152,6 +152,11 @@ class ConfigurationSpace:
             lambda group: chart_velocity(group.kind, step[..., group.rows], v[..., group.rows]),
         )
 
+    def chart_matrix(self, step: Tensor) -> Tensor:
+        """The matrix (..., nv, nv) of `chart_velocity`: the derivative of a step in one more step from its end."""
+        axes = torch.eye(self.nv, dtype=step.dtype, device=step.device).expand(*step.shape, -1)
+        return self.chart_velocity(step[..., None, :].expand_as(axes), axes).mT
+
     def midpoint_step(self, step: Tensor) -> Tensor:
         """The step (..., nv) of the implicit midpoint rule whose body velocity times dt is `step` (:func:`cayley`)."""
         if not self.groups:

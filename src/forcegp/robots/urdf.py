@@ -205,11 +205,6 @@ def _scalar(element: Element | None, attribute: str, default: float, place: _Pla
     return value
 
 
-def _limit(element: Element | None, attribute: str, place: _Place) -> float:
-    """A limit >= 0 that may be absent; a negative one is none."""
-    return _non_negative(element, attribute, math.inf, place, "no limit")
-
-
 def _loss(element: Element | None, attribute: str, place: _Place) -> float:
     """Damping or dry friction: a finite number >= 0 that may be absent; a negative one is none."""
     value = _non_negative(element, attribute, 0.0, place, "none")
@@ -262,15 +257,15 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     products = [] if entries is None else [key for key in ("ixy", "ixz", "iyz") if key not in entries.attrib]
     if products:
         place.problems.ignore("a product of inertia that is not given is 0", place.owner, f"no {', '.join(products)}")
-    missing = np.nan if mass else 0.0
-    ixx, ixy, ixz, iyy, iyz, izz = (
-        missing
-        if entries is None
-        else 0.0
-        if key in products
-        else _number(_attribute(entries, key, place), f"<inertia> {key}", place)
-        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    )
+    given = {} if entries is None else {key: "0" for key in products} | entries.attrib
+
+    def entry(key: str) -> float:
+        if entries is None:  # a mere frame has none
+            return np.nan if mass else 0.0
+        text = given[key] if key in given else _attribute(entries, key, place)
+        return _number(text, f"<inertia> {key}", place)
+
+    ixx, ixy, ixz, iyy, iyz, izz = map(entry, ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
     origin = _origin(_optional_child(element, "origin", place), place)
     rotation = origin[:3, :3]
     about_center = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
@@ -299,7 +294,7 @@ def _joint(
             )
     origin = _origin(_optional_child(element, "origin", place), place)
     axis_element = _optional_child(element, "axis", place)
-    if kind == "planar" and axis_element is None:  # x by the format, which nobody means
+    if kind == "planar" and axis_element is None:  # x by the format: a base that moves up the wall
         place.problems.ignore("a planar joint without <axis> moves along x and y", place.owner, "no <axis>")
     axis = _vector(axis_element, "xyz", (0.0, 0.0, 1.0) if kind == "planar" else (1.0, 0.0, 0.0), place)
     length, directed = float(np.linalg.norm(axis)), kind in (*MOVABLE, "planar")
@@ -333,8 +328,8 @@ def _joint(
         axis=unit,
         lower=lower,
         upper=upper,
-        velocity_limit=_limit(limit, "velocity", place),
-        effort_limit=_limit(limit, "effort", place),
+        velocity_limit=_non_negative(limit, "velocity", math.inf, place, "no limit"),
+        effort_limit=_non_negative(limit, "effort", math.inf, place, "no limit"),
         damping=_loss(dynamics, "damping", place),
         friction=_loss(dynamics, "friction", place),
         mimics=None if mimic is None or kind == "fixed" else _mimic(mimic, place),

@@ -145,18 +145,12 @@ class MotionFit:
         in_start, in_parameters = motions.in_start, motions.in_parameters
         if not self.space.is_vector_space and in_start is not None and in_parameters is not None:
             # steps from the motions change those from the recording, and steps of the start those from its motion
-            turned, start = self._chart(r), in_start.clone()
-            nv = r.shape[-1]
-            start[..., :nv] @= torch.linalg.inv(self._chart(here.states[:, :nv]))[:, None]
+            turned, start, nv = self.space.chart_matrix(r), in_start.clone(), r.shape[-1]
+            start[..., :nv] @= torch.linalg.inv(self.space.chart_matrix(here.states[:, :nv]))[:, None]
             in_start, in_parameters = turned @ start, turned @ in_parameters
         parts = r[..., None], in_start, in_parameters
         r, A, B = ((part / noise[:, None]).flatten(1, 2) for part in parts if part is not None)
         return r[..., 0], A, B
-
-    def _chart(self, step: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv nv"]:
-        """Derivative of a step in one more step from its end."""
-        axes = torch.eye(step.shape[-1], dtype=step.dtype).expand(*step.shape, -1)
-        return self.space.chart_velocity(step[..., None, :].expand_as(axes), axes).mT
 
     def curvature(
         self, here: _Point, noise: Tensor, sigma: Tensor, damping: float = 0.0

@@ -41,7 +41,7 @@ from forcegp.priors import ForcePrior
 from forcegp.priors.contact_friction import JAMMING, TabulatedCurve, refined_loads
 from forcegp.robots.arguments import whole_number
 
-FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9
+FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9  # rows that noise is learned from, and the share of them that needs no word
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
 
