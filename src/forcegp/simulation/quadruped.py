@@ -135,11 +135,9 @@ def _base_motion(
         return torch.cat([six, t.new_zeros(len(t), robot.nv - 6)], -1)
 
     def velocities(t: Tensor) -> Tensor:
-        """The chart's Jacobian from columns: d step / dt = J^-1 v, so v solves it."""
+        """d step / dt is the matrix of the chart times v, so v solves it."""
         step, change = torch.func.jvp(steps, (t,), (torch.ones_like(t),))[:2]
-        unit = torch.eye(robot.nv, dtype=t.dtype)[:6]
-        columns = [robot.space.chart_velocity(step, axis.expand_as(step))[:, :6] for axis in unit]
-        return torch.linalg.solve(torch.stack(columns, -1), change[:, :6])
+        return torch.linalg.solve(robot.space.chart_matrix(step)[:, :6, :6], change[:, :6])
 
     V, dV = torch.func.jvp(velocities, (time,), (torch.ones_like(time),))[:2]
     return robot.space.integrate(home, steps(time))[:, :7], V, dV
