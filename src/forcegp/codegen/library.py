@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from functools import cache, reduce
 from operator import or_
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -306,17 +307,26 @@ def _pointers(count: int, rows: Iterable[Tensor]) -> list[int]:
 
 def are_plain(given: Sequence[object], size: int) -> bool:
     """Whether these are tensors (size,) or (n, size), all of one shape, that need neither conversion nor a graph."""
-    return all(
-        type(x) is Tensor
-        and x.shape == given[0].shape  # type: ignore[attr-defined]  # of a tensor, or they differ
-        and x.shape[-1:] == (size,)
-        and x.dim() <= 2
-        and x.dtype is torch.float64
-        and not x.requires_grad
-        and x.is_cpu
-        and x.is_contiguous()
-        for x in given
-    )
+    shape = getattr(given[0], "shape", ())
+    if len(shape) not in (1, 2) or shape[-1:] != (size,):
+        return False
+    for x in given:  # not a generator: every prediction of one state passes here
+        if (
+            type(x) is not Tensor
+            or x.shape != shape
+            or x.dtype is not torch.float64
+            or x.requires_grad
+            or not x.is_cpu
+            or not x.is_contiguous()
+        ):
+            return False
+    return True
+
+
+def as_plain(given: Any) -> Any:
+    """A vector of an array as a tensor; everything else as it is."""
+    plain = type(given) is np.ndarray and given.dtype == np.float64 and given.ndim == 1
+    return torch.tensor(given) if plain else given
 
 
 def aligned(values: np.ndarray) -> Tensor:

@@ -10,10 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, require_plain
+from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
@@ -128,8 +129,8 @@ class Predictor(Summary):
     def mean(self, q: Any, v: Any, u: Any) -> Tensor:
         """The mean acceleration (nv,) or (n, nv) in rad/s^2 or m/s^2."""
         compiled = self.compiled("mean")
-        if compiled and self._is_one_state(q, v, u):
-            return self._at_one("mean", compiled, q, v, u)[0]
+        if compiled and (one := self._one_state(q, v, u)):
+            return self._at_one("mean", compiled, one)[0]
         states, single = self._states(q, v, u)
         if not compiled:
             return _finished([self._mean(*part)[0] for part in self._blocks(states)], single)
@@ -145,8 +146,8 @@ class Predictor(Summary):
         if self.kind == "none":
             raise InvalidInput("this predictor has no covariance; make it with covariance='compressed' or 'exact'.")
         nv, compiled = self.nv, self.compiled("covariance") if self.compressed is not None else None
-        if compiled and self._is_one_state(q, v, u):
-            a, covariance = self._at_one("covariance", compiled, q, v, u)
+        if compiled and (one := self._one_state(q, v, u)):
+            a, covariance = self._at_one("covariance", compiled, one)
             return a, covariance.view(nv, nv)
         states, single = self._states(q, v, u)
         if compiled and not (torch.is_grad_enabled() and any(x.requires_grad for x in states)):
@@ -165,8 +166,8 @@ class Predictor(Summary):
         Where a base moves, da_dq (..., nv, nv) is that in a step d from q: q moves to `robot.integrate(q, d)`.
         """
         (_, nv, nu), compiled = self.sizes, self.compiled("linearize")
-        if compiled and self._is_one_state(q, v, u):
-            a, jacobian = self._at_one("linearize", compiled, q, v, u)
+        if compiled and (one := self._one_state(q, v, u)):
+            a, jacobian = self._at_one("linearize", compiled, one)
             return Linearization(a, *jacobian.view(nv, -1).split([nv, nv, nu], dim=-1))
         states, single = self._states(q, v, u)
         require_plain(states, "linearize", "take derivatives of `mean` instead, of a predictor with compile=False")
@@ -273,8 +274,8 @@ class Predictor(Summary):
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""
         program, (_, nv, nu), m = self.compiled("forces"), self.sizes, len(self.posterior.system.contacts)
-        if program and self._is_one_state(q, v, u):
-            Q, around = self._at_one("forces", program, q, v, u)
+        if program and (one := self._one_state(q, v, u)):
+            Q, around = self._at_one("forces", program, one)
         else:
             states, single = self._states(q, v, u)
             Q, around = (_single(x, single) for x in self.run("forces", states))
@@ -324,14 +325,14 @@ class Predictor(Summary):
                 parts.append((mean, W @ self._covariance(W, features) @ W.mT) if kind == "covariance" else (mean,))
         return [_finished(list(rows), False).flatten(1) for rows in zip(*parts, strict=True)]
 
-    def _at_one(self, kind: str, program: RowFunction, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-        """The same at one state that needs no conversion, whose numbers are checked on the way."""
-        require_plain((q, v, u), "a compiled predictor", INSTEAD_OF_TRANSFORMS)
-        bits, outputs = program.single(q, v, u)
+    def _at_one(self, kind: str, program: RowFunction, state: Sequence[Tensor]) -> list[Tensor]:
+        """The same at what `_one_state` gave, whose numbers are checked on the way."""
+        require_plain(state, "a compiled predictor", INSTEAD_OF_TRANSFORMS)
+        bits, outputs = program.single(*state)
         if bits & NOT_FINITE:
             raise InvalidInput("q, v or u has values that are not finite; drop or repair those rows.")
         if bits:
-            self._repair(kind, [q[None], v[None], u[None]], [x[None] for x in outputs])
+            self._repair(kind, [x[None] for x in state], [x[None] for x in outputs])
         return outputs
 
     def compiled(self, kind: str) -> RowFunction | None:
@@ -413,16 +414,16 @@ class Predictor(Summary):
         single = len(shape) == 1
         return [x[None] if single else x for x in states], single
 
-    def _is_one_state(self, q: Any, v: Any, u: Any) -> bool:
-        """Whether these are tensors (size,) that need no conversion. Raises InvalidInput for turns of other lengths."""
+    def _one_state(self, *given: Any) -> Sequence[Tensor] | None:
+        """Tensors or arrays (size,) as tensors, else None. Raises InvalidInput for quaternions of other lengths."""
+        state = [as_plain(x) for x in given] if type(given[0]) is np.ndarray else given
         nq, nv, nu = self.sizes
         if nq == nv == nu:
-            return are_plain((q, v, u), nv) and q.dim() == 1
-        plain = are_plain((q,), nq) and are_plain((v,), nv) and are_plain((u,), nu)
-        if not plain or not q.dim() == v.dim() == u.dim() == 1:
-            return False
-        self.space.check(q)
-        return True
+            return state if are_plain(state, nv) and state[0].dim() == 1 else None
+        if not all(are_plain((x,), size) and x.dim() == 1 for x, size in zip(state, self.sizes, strict=True)):
+            return None
+        self.space.check(state[0])
+        return state
 
     def _blocks(self, states: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
         rows = max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
