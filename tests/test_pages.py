@@ -36,7 +36,9 @@ def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
     example, poses, wheels = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     run_example(poses, tmp_path)
     assert run_example(wheels, tmp_path).split() == ["True", "True"]
-    simulated, own, bags, regression = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    simulated, own, bags, feet, regression = (
+        block.splitlines() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    )
     for command in own:
         done = run_here(*shlex.split(command)[1:], folder=tmp_path)
         assert done.returncode == 0, done.stderr
@@ -55,7 +57,7 @@ def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
     assert [round(float(x), 6) for x in re.findall(r"-?\d\.\d+(?:e-\d+)?", step)] == [0.1, 0, 0, 0, 0, 0.3, 0.2]
     assert inputs == "('knee', 'foot_stands')"
     assert len(re.findall(r"-?\d+\.\d+", force)) == 3
-    for command in (*simulated, *bags, *regression):
+    for command in (*simulated, *bags, *feet, *regression):
         parse_arguments(shlex.split(command)[1:])
 
 

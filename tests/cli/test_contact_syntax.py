@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from forcegp.cli.learning_options import EXAMPLE, parse_contact, parse_contacts
+from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts, parse_feet, parse_wheels
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
+from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_point, rolling
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,27 @@ def test_none_is_no_contact():
 def test_anything_else_is_refused(text):
     with pytest.raises(InvalidInput):
         parse_contact(text)
+
+
+def test_feet_and_wheels_read_as_written():
+    left, right = fixed_point("FL", switch="FL_stands"), fixed_point("a@b", (0.0, 0.1, -0.02), "a@b_stands")
+    assert parse_feet(("FL", "a@b@0,.1,-2e-2")) == (*left, *right)
+    assert parse_wheels(("left=0.1", "a=b=.2")) == (*rolling("left", 0.1), *rolling("a=b", 0.2))
+    assert parse_feet(()) == parse_wheels(()) == ()
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        *((parse_feet, text) for text in ("", "@0,0,0", "FL@1,2", "FL@a,b,c", "FL@0,0,nan")),
+        *((parse_wheels, text) for text in ("", "left", "=0.1", "left=", "left=wide", "left=-1", "left=inf")),
+    ],
+)
+def test_other_feet_and_wheels_are_refused(parse, text):
+    with pytest.raises(InvalidInput):
+        parse((text,))
+    with pytest.raises(InvalidInput, match="twice"):
+        parse_feet(("FL", "FL@0,0,1"))
 
 
 def test_a_model_is_scored_under_other_contacts(forcegp, workshop):

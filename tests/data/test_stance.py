@@ -92,6 +92,21 @@ def test_prepared_rows_carry_the_flags_and_leave_open_ones_out():
     assert Preparation(stance="auto", every=2).rows(log).u.shape == prepared.dataset.u.shape
 
 
+def test_open_rows_are_filled_by_the_nearest_decided_one():
+    log, flags = walk(1)
+    found = estimate_stance(log)
+    filled = found.filled(log)
+    assert (filled.u[:, SWITCHES] == flags).mean() > 0.98
+    decided = np.isfinite(found.flags)
+    assert (filled.u[:, SWITCHES] == found.flags)[decided].all()
+    own, known = found.flags[:, 0], np.flatnonzero(decided[:, 0])
+    for row in np.flatnonzero(~decided[:, 0]):
+        distance = np.abs(known - row)
+        assert filled.u[row, SWITCHES.start] in own[known[distance == distance.min()]]
+    with pytest.raises(DatasetError, match="open in all 1440 rows"):
+        replace(found, flags=np.full_like(found.flags, np.nan)).filled(log)
+
+
 def test_what_stance_needs_is_named():
     log, _ = walk(0)
     with pytest.raises(ContactError, match="no contact of the system has a switch"):

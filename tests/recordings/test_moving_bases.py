@@ -13,7 +13,7 @@ from forcegp import MechanicalSystem, Robot
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
-from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
+from forcegp.simulation import QuadrotorConfig, QuadrupedConfig, simulate_quadrotor, simulate_quadruped
 
 FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down -> north, west, up: half a turn about x
 PLAIN = ColumnMapping(time="time", q=("q{0..6}",), v=("v{0..5}",), u=("u{0..3}",), a=("a{0..5}",))
@@ -323,3 +323,39 @@ def test_turning_joints_stand_where_the_robot_has_them(tmp_path, orientation):
     import_recordings([write_text(tmp_path / "log.csv", table)], tmp_path / "out.h5", mapping, system=system)
     expected = np.column_stack([slide, quaternion, turned])
     np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q, expected, rtol=0, atol=1e-14)
+
+
+def walking_log(tmp_path, u: np.ndarray):
+    """A log of a walker that has these columns of u, its dataset, and the mapping."""
+    walk = simulate_quadruped(QuadrupedConfig(seconds=1.0, seed=2))
+    write_text(tmp_path / "walk.csv", columns(walk, u=u(walk)))
+    mapping = ColumnMapping(time="time", q=("q{0..18}",), v=("v{0..17}",), u=(f"u{{0..{u(walk).shape[1] - 1}}}",))
+    return walk, mapping
+
+
+def test_flags_that_a_log_lacks_are_open(tmp_path):
+    walk, mapping = walking_log(tmp_path, lambda walk: 1e3 * walk.u[:, :12])
+    mapping = replace(mapping, unit={"u": ("mNm",)}, sign={"u": (-1.0,)})
+    given = {"paths": [tmp_path / "walk.csv"], "out": tmp_path / "walk.h5", "system": walk.system}
+    with pytest.raises(InvalidInput, match="u has 12 columns for 16 inputs"):
+        import_recordings(mapping=mapping, **given)
+    done = import_recordings(mapping=mapping, options=ImportOptions(stance="auto"), **given)
+    assert done["open_switches"] == list(walk.system.inputs[12:])
+    assert done["columns"]["u"] == [f"u{k}" for k in range(12)]
+    u = Dataset.load(tmp_path / "walk.h5").u
+    np.testing.assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
+    assert (u[:, 12:] == 0.0).all()
+
+
+def test_signs_and_scales_of_the_actuators_leave_flags_alone(tmp_path):
+    walk, mapping = walking_log(tmp_path, lambda walk: walk.u)
+    signs = (-1.0, *[1.0] * 11)
+    for change in ({"sign": {"u": (-1.0,)}}, {"sign": {"u": signs}}, {"scale": {"u": (0.5,)}}):
+        options = ImportOptions(stance="auto")
+        done = import_recordings([tmp_path / "walk.csv"], tmp_path / "walk.h5", replace(mapping, **change),
+                                 system=walk.system, options=options)  # fmt: skip
+        u = Dataset.load(tmp_path / "walk.h5").u
+        assert done["open_switches"] == []
+        np.testing.assert_array_equal(u[:, 12:], walk.u[:, 12:])
+        [values] = [x["u"] for x in change.values()]
+        np.testing.assert_allclose(u[:, :12], walk.u[:, :12] * np.array(values), rtol=1e-6)

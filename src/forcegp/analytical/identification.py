@@ -106,8 +106,13 @@ def identify_analytical(
             r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
         else:
             r, in_parameters, in_terms = recorded.in_acceleration(parameters, x[split:], a)
-        in_bodies = np.einsum("nibp,bpk->nibk", in_parameters, bodies.derivatives(x[:split]))
-        return r, np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1)
+        jacobian = np.empty((*r.shape, len(x)))
+        derivatives = bodies.derivatives(x[:split])
+        size = split // len(derivatives)
+        for body, derivative in enumerate(derivatives):  # matrix products, where `einsum` would loop by itself
+            jacobian[..., body * size : (body + 1) * size] = in_parameters[:, :, body] @ derivative
+        jacobian[..., split:] = in_terms
+        return r, jacobian
 
     center, spread = terms.prior()
     weight = prior_strength**0.5

@@ -31,8 +31,9 @@ from forcegp.errors import NumericalError
 
 ROWS = 2000
 """Rows that levels are found from at most, evenly spread."""
-LEAST = 1e-3
-"""Smallest standard deviation, relative to that of all residuals."""
+LEAST, MOST = 1e-3, 1e2
+"""Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
+of the search that goes further has a covariance that rounding makes singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class NoiseLevels:
         M: Float[np.ndarray, "rows nv nv"],
         H: Float[np.ndarray, "rows nv nv"] | None = None,
     ) -> "NoiseLevels":
-        """Those of largest likelihood, by L-BFGS on their logarithms, each at least `LEAST` of the whole.
+        """Those of largest likelihood, by L-BFGS on their logarithms, each between `LEAST` and `MOST` times the whole.
 
         `H` is that of Gauss' principle under constraints; None is M^-1.
         """
@@ -72,7 +73,7 @@ class NoiseLevels:
             return float(value.detach()), gradient.numpy()
 
         # scipy's search, since the import of torch.optim takes seconds
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(np.log(LEAST), None)] * len(start))
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(np.log(LEAST), np.log(MOST))] * len(start))
         acceleration, force = whole.numpy() * np.exp(found.x).reshape(whole.shape)
         return cls(acceleration, force)
 

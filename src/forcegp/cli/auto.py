@@ -49,11 +49,12 @@ class Auto(Resuming, Import):
     For example:
       forcegp auto run.csv --time t --q 'pos{1..6}' --u 'tau{1..6}' --robot arm.urdf --out answer
       forcegp auto run1.csv run2.csv --robot arm.urdf --mapping columns.yaml --correct --out answer
-      forcegp auto walk.csv --mapping columns.yaml --identified dog.json --out answer
+      forcegp auto walk.csv --mapping columns.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out answer
+      forcegp auto flight.csv --mapping columns.yaml --identified drone.json --out answer
     """
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "that of --identified", Path)] = None
-    """The robot that was recorded. Feet that stand, thrusters and actuators of another kind come with --identified."""
+    """The robot that was recorded. Thrusters, actuators and contacts of another kind come with --identified."""
     out: Annotated[Path, arg(metavar="FOLDER")] = field()
     """The folder of results; an unfinished one resumes."""
     correct: bool = False
@@ -105,12 +106,12 @@ class Auto(Resuming, Import):
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing and identifying"):
-            rows, recording, settings = self._prepared_rows(
-                terminal, dataset, self._timed(terminal, preparation, dataset)
-            )
-            identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
+            timed = self._timed(terminal, preparation, dataset)
+            timed = replace(timed, stance="auto") if done["open_switches"] else timed
+            rows, recording, decided, settings = self._prepared_rows(terminal, dataset, timed)
+            identified = forcegp.identify_analytical(decided, friction=forcegp.analytical.LAWS)
             try:
-                payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
+                payload, why_not = forcegp.analytical.identify_payload(decided, link=self.link), ""
             except DatasetError as error:
                 payload, why_not = None, f"not estimated: {error}"
         document, posterior = self._validated(terminal, rows, recording, system)
@@ -166,22 +167,28 @@ class Auto(Resuming, Import):
         self, terminal: Terminal, system: forcegp.MechanicalSystem, mapping: forcegp.ColumnMapping, path: Path
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
-        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
-        options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
         mistakes: list[forcegp.checks.Finding] = []
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress, atomic_file(path, overwrite=True) as temporary:
                     done = forcegp.import_recordings(
-                        self.logs, temporary, mapping, system=system, options=options, report=progress
+                        self.logs, temporary, mapping, system=system, options=self._options(), report=progress
                     )
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
                 mistakes.append(_mistake(error, correction))
                 mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
                 continue
-            dataset = forcegp.Dataset.load(path)
+            dataset, undecided = forcegp.Dataset.load(path), None
+            if done["open_switches"]:
+                try:
+                    dataset = forcegp.data.estimate_stance(dataset).filled(dataset)
+                    dataset.save(path)
+                except DatasetError as error:  # of a mistake, perhaps
+                    undecided = error
             found = [finding for finding in forcegp.checks.quick_check(dataset) if finding.correction]
+            if not found and undecided is not None:
+                raise undecided
             if not found:
                 return dataset, done, mapping, mistakes
             mistakes.append(found[0])
@@ -211,22 +218,28 @@ class Auto(Resuming, Import):
 
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
-    ) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
-        """Rows to learn from, the same at the full rate, and what was done."""
+    ) -> tuple[forcegp.Dataset, forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
+        """Rows to learn from, all rows, those of them whose stance is decided, and what was done."""
+        first = replace(wanted, every=1, stance="log")
         try:
-            chosen = replace(wanted, every=1).apply(raw)
+            chosen = first.apply(raw)
         except DatasetError as error:
             if self.lag != "auto" or wanted.lag != "auto":
                 raise
             terminal.note(f"rotors are taken to follow at once: {error}")
-            chosen = replace(wanted, every=1, lag=0.0).apply(raw)
+            chosen = replace(first, lag=0.0).apply(raw)
         numbers = chosen.preparation
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         numbers = replace(numbers, trim=max(self.trim, period))
-        rows = replace(numbers, every=numbers.thinning(raw) if self.every is None else wanted.every).apply(raw)
+        every = numbers.thinning(raw) if self.every is None else wanted.every
+        rows = replace(numbers, every=every, stance=wanted.stance).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.dataset.save(temporary)
-        return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
+        recording = decided = numbers.apply(raw).dataset
+        if wanted.stance == "auto":
+            stance = forcegp.data.estimate_stance(recording)
+            recording, decided = stance.filled(recording), stance.written(recording)
+        return rows.dataset, recording, decided, {**rows.report, "why": chosen.report["why"]}
 
     def _validated(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, system: forcegp.MechanicalSystem
@@ -248,6 +261,9 @@ class Auto(Resuming, Import):
             found = forcegp.validate(
                 comparison, self.out / "validation", models=models, seeds=1, overwrite=self.overwrite, progress=report
             )
+        for name, model in found.document["models"].items():
+            for failure in model["failures"]:
+                terminal.warn(f"{name} was not fitted: {failure['error']}")
         with terminal.progress("learning from all rows"):
             best = forcegp.validation.recommended(found.document)
             if best is None:

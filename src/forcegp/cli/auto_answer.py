@@ -9,6 +9,7 @@ import forcegp
 import forcegp.analytical
 import forcegp.checks
 import forcegp.data
+from forcegp.cli.import_log import stance_text
 from forcegp.cli.terminal import number
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
@@ -72,6 +73,7 @@ def answer_lines(
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
         ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
+        *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *(of_joints if joints else []),
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg")] if moving else []),
         ("payload", held),

@@ -15,8 +15,8 @@ import forcegp.models
 import forcegp.report
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Command, listed, require_free_file, unless_given
+from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import SystemChoice, carried_over, with_observed_wind
-from forcegp.cli.learning_options import CONTACTS, parse_contacts
 from forcegp.cli.terminal import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,

@@ -13,8 +13,8 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, listed, numbers_of, require_free_file, unless_given
+from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import RobotOptions
-from forcegp.cli.learning_options import CONTACTS, parse_contacts
 from forcegp.cli.terminal import Terminal, columns, number
 from forcegp.errors import InvalidInput
 

@@ -25,7 +25,7 @@ GROUPS: Mapping[str, str] = {
     "Timing": "start end gap resample rate",
     "Preparation": "cutoff differentiate delay lag stance every trim",
     "Robot": "robot shapes inertias base root identified "
-    "lock armature gravity beyond_limits link system contact known_force",
+    "lock armature gravity beyond_limits link system contact feet wheels known_force",
     "Scene": "surface contact_model tool_friction friction_coefficient joint_friction patch wind",
     "Motion": "seconds trajectories start_rows starts integrator baumgarte samples posture limits limit_share avoid "
     "clearance tries bandwidth false_alarms",

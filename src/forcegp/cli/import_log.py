@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +14,8 @@ import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, URDF, require_free_file, unless_given
+from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, listed, require_free_file, unless_given
+from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ForceGPError, InvalidInput
@@ -41,10 +42,16 @@ class Import(PreparationOptions, RobotOptions):
       forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
       forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
+      forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
     """
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "none", Path)] = None
     """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
+    feet: Annotated[tuple[str, ...], listed(FEET, "none", goes_on=NUMBERS)] = ()
+    """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
+    actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped."""
+    wheels: Annotated[tuple[str, ...], listed(WHEELS, "none")] = ()
+    """Wheels that roll about the y axes of these frames without slipping, on level ground; radius in m."""
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
@@ -123,13 +130,14 @@ class Import(PreparationOptions, RobotOptions):
         if self.write_mapping is not None:
             require_free_file(self.write_mapping, overwrite=self.overwrite, own=_is_mapping, what="a mapping")
         mapping = self._mapping(terminal)
-        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
-        options = forcegp.ImportOptions(most_rows=self.max_rows, **{name: getattr(self, name) for name in same})
+        options = self._options()
         system, preparation = self._system(), self._preparation()
         with atomic_file(self.out, overwrite=self.overwrite) as temporary, terminal.progress("importing") as report:
             done = forcegp.import_recordings(
                 self.logs, temporary, mapping, system=system, options=options, report=report
             )
+            if done["open_switches"]:
+                preparation = replace(preparation, stance="auto")
             if not preparation.changes_nothing:
                 done |= _prepared(temporary, preparation, done["rows"])
             if self.write_mapping is not None:  # a mapping that fails leaves no dataset behind
@@ -137,13 +145,27 @@ class Import(PreparationOptions, RobotOptions):
         _report(terminal, self.out, done)
         return {"out": str(self.out), **done}
 
+    def _options(self) -> forcegp.ImportOptions:
+        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
+        given = {name: getattr(self, name) for name in same}
+        return forcegp.ImportOptions(most_rows=self.max_rows, stance="auto", **given)
+
     def _system(self) -> forcegp.MechanicalSystem | None:
-        """The robot of the options, with the known forces of --identified if that was given."""
+        """The robot of the options, with the known forces and contacts of --identified, or with feet and wheels."""
+        touching = [*parse_feet(self.feet), *parse_wheels(self.wheels)]
+        option = "--feet" if self.feet else "--wheels"
         found = self._identified_system()
         if found is not None:
+            if touching:
+                raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
             return found
         robot = self.chosen_robot()
-        return None if robot is None else self.with_loops(robot)
+        if robot is None:
+            if touching:
+                raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
+            return None
+        system = self.with_loops(robot)
+        return system.with_contacts((*touching, *system.loops)) if touching else system
 
     def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""
@@ -229,6 +251,8 @@ def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
         for name in ("cutoff", "delay", "lag"):
             if name in report["why"]:
                 terminal.note(f"{name}: {report['why'][name]}")
+        if "stance" in report:
+            terminal.note(f"stance: {stance_text(report)}")
         settings = ", ".join(f"{name} {report[name]}" for name in ("cutoff", "delay", "lag", "every", "trim"))
         terminal.note(f"prepared: {settings}; {report['rows'][0]} rows became {report['rows'][1]}")
     how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
@@ -237,6 +261,12 @@ def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
     seconds = sum(recording["seconds"] for recording in done["recordings"])
     rows, episodes = _counted(done["rows"], "row"), _counted(len(done["episodes"]), "episode")
     terminal.show(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
+
+
+def stance_text(report: Mapping[str, Any]) -> str:
+    """How long each foot stands, and how many rows leave it open, of a report of `Preparation`."""
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in report["stance"]["standing"].items())
+    return f"{shares}; {report['stance']['open_rows']} rows left out, which leave one open"
 
 
 def _counted(count: int, what: str) -> str:

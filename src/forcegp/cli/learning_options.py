@@ -19,53 +19,15 @@ import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
 from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, listed, numbers_of, unless_given
+from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import ContactError, ContactWarning, InvalidInput, require_known
-
-SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
-"""Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
 
 PARTS = r"(?!((viscous|coulomb|load)-joint-friction|armature|rotor-inertia)(=.*)?$)[^:]*"
 """What continues an entry of --learn: a part of a link or a joint, but no force."""
 MODEL_PARTS = rf"{FIELDS}|(viscous|coulomb|stribeck|load|offset|direction)(/motions)?"
 """What continues the name of a model: FIELD=VALUE of a prior, or a law of friction."""
-CONTACTS = "FRAME@x,y,z:SURFACE,..."
-EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
-
-
-def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """One contact per text; the single text `none` is no contact. Raises InvalidInput for anything else."""
-    if "none" in texts:
-        if len(texts) > 1:
-            raise InvalidInput("--contact none stands alone; the other contacts contradict it.")
-        return ()
-    return tuple(parse_contact(text) for text in texts)
-
-
-def parse_contact(text: str) -> forcegp.Contact:
-    """`FRAME@x,y,z:SURFACE:numbers`, without `@x,y,z` at the frame's origin. Raises InvalidInput with an example."""
-    place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
-    if kind not in SYNTAX or not place:
-        forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
-        raise InvalidInput(
-            f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
-        )
-    *given, size = _numbers(text, kind, numbers, SYNTAX[kind])
-    vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
-    frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
-    x, y, z = _numbers(text, "the point", point, "x,y,z")
-    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere, "cylinder": forcegp.Cylinder}[kind]
-    return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
-
-
-def _numbers(text: str, what: str, given: str, form: str) -> list[float]:
-    count = form.count(",") + 1
-    complaint = f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
-    values = numbers_of(given, complaint)
-    if len(values) != count:
-        raise InvalidInput(complaint)
-    return values
 
 
 def parse_learn(words: Sequence[str]) -> tuple[forcegp.models.Learned, ...]:

@@ -14,6 +14,7 @@ import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import DATASET, require_free_file, unless_given
+from forcegp.cli.import_log import stance_text
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, facts, shown
 from forcegp.errors import InvalidInput
@@ -85,8 +86,7 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
             )
             values[f"{name} of u"] = f"{milliseconds} ms{'' if why is None else f'; {why}'}"
     if "stance" in report:
-        shares = ", ".join(f"{name} {share:.0%}" for name, share in report["stance"]["standing"].items())
-        values["stance"] = f"{shares}; {report['stance']['open_rows']} rows left out, which leave one open"
+        values["stance"] = stance_text(report)
     tables: list[Any] = [facts(f"{out}: prepared", values)]
     if cutoff is None:
         return tables

@@ -57,16 +57,29 @@ class Stance:
         rows = {name: getattr(self, name)[index] for name in ("flags", "speed", "force")}
         return replace(self, **rows)
 
+    def filled(self, dataset: Dataset) -> Dataset:
+        """All rows, where open ones have the flag of the nearest row that is decided. Raises DatasetError for none."""
+        rows, decided = np.arange(len(self.flags)), np.isfinite(self.flags)
+        if not decided.any(axis=0).all():
+            raise self._open(len(rows))
+        nearest = [
+            np.interp(rows, rows[known], own[known]) > 0.5 for own, known in zip(self.flags.T, decided.T, strict=True)
+        ]
+        return replace(dataset, u=np.column_stack([dataset.u[:, : -len(self.names)], *nearest]))
+
     def written(self, dataset: Dataset) -> Dataset:
         """The rows that are decided, with these flags in the last columns of u. Raises DatasetError where none is."""
         u = np.concatenate([dataset.u[:, : -len(self.names)], self.flags], axis=1)
         decided = np.flatnonzero(np.isfinite(u).all(axis=1))
         if not len(decided):
-            raise DatasetError(
-                f"motion and forces leave the stance open in all {len(u)} rows; give the flags "
-                f"{', '.join(self.names)} in the last columns of u, or filter the velocities first."
-            )
+            raise self._open(len(u))
         return replace(dataset, u=np.where(np.isfinite(u), u, 0.0)).rows(decided)
+
+    def _open(self, rows: int) -> DatasetError:
+        return DatasetError(
+            f"motion and forces leave the stance open in all {rows} rows; give the flags {', '.join(self.names)} in "
+            "the last columns of u, or filter the velocities first."
+        )
 
 
 def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem | None = None) -> Stance:

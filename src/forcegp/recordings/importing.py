@@ -24,7 +24,7 @@ from forcegp.recordings.reading import (
     require_plausible_positions,
     warn_of_implausible_forces,
 )
-from forcegp.recordings.signal_plan import SignalPlan, signal_plan
+from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import Source
 
 ROUND_RATE = 1e-3
@@ -47,6 +47,8 @@ class ImportOptions:
     unwrap: continue positions of turning joints that jump by a turn.
     beyond_limits: accept positions beyond the limits of the URDF.
     most_rows: of one recording.
+    stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of
+        what was done names them: `Preparation(stance="auto")` has to find them. "log" refuses such logs.
 
     Raises InvalidInput for numbers that make no sense.
     """
@@ -61,6 +63,7 @@ class ImportOptions:
     unwrap: bool = False
     beyond_limits: bool = False
     most_rows: int = 100_000_000
+    stance: Literal["log", "auto"] = "log"
 
     @usable_arguments("ImportOptions")
     def __post_init__(self) -> None:
@@ -72,6 +75,8 @@ class ImportOptions:
             raise InvalidInput("a rate asks for resampling; leave out `rate` or `resample` no.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
+        if self.stance not in ("log", "auto"):
+            raise InvalidInput(f"stance is {self.stance!r}; allowed: 'log' or 'auto'.")
         if self.most_rows < 1:
             raise InvalidInput(f"max-rows is {self.most_rows}; it must be at least 1.")
 
@@ -101,7 +106,8 @@ def import_recordings(
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot = None if system is None else system.robot
     sources = _sources([Path(path) for path in paths], mapping)
-    joined = [on_one_clock(source, signal_plan(mapping, source, system), out.parent) for _, source in sources]
+    lacks = {"may_lack_switches": options.stance == "auto"}
+    joined = [on_one_clock(source, signal_plan(mapping, source, system, **lacks), out.parent) for _, source in sources]
     sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
     plans = [plan for _, plan in joined]
     plan = plans[0]
@@ -215,7 +221,11 @@ def _what_was_done(
         "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
-        "columns": {name: [str(item) for item in plan.signals if item.signal == name] for name in plan.logged},
+        "columns": {
+            name: [str(x) for x in plan.signals if x.signal == name and not (name == "u" and x.expression is LACKING)]
+            for name in plan.logged
+        },
+        "open_switches": list(plan.open_switches),
         "signals": {
             name: f"logged and {made[name]}" if name in lacking else "logged" if name in plan.logged else made[name]
             for name in SIGNALS

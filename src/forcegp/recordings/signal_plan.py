@@ -18,7 +18,7 @@ from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, la
 from forcegp.recordings.source import Columns, Source
 
 LACKING = LinearExpression({}, 0.0)
-"""This very object: an entry of v or a that the log lacks, which is differentiated."""
+"""This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
 
 
@@ -65,6 +65,11 @@ class SignalPlan:
         return tuple(dict.fromkeys(item.signal for item in self.signals))
 
     @property
+    def open_switches(self) -> tuple[str, ...]:
+        """Switches of contacts that the log lacks: columns of u that are 0."""
+        return tuple(item.joint for item in self.signals if item.signal == "u" and item.expression is LACKING)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Every column that is needed, each once."""
         expressions = [item.expression for item in self.signals]
@@ -73,11 +78,16 @@ class SignalPlan:
 
 
 def signal_plan(
-    mapping: ColumnMapping, source: Source, system: forcegp.mechanics.MechanicalSystem | None
+    mapping: ColumnMapping,
+    source: Source,
+    system: forcegp.mechanics.MechanicalSystem | None,
+    *,
+    may_lack_switches: bool = False,
 ) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot if there is one.
 
     Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
+    With `may_lack_switches`, u may end with the actuators.
     Raises InvalidInput for columns, joints and numbers of them that do not fit, FileFormatError for missing columns.
     """
     robot = None if system is None else system.robot
@@ -88,12 +98,18 @@ def signal_plan(
     for signal in SIGNALS:
         patterns = getattr(mapping, signal)
         if patterns is None and log[signal]:
-            patterns = guessed_columns(signal, tuple(log[signal]), source)
+            names = tuple(log[signal])
+            patterns = guessed_columns(signal, names, source)
+            if patterns is None and signal == "u" and may_lack_switches and system is not None and system.actuators:
+                patterns = guessed_columns(signal, names[: len(system.actuators)], source)
             if patterns is not None:
                 guessed.append(f"{signal} = {', '.join(patterns)}")
                 found[signal] = [LinearExpression({name: 1.0}) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
+    switches = len({x.switch for x in (system.contacts if system and may_lack_switches else ())} - {None})
+    if system is not None and switches and len(found.get("u", ())) == len(system.inputs) - switches:
+        found["u"] = [*found.get("u", ()), *[LACKING] * switches]
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
         if signal not in found and (system is None or log[signal]):
             raise InvalidInput(
@@ -126,7 +142,7 @@ def signal_plan(
         for name, expressions in found.items()
         for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
     )
-    lacking = {name: [x.expression is LACKING for x in signals if x.signal == name] for name in found}
+    lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
     episode = mapping.episode
     if episode is None and source.suggested_episode in source.columns():
         episode = source.suggested_episode
@@ -216,6 +232,7 @@ def _signals(
         listed = ", ".join(names) or "none"
         raise InvalidInput(f"{signal} has {len(expressions)} columns for {len(names)} {what} ({listed}); {remedy}")
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, ())]
+    switches = [name for name in names if signal == "u" and columns[name] == "1"]
     for name in order:
         index, si = names.index(name), columns[name]
         unit = _unit(signal, given, index, columns, by_kind=not plain)
@@ -226,12 +243,23 @@ def _signals(
                 "per joint."
             )
         sign, scale, offset = (
-            _at(f"{what} of {signal}", getattr(mapping, what).get(signal, (neutral,)), index, names)
-            for what, neutral in (("sign", 1.0), ("scale", 1.0), ("offset", 0.0))
+            _factor(mapping, what, signal, index, names, switches)
+            for what in (("sign", 1.0), ("scale", 1.0), ("offset", 0.0))
         )
         if name in turned and signal != "u":
             sign, offset = -sign, -offset
         yield JointSignal(signal, name, expressions[index], unit, sign * scale, offset)
+
+
+def _factor(
+    mapping: ColumnMapping, what: tuple[str, float], signal: str, index: int, names: list[str], switches: list[str]
+) -> float:
+    """One for all, or one for each; those of all actuators do not change a switch that stands behind them."""
+    name, neutral = what
+    values = getattr(mapping, name).get(signal, (neutral,))
+    if switches and len(values) in (1, len(names) - len(switches)):
+        values = [*values * (1 if len(values) > 1 else len(names) - len(switches)), *[neutral] * len(switches)]
+    return _at(f"{name} of {signal}", values, index, names)
 
 
 def _unit(

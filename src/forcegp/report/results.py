@@ -147,7 +147,7 @@ def validation_table(document: Mapping[str, Any], names: Mapping[str, str]) -> T
     for name, model in document["models"].items():
         motions = model.get("motions")
         last = motions["rms"][-1] if motions and motions["rms"] else None
-        covered = model["coverage_95"]
+        covered = model.get("coverage_95")  # a model that failed has no score
         inside = "–" if covered is None else f"{100.0 * covered['median']:.0f} %"
         rows.append([names.get(name, name), cell(model.get("nrmse")), cell(last), inside])
     header = ["model", "nRMSE of the acceleration", "RMS of q at the longest horizon", "inside the 95 % interval"]
