@@ -143,6 +143,22 @@ def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():
     assert {each["model"] for each in alone.values()} == {"net"}
 
 
+@pytest.mark.parametrize(
+    ("squared", "taken"),
+    [
+        ([0.01, 0.4, 0.09], True),  # .41 of the error, better everywhere: three stretches cannot show it
+        ([0.7, 0.9, 0.8], False),  # .89 of it, which is not much
+        ([0.001, 0.002, 1.3], False),  # lower by .66, but not mostly
+    ],
+)
+def test_too_little_time_to_show_a_large_difference_decides_for_it(squared, taken):
+    found = paired_test("nrmse", "gp", "ls", np.array([[squared]]), np.ones((1, 1, 3)))
+    assert found.outcome == "no difference"
+    assert found.speaks_for_it == taken
+    nats = paired_test("nlpd", "gp", "ls", np.array([[[-4.0, 0.9, 0.9]]]), np.ones((1, 1, 3)))
+    assert (nats.outcome, nats.ahead, nats.speaks_for_it) == ("no difference", 3, False)
+
+
 def test_a_model_whose_motions_diverge_is_not_the_best():
     kinds = {"a": "force prior", "b": "force prior"}
     cells = {"a": [cell(0, 1.0, diverged=2, motion=0.01)], "b": [cell(0, 1.0, diverged=0, motion=0.5)]}

@@ -18,6 +18,7 @@ from scipy.stats import t as student
 
 CERTAINTY = 0.95
 MARGIN = 0.02  # of a ratio: a difference below it matters to nobody, however sure it is
+CLEAR, MOSTLY = 0.67, 0.8  # ratio and share of stretches that decide where a log is too short to show anything
 MOST_LOG = 700.0  # of a ratio that is still a finite number
 
 SCORES: Mapping[str, str] = {
@@ -69,6 +70,15 @@ class PairedTest:
             return "no difference"
         low, high = self.interval
         return "better" if high < equal else "worse" if low > equal else "no difference"
+
+    @property
+    def speaks_for_it(self) -> bool:
+        """Whether the challenger is the one to take: shown to be better, or a third better in most stretches.
+
+        A short log shows nothing, however large the difference; to stay with the worse model would be no caution.
+        """
+        large = self.score != "nlpd" and self.value <= CLEAR and self.ahead >= MOSTLY * self.stretches
+        return self.outcome == "better" or (self.outcome == "no difference" and large)
 
     @property
     def sentence(self) -> str:
@@ -157,7 +167,7 @@ def conclusions(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) 
 
 
 def winners(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) -> dict[str, dict[str, str]]:
-    """By score the model to take, and why: the best parametric one, unless another is shown to be better than it.
+    """By score the model to take, and why: the best parametric one, unless the test speaks for another.
 
     A score that no model has is missing.
     """
@@ -170,8 +180,9 @@ def winners(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) -> d
                 out[score] = {"model": only, "why": f"the lowest {words}; there is no other kind of model"}
             continue
         answer = compared(score, other, simple, runs, margin)
-        if answer is not None and answer.outcome == "better":
-            out[score] = {"model": other, "why": answer.sentence}
+        if answer is not None and answer.speaks_for_it:
+            sure = "" if answer.outcome == "better" else "a third better or more, on too little time to be sure: "
+            out[score] = {"model": other, "why": sure + answer.sentence}
         else:
             shown = "no comparison was possible" if answer is None else answer.sentence
             out[score] = {"model": simple, "why": f"nothing is shown to be better than the best parametric: {shown}"}
