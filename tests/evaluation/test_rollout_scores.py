@@ -8,6 +8,7 @@ import torch
 
 from forcegp import JointFriction, StructuredGP
 from forcegp.data import recorded_motions
+from forcegp.errors import InvalidInput
 from forcegp.evaluation import rollout_errors, rollout_figure
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
@@ -62,3 +63,16 @@ def test_a_base_is_drawn_by_its_way_from_the_start(posterior, log):
     start = torch.tensor(recorded.q[0, :1])
     way = log.system.robot.difference(start.expand(len(drawn), -1), torch.tensor(recorded.q[0]))
     np.testing.assert_allclose(drawn, way[:, 0], atol=1e-12)
+
+
+def test_starts_that_are_counted_avoid_gaps(log):
+    kept = np.setdiff1d(np.arange(len(log)), [*range(100, 110), *range(300, 330)])
+    found = recorded_motions(log.rows(kept), 40, 0.2)
+    steps = found.u.shape[1]
+    for start in found.rows:
+        at = kept[start : start + steps + 1]
+        np.testing.assert_array_equal(at, at[0] + np.arange(steps + 1))
+    with pytest.raises(InvalidInput, match="uneven"):
+        recorded_motions(log.rows(kept), [int(np.searchsorted(kept, 100)) - 5], 0.2)
+    with pytest.raises(InvalidInput, match="uneven"):
+        recorded_motions(log.rows(kept), 5, 1.0)

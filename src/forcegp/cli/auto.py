@@ -108,10 +108,10 @@ class Auto(Resuming, Import):
         with terminal.progress("preparing and identifying"):
             timed = self._timed(terminal, preparation, dataset)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
-            rows, recording, decided, settings = self._prepared_rows(terminal, dataset, timed)
-            identified = forcegp.identify_analytical(decided, friction=forcegp.analytical.LAWS)
+            rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
+            identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
             try:
-                payload, why_not = forcegp.analytical.identify_payload(decided, link=self.link), ""
+                payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
             except DatasetError as error:
                 payload, why_not = None, f"not estimated: {error}"
         document, posterior = self._validated(terminal, rows, recording, system)
@@ -218,8 +218,8 @@ class Auto(Resuming, Import):
 
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
-    ) -> tuple[forcegp.Dataset, forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
-        """Rows to learn from, all rows, those of them whose stance is decided, and what was done."""
+    ) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
+        """Rows to learn from, the same at the full rate, and what was done."""
         first = replace(wanted, every=1, stance="log")
         try:
             chosen = first.apply(raw)
@@ -230,16 +230,12 @@ class Auto(Resuming, Import):
             chosen = replace(first, lag=0.0).apply(raw)
         numbers = chosen.preparation
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
-        numbers = replace(numbers, trim=max(self.trim, period))
+        numbers = replace(numbers, trim=max(self.trim, period), stance=wanted.stance)
         every = numbers.thinning(raw) if self.every is None else wanted.every
-        rows = replace(numbers, every=every, stance=wanted.stance).apply(raw)
+        rows = replace(numbers, every=every).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.dataset.save(temporary)
-        recording = decided = numbers.apply(raw).dataset
-        if wanted.stance == "auto":
-            stance = forcegp.data.estimate_stance(recording)
-            recording, decided = stance.filled(recording), stance.written(recording)
-        return rows.dataset, recording, decided, {**rows.report, "why": chosen.report["why"]}
+        return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
 
     def _validated(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, system: forcegp.MechanicalSystem

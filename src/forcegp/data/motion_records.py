@@ -35,6 +35,7 @@ class RecordedMotions:
 def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: float) -> RecordedMotions:
     """The motions of that length that begin at the given rows, or at so many rows spread evenly over the recording.
 
+    A number of starts takes motions without a gap, where there are any.
     Raises InvalidInput for rows that do not exist or lie too near to the end of their episode, for steps of time that
     are not equal, and for a length of less than one step.
     """
@@ -58,6 +59,10 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
     if isinstance(starts, int):
         if starts < 1:
             raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
+        gaps = np.abs(np.diff(dataset.time) - dt) > EVEN_STEPS * dt
+        before = np.concatenate([[0], np.cumsum(gaps)])
+        whole = possible[before[possible + steps] == before[possible]]
+        possible = whole if whole.size else possible  # which is refused then
         chosen = possible[np.unique(np.linspace(0, len(possible) - 1, starts).round().astype(int))]
     else:
         chosen = np.asarray(starts, dtype=int)

@@ -25,6 +25,8 @@ WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
 """s: of the averages; of open rows that follow those around them; on either side of what is not sure."""
 SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
 """m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves."""
+QUARTER = 0.3186
+"""Of |x| of a normal number, in standard deviations: a quarter of the rows is quiet also where a foot moves much."""
 FREE, LEAST, BEARS = 0.99, 0.02, 0.4
 """Quantile of the forces on feet that clearly move; shares of the median force at rest: nothing, and surely bearing."""
 FEW = 10
@@ -109,12 +111,12 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     noise = np.empty(len(names))
     widths = [_width(dataset.time[rows]) for rows in episodes]
     for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
+        smooth = np.empty_like(own)
         for rows, width in zip(episodes, widths, strict=True):
-            for size, values in ((speed, own), (force, needed)):
-                size[rows, k] = np.linalg.norm(_averaged(values[rows], width), axis=1)
-        differences = np.concatenate([np.diff(own[rows], n=3, axis=0) for rows in episodes])
-        white = 1.4826 / 20.0**0.5 * np.median(np.abs(differences), axis=0) if len(differences) else np.zeros(1)
-        noise[k] = np.linalg.norm(white) / min(widths) ** 0.5
+            smooth[rows] = _averaged(own[rows], width)
+            force[rows, k] = np.linalg.norm(_averaged(needed[rows], width), axis=1)
+        speed[:, k] = np.linalg.norm(smooth, axis=1)
+        noise[k] = max(_noise(smooth, episodes, [times * width for width in widths]) for times in (1, 2))
     slow = np.maximum(SLOW, DEVIATIONS * noise)
     rests, moves = speed <= slow, speed >= CLEARLY * slow
     bearing = _bearing(force, rests, moves)
@@ -152,6 +154,19 @@ def _motion_and_force(
 def _width(time: Float[np.ndarray, " rows"]) -> int:
     """Rows of a window."""
     return 2 * int(0.5 * WINDOW / np.median(np.diff(time))) + 1 if len(time) > 1 else 1
+
+
+def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], strides: list[int]) -> float:
+    """Root-mean-square noise by third differences over these strides, also of what a filter made alike nearby."""
+    differences = [
+        values[rows[3 * n :]] - 3.0 * values[rows[2 * n : -n]] + 3.0 * values[rows[n : -2 * n]] - values[rows[: -3 * n]]
+        for rows, n in zip(episodes, strides, strict=True)
+        if len(rows) > 3 * n
+    ]
+    if not differences:
+        return 0.0
+    each = np.quantile(np.abs(np.concatenate(differences)), 0.25, axis=0) / (QUARTER * 20.0**0.5)
+    return float(np.linalg.norm(each))
 
 
 def _averaged(values: Float[np.ndarray, "rows m"], width: int) -> Float[np.ndarray, "rows m"]:
