@@ -24,7 +24,7 @@ from forcegp.analytical.identification import joint_terms
 from forcegp.analytical.least_squares import weighted_least_squares
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import DataWarning, InvalidInput
 from forcegp.mechanics import (
     Actuation,
     Armature,
@@ -232,3 +232,34 @@ def test_a_robot_that_cannot_move_teaches_nothing(walker):
     rows = Dataset(q=q.numpy(), v=still, u=u[:, :3].numpy(), a=still, time=np.arange(20.0), system=system)
     with pytest.raises(InvalidInput, match="no equation is left"):
         identify_analytical(rows)
+
+
+def standing(system, count, seed=0):
+    """Rows in which both feet stand and nothing accelerates much."""
+    log = recorded(system, count, seed=seed)
+    u = log.u.copy()
+    u[:, -2:] = 1.0
+    q, v = torch.tensor(log.q), torch.tensor(0.05 * log.v)
+    a = system.dynamics(q, v, torch.tensor(u)).acceleration_map().offset
+    return replace(log, v=v.numpy(), u=u, a=a.numpy())
+
+
+def test_feet_that_are_said_to_swing_are_named_by_the_mass(walker):
+    log = standing(walker, 200)
+    identify_analytical(log)  # without a warning
+    lifted = log.u.copy()
+    lifted[:, -2:] = 0.0
+    with pytest.warns(DataWarning, match="by this log the robot weighs .* Check flags of stance"):
+        identify_analytical(replace(log, u=lifted, a=0.0 * log.a))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_under_constraints_stays_within_doubles(seed):
+    """H of rank 1 and hardly any noise beside it: a search without bounds meets a covariance that is singular."""
+    draw = np.random.default_rng(seed)
+    direction = draw.normal(size=(300, 3, 1))
+    H = direction @ direction.swapaxes(1, 2)
+    residual = (H @ draw.normal(size=(300, 3, 1)))[..., 0] + 1e-9 * draw.normal(size=(300, 3))
+    found = NoiseLevels.of(residual, np.broadcast_to(np.diag([1e-2, 1.0, 20.0]), H.shape), H)
+    assert np.isfinite([found.acceleration, found.force]).all()
+    assert np.isfinite(found.whitening(H)).all()

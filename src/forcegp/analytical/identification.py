@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
+from warnings import warn
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
-from forcegp.errors import InvalidInput, require_type, usable_arguments
+from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots.arguments import whole_number
 
@@ -139,7 +140,7 @@ def identify_analytical(
         predicted, M, H = recorded.acceleration(bodies.parameters(fit.x[:split]), fit.x[split:])
         noise = NoiseLevels.of(a - predicted, M, H)
         fit = search(fit.x, noise.whitening(H))
-    return AnalyticalIdentification(
+    found = AnalyticalIdentification(
         given=system,
         bodies=bodies,
         terms=terms,
@@ -151,6 +152,15 @@ def identify_analytical(
         thickened=thick,
         noise=noise,
     )
+    mass, given = found.total_mass[0], float(bodies.parameters(np.zeros(split))[:, 0].sum())
+    if not system.robot.space.is_vector_space and not given / OTHER_ROBOT <= mass <= given * OTHER_ROBOT:
+        warn(
+            f"by this log the robot weighs {mass:.3g} kg, by its file {given:.3g} kg: what holds it up is not what the "
+            "log states. Check flags of stance, thrust coefficients and the unit of u.",
+            DataWarning,
+            stacklevel=2,
+        )
+    return found
 
 
 def joint_terms(
@@ -179,6 +189,8 @@ def joint_terms(
     return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)
 
 
+OTHER_ROBOT = 2.0
+"""Factor between the masses of log and file from which on they are not those of one robot with a load."""
 STRETCHES = 4
 """Stretches of time that logs of fewer than three episodes are cut into."""
 

@@ -92,7 +92,12 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
         f"positions {_horizon(models[best])} ahead are wrong by {{:.2g}} {unit}": _motion,
         "accelerations are wrong by {:.2g} of their standard deviation": _acceleration,
     }
-    name = NAMES.get(best, best)
+    name, error = NAMES.get(best, best), _acceleration(models[best])
+    if _motion(models[best]) is None and error is not None and error >= 1.0:  # no better than a = 0
+        return (
+            f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are wrong by "
+            f"{error:.2g} of their standard deviation. Forces, flags of stance, units or the robot's file are wrong."
+        )
     for pattern, score in scores.items():
         own, urdf = score(models[best]), score(models.get("analytical"))
         if own is not None:
