@@ -2,12 +2,14 @@
 
 import json
 import shlex
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from forcegp import Dataset, Robot, load_posterior
 from forcegp.analytical import motion_residuals
+from forcegp.cli.auto_answer import best_sentence
 from forcegp.cli.main import parse_arguments
 from forcegp.simulation.free_arms import FreeArmConfig, simulate_free_arm
 
@@ -138,3 +140,13 @@ def _stopped(*_):
     from forcegp.errors import InvalidInput
 
     raise InvalidInput("reached")
+
+
+def test_a_model_that_is_worse_than_none_is_not_trusted():
+    """Where all motions diverge and accelerations are wrong by more than they vary."""
+    dataset = SimpleNamespace(units={"q": "rad"})
+    scored = {"nrmse": {"median": 328.2}, "motions": {"rms": [None], "horizons": [1.0]}}
+    content = {"models": {"analytical": scored}, "recommended": "analytical"}
+    assert best_sentence(content, dataset).startswith("Trust none of these models: on unseen time, accelerations")
+    good = {"nrmse": {"median": 1.02}, "motions": {"rms": [{"median": 0.01}], "horizons": [1.0]}}  # noise of a alone
+    assert best_sentence(content | {"models": {"analytical": good}}, dataset).startswith("Trust the model “the URDF”")
