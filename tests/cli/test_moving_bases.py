@@ -13,7 +13,8 @@ from forcegp.analytical.bodies import with_bodies
 from forcegp.analytical.identifiability import body_pseudo_inertias
 from forcegp.mechanics import CoulombJointFriction, MechanicalSystem
 from forcegp.simulation.quadrotor import simulate_quadrotor
-from forcegp.simulation.scenarios import QuadrotorConfig
+from forcegp.simulation.quadruped import simulate_quadruped
+from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
 
 COLUMNS = ("--time", "t", "--q", "x,y,z,qx,qy,qz,qw", "--v", "v{1..6}", "--u", "rotor_{1..4}")
 
@@ -32,6 +33,13 @@ def folder(tmp_path_factory):
     table = np.column_stack([flight.time, flight.q, flight.v, flight.u])
     np.savetxt(place / "flight.csv", table, "%.9g", ",", header=",".join(names), comments="")
     (place / "drone.json").write_text(flight.system.to_json())
+    dog = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=1))
+    columns = {"q": dog.q, "v": dog.v, "u": dog.u[:, :12]}
+    names = ["t", *(f"{name}{k}" for name, x in columns.items() for k in range(x.shape[1]))]
+    table = np.column_stack([dog.time, *columns.values()])
+    np.savetxt(place / "dog.csv", table, "%.9g", ",", header=",".join(names), comments="")
+    np.save(place / "stands.npy", np.column_stack([dog.time, dog.u[:, 12:]]))
+    (place / "dog.urdf").write_text(dog.system.robot.urdf_text)
     return place
 
 
@@ -86,9 +94,31 @@ def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
     assert np.abs(a - flight.a)[:, 2].mean() < np.abs(flight.a)[:, 2].std()
 
 
+DOG = "import dog.csv --time t --q q{0..18} --v v{0..17} --u u{0..11} --out dog.h5 --overwrite"
+LEGS = "front_left_foot", "front_right_foot", "rear_left_foot", "rear_right_foot"
+
+
+def test_feet_whose_stance_no_column_states(folder, forcegp):
+    done = forcegp(*DOG.split(), "--robot", "dog.urdf", "--base", "floating", "--feet", ",".join(LEGS), folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "stance: front_left_foot_stands" in done.stderr
+    log, (time, *flags) = Dataset.load(folder / "dog.h5"), np.load(folder / "stands.npy").T
+    assert log.system.inputs[12:] == tuple(f"{leg}_stands" for leg in LEGS)
+    for column, true in enumerate(flags, 12):
+        np.testing.assert_array_equal(log.u[:, column], np.interp(log.time, time, true) > 0.5)
+    assert 0.8 * len(time) < len(log) < len(time)
+    assert len(log.system.contacts) == 12
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (f"{DOG} --feet front_left_foot", "--feet needs --robot ROBOT.urdf"),
+        (f"{DOG} --feet front_left_foot --identified drone.json", "brings its contacts along; leave --feet out"),
+        (f"{DOG} --wheels a=0.1 --identified drone.json", "brings its contacts along; leave --wheels out"),
+        (f"{DOG} --robot dog.urdf --base floating --feet paw", "paw"),
+        (f"{DOG} --robot dog.urdf --base floating --feet paw@1,2", "is not FRAME or FRAME@x,y,z"),
+        (f"{DOG} --robot dog.urdf --feet front_left_foot", "base='floating'"),
         ("auto flight.csv --out x", "give --robot ARM.urdf, or --identified"),
         ("compare walk.h5", "give two or more, as in a,b"),
         ("fit walk.h5 --motions 0 --prior joint-friction --out x", "--motions is 0; give the length of the windows"),
