@@ -27,7 +27,7 @@ SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
 """m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves."""
 QUARTER = 0.3186
 """Of |x| of a normal number, in standard deviations: a quarter of the rows is quiet also where a foot moves much."""
-FREE, LEAST, BEARS = 0.99, 0.02, 0.4
+FREE, LEAST, BEARS = 0.95, 0.02, 0.4
 """Quantile of the forces on feet that clearly move; shares of the median force at rest: nothing, and surely bearing."""
 FEW = 10
 CHUNK = 4000
