@@ -104,7 +104,12 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
             against = "" if urdf is None or best == "analytical" else f", with the URDF alone by {urdf:.2g}"
             if urdf is None and score is _motion and "analytical" in models:
                 against = "; with the URDF alone they diverge"
-            return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}."
+            doubt = (
+                ""
+                if error is None or error < 1.0
+                else f" But no acceleration at all has a lower error: nRMSE {error:.3g}."
+            )
+            return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}.{doubt}"
     return f"Trust the model “{name}”."
 
 
