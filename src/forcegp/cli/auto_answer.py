@@ -104,11 +104,8 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
             against = "" if urdf is None or best == "analytical" else f", with the URDF alone by {urdf:.2g}"
             if urdf is None and score is _motion and "analytical" in models:
                 against = "; with the URDF alone they diverge"
-            doubt = (
-                ""
-                if error is None or error < 1.0
-                else f" But no acceleration at all has a lower error: nRMSE {error:.3g}."
-            )
+            worse = error is not None and error >= 1.0
+            doubt = f" But no acceleration at all has a lower error: nRMSE {error:.3g}." if worse else ""
             return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}.{doubt}"
     return f"Trust the model “{name}”."
 
