@@ -6,7 +6,7 @@ import pytest
 
 from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts, parse_feet, parse_wheels
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_point, rolling
+from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_frame, fixed_point, rolling
 
 
 @pytest.mark.parametrize(
@@ -47,6 +47,7 @@ def test_anything_else_is_refused(text):
 def test_feet_and_wheels_read_as_written():
     left, right = fixed_point("FL", switch="FL_stands"), fixed_point("a@b", (0.0, 0.1, -0.02), "a@b_stands")
     assert parse_feet(("FL", "a@b@0,.1,-2e-2")) == (*left, *right)
+    assert parse_feet(("l_sole:flat",)) == fixed_frame("l_sole", "l_sole_stands")
     assert parse_wheels(("left=0.1", "a=b=.2")) == (*rolling("left", 0.1), *rolling("a=b", 0.2))
     assert parse_feet(()) == parse_wheels(()) == ()
 
@@ -54,7 +55,7 @@ def test_feet_and_wheels_read_as_written():
 @pytest.mark.parametrize(
     ("parse", "text"),
     [
-        *((parse_feet, text) for text in ("", "@0,0,0", "FL@1,2", "FL@a,b,c", "FL@0,0,nan")),
+        *((parse_feet, text) for text in ("", "@0,0,0", "FL@1,2", "FL@a,b,c", "FL@0,0,nan", ":flat", "FL@0,0,0:flat")),
         *((parse_wheels, text) for text in ("", "left", "=0.1", "left=", "left=wide", "left=-1", "left=inf")),
     ],
 )
