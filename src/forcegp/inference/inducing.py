@@ -316,13 +316,7 @@ def inducing_pivots(
 
 
 def collapsed_bound(
-    W: Float[Tensor, "N D C"],
-    residual: Float[Tensor, "N D"],
-    noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
-    kernels: LatentKernels,
-    parameters: Mapping[str, Tensor],
-    features: Sequence[Float[Tensor, "N _"]],
-    points: Sequence[Float[Tensor, "_ _"]],
+    terms: Terms, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
 ) -> Float[Tensor, ""]:
     """An upper bound of `negative_log_likelihood`, differentiable in every argument but the inducing `points`.
 
@@ -330,6 +324,7 @@ def collapsed_bound(
     computed again in the backward pass. Raises NumericalError when a covariance cannot be factorised, or where rounding
     explains more than all of the prior variance, as at length scales of 1e-10: the sum would be no bound there.
     """
+    features, W, residual, noise = terms
     count, outputs, _ = W.shape
     W_white, y_white, log_noise = whiten(W, residual, noise)
     lowers = [_lower(K) for K in kernels.crosses(parameters, points, points)]
