@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from forcegp.inference import ExactPosterior, LatentKernels, minimize_objective, negative_log_likelihood
+from forcegp.inference import ExactPosterior, LatentKernels, Terms, minimize_objective, negative_log_likelihood
 from forcegp.models.search import perturbed
 from forcegp.priors.kernels import kernel_of
 
@@ -93,7 +93,7 @@ def scores(kernel: str, function: str, seed: int) -> tuple[float, float]:
     moments = latent.initial_parameters()
     starts = [moments, *(perturbed(moments, seed, index) for index in range(1, STARTS))]
     best = min((minimize_objective(objective, start) for start in starts), key=lambda result: result.value)
-    posterior = ExactPosterior.condition(latent.at(best.parameters), [z], W, y[:, None], noise)
+    posterior = ExactPosterior.condition(latent.at(best.parameters), Terms([z], W, y[:, None], noise))
     error = target - posterior.mean([new])[:, 0]
     variance = posterior.covariance([new])[:, 0, 0].clamp_min(0.0) + NOISE**2
     density = 0.5 * (error.square() / variance + (2.0 * math.pi * variance).log()).mean()

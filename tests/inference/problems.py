@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from gpytorch.kernels import RBFKernel, ScaleKernel
 
-from forcegp.inference import LatentKernels
+from forcegp.inference import LatentKernels, Terms
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -41,6 +41,10 @@ class Problem:
     @property
     def data(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         return self.W, self.residual, self.noise
+
+    @property
+    def terms(self) -> Terms:
+        return Terms(self.features, *self.data)
 
 
 def problem(

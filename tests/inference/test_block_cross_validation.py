@@ -9,7 +9,7 @@ from tests.inference.dense import dense_covariance
 from tests.inference.problems import Problem, problem
 
 from forcegp.errors import InvalidInput
-from forcegp.inference import ExactPosterior, LeaveOut, leave_blocks_out, negative_log_likelihood
+from forcegp.inference import ExactPosterior, LeaveOut, Terms, leave_blocks_out, negative_log_likelihood
 
 BLOCKS = ((3, 1, 7), (0,), (11, 2), (10, 4, 5, 6))  # row 8 and 9 are never left out
 
@@ -56,9 +56,8 @@ def condition(given_problem: Problem, rows: list[int] | None = None) -> ExactPos
     rows = list(range(len(given_problem.W))) if rows is None else rows
     noise = given_problem.noise if len(given_problem.noise) == 1 else given_problem.noise[rows]
     features = [z[rows] for z in given_problem.features]
-    return ExactPosterior.condition(
-        given_problem.kernels, features, given_problem.W[rows], given_problem.residual[rows], noise
-    )
+    terms = Terms(features, given_problem.W[rows], given_problem.residual[rows], noise)
+    return ExactPosterior.condition(given_problem.kernels, terms)
 
 
 def left_out(given_problem: Problem, blocks=None) -> LeaveOut:

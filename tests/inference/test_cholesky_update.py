@@ -18,11 +18,11 @@ def rows_of(given_problem: Problem, index) -> Problem:
 
 
 def condition(given_problem: Problem) -> ExactPosterior:
-    return ExactPosterior.condition(given_problem.kernels, given_problem.features, *given_problem.data)
+    return ExactPosterior.condition(given_problem.kernels, given_problem.terms)
 
 
 def add(latent: ExactPosterior, more: Problem) -> ExactPosterior:
-    return with_rows(latent, more.features, *more.data)
+    return with_rows(latent, more.terms)
 
 
 def assert_same(first: ExactPosterior, second: ExactPosterior) -> None:

@@ -12,7 +12,7 @@ from forcegp.inference.prepared_kernels import Sample, compress, kernel_groups
 def latent() -> ExactPosterior:
     given = problem(count=10)
     given.kernels.requires_grad_(False)
-    return ExactPosterior.condition(given.kernels, given.features, *given.data)
+    return ExactPosterior.condition(given.kernels, given.terms)
 
 
 def groups(latent: ExactPosterior) -> list[tuple[int, ...]]:

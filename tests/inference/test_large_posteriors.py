@@ -6,7 +6,7 @@ from tests.inference.problems import Problem, normal, problem
 
 from forcegp.inference import ExactPosterior, negative_log_likelihood
 from forcegp.inference.inducing import InducingPosterior, collapsed_bound, inducing_pivots, pivoted_cholesky
-from forcegp.inference.likelihood import Terms, deflate, whiten
+from forcegp.inference.likelihood import Terms
 
 SHAPES = {
     "no constraint": {"constraints": 0},
@@ -26,7 +26,7 @@ def new_features(given: Problem, points: int = 5) -> list[torch.Tensor]:
 
 
 def exact(given: Problem) -> ExactPosterior:
-    return ExactPosterior.condition(given.kernels, given.features, *given.data)
+    return ExactPosterior.condition(given.kernels, given.terms)
 
 
 def inducing(given: Problem, points: int = COUNT, tolerance: float = 0.0) -> InducingPosterior:
@@ -98,11 +98,10 @@ def test_the_bound_is_the_likelihood_with_all_points_and_above_it_with_few(shape
     parameters = given.kernels.initial_parameters()
 
     def bound(points: int) -> float:
-        W_white, y_white, _ = whiten(*given.data)
-        pivots = inducing_pivots(given.kernels, given.features, deflate(W_white, y_white).C, points)
+        pivots = inducing_pivots(given.kernels, given.features, given.terms.deflated().C, points)
         inside = [z[p] for z, p in zip(given.features, pivots, strict=True)]
         with torch.no_grad():
-            return float(collapsed_bound(*given.data, given.kernels, parameters, given.features, inside))
+            return float(collapsed_bound(given.terms, given.kernels, parameters, inside))
 
     expected = float(negative_log_likelihood(*given.data, given.kernels.matrices(parameters, given.features)))
     assert bound(COUNT) == pytest.approx(expected, abs=1e-3)
@@ -119,7 +118,7 @@ def test_the_bound_has_the_gradients_of_its_values(chunk, monkeypatch):
 
     def bound(W, residual, noise, *values):
         parameters = dict(zip(names, values, strict=True))
-        return collapsed_bound(W, residual, noise, given.kernels, parameters, given.features, points)
+        return collapsed_bound(Terms(given.features, W, residual, noise), given.kernels, parameters, points)
 
     inputs = [x.clone().requires_grad_() for x in (*given.data, *given.kernels.initial_parameters().values())]
     assert torch.autograd.gradcheck(bound, inputs, rtol=1e-5, atol=1e-6)

@@ -136,7 +136,7 @@ def test_one_node_in_each_is_ordinary_inference(count, outputs, constraints, see
         rows = negative_log_likelihood(terms.W, terms.residual, terms.noise, matrices)
         torch.testing.assert_close(ours, rows, rtol=1e-9, atol=1e-8)
         left = FunctionalPosterior.condition(given_problem.kernels, ones, terms)
-        right = ExactPosterior.condition(given_problem.kernels, *terms)
+        right = ExactPosterior.condition(given_problem.kernels, terms)
         new = [normal(3, z.shape[1], seed=100 + c) for c, z in enumerate(terms.features)]
         torch.testing.assert_close(left.mean(new), right.mean(new), rtol=1e-7, atol=1e-8)
         torch.testing.assert_close(left.covariance(new), right.covariance(new), rtol=1e-7, atol=1e-8)

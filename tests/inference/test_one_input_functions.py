@@ -12,7 +12,7 @@ from tests.inference.problems import normal
 
 from forcegp.codegen.library import Purpose
 from forcegp.errors import CompilerError
-from forcegp.inference import ExactPosterior, LatentKernels
+from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.one_input_functions import (
     OneInputFunctions,
     cubic_table,
@@ -205,7 +205,8 @@ def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
     kernels.requires_grad_(False)
     W = torch.ones(12, 1, 1, dtype=torch.float64)
     noise = torch.full((12, 1), 0.01, dtype=torch.float64)
-    return ExactPosterior.condition(kernels, [normal(12, dimension, seed=2)], W, normal(12, 1, seed=1), noise)
+    terms = Terms([normal(12, dimension, seed=2)], W, normal(12, 1, seed=1), noise)
+    return ExactPosterior.condition(kernels, terms)
 
 
 @pytest.mark.parametrize(("expression", "tolerance"), [("squared-exponential", 1e-8), ("matern-5/2", 1e-6)])

@@ -7,7 +7,7 @@ from gpytorch.kernels import CosineKernel, LinearKernel, MaternKernel, RBFKernel
 from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 
 from forcegp.errors import InvalidInput
-from forcegp.inference import ExactPosterior, LatentKernels
+from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
 from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
 from forcegp.priors.kernels import kernel_of
@@ -27,7 +27,7 @@ def conditioned(kernels: list, dimensions: tuple[int, ...]) -> ExactPosterior:
     residual = torch.randn(POINTS, OUTPUTS, dtype=torch.float64, generator=generator)
     noise = torch.full((1, OUTPUTS), 0.09, dtype=torch.float64)
     latent = LatentKernels([kernel.double() for kernel in kernels])
-    return ExactPosterior.condition(latent.at(latent.initial_parameters()), features, W, residual, noise)
+    return ExactPosterior.condition(latent.at(latent.initial_parameters()), Terms(features, W, residual, noise))
 
 
 def scaled_rbf(dimension: int, lengthscale: float, variance: float) -> ScaleKernel:

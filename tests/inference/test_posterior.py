@@ -22,7 +22,7 @@ SHAPES = {
 
 
 def condition(given_problem: Problem) -> ExactPosterior:
-    return ExactPosterior.condition(given_problem.kernels, given_problem.features, *given_problem.data)
+    return ExactPosterior.condition(given_problem.kernels, given_problem.terms)
 
 
 def new_features(given_problem: Problem, points: int = 6) -> list[torch.Tensor]:

@@ -9,7 +9,7 @@ from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Graph
 from forcegp.codegen.library import Purpose, RowFunction, aligned, compile_library
-from forcegp.inference import ExactPosterior, LatentKernels
+from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.prepared_kernels import SharedCenters, kernel_groups, kernel_sums
 
 SHARED = [1, 3, 4]
@@ -25,7 +25,7 @@ def latent() -> ExactPosterior:
     features = [given.features[1] + 5.0 if c in SHARED else z for c, z in enumerate(given.features)]
     built = LatentKernels(kernels)
     built.requires_grad_(False)
-    return ExactPosterior.condition(built, features, *given.data)
+    return ExactPosterior.condition(built, Terms(features, *given.data))
 
 
 def points(latent: ExactPosterior, count: int = 6) -> list[torch.Tensor]:

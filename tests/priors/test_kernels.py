@@ -11,7 +11,7 @@ from tests.inference.problems import normal
 from tests.priors.kernel_conformance import KernelConformance
 
 from forcegp.errors import InvalidInput
-from forcegp.inference import ExactPosterior, LatentKernels, minimize_objective, negative_log_likelihood
+from forcegp.inference import ExactPosterior, LatentKernels, Terms, minimize_objective, negative_log_likelihood
 from forcegp.priors.kernels import KERNELS, check_kernel, kernel_of
 
 
@@ -300,7 +300,7 @@ def neg_log_posterior(kernel, z, y, noise):
         return value - latent.log_prior(parameters)
 
     result = minimize_objective(objective, latent.initial_parameters())
-    return ExactPosterior.condition(latent.at(result.parameters), [z], W, y, float64([[noise]])), result
+    return ExactPosterior.condition(latent.at(result.parameters), Terms([z], W, y, float64([[noise]]))), result
 
 
 def test_deep_finds_a_step_that_the_squared_exponential_smears():

@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from scipy.stats import t as student
 
 from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
-from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
 from forcegp.analytical.identification import ROWS, joint_terms
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
 from forcegp.analytical.recorded_rows import RecordedRows
@@ -31,7 +31,7 @@ from forcegp.errors import DatasetError, InvalidInput, require_type, usable_argu
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
-from forcegp.robots.inertia import pseudo_inertia, standard_basis
+from forcegp.robots.inertia import pseudo_inertia
 from forcegp.robots.urdf_file import replace_inertial
 from forcegp.summary import Summary
 
@@ -154,9 +154,7 @@ def identify_payload(
 
     links, usual = body_pseudo_inertias(robot).cpu().numpy(), _usual(offset)
     bodies = ConsistentBodies(usual[None] if baseline is None else np.concatenate([links, usual[None]]))
-    stated = (links.reshape(-1, 16) @ np.linalg.pinv(standard_basis().numpy()).T)[
-        : len(links) if baseline is None else 0
-    ]
+    stated = standard_parameters(robot).reshape(-1, 10).cpu().numpy()[: len(links) if baseline is None else 0]
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)

@@ -83,6 +83,11 @@ def plain(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
+def numbers_of(values: Sequence[float | None]) -> np.ndarray:
+    """Numbers from a report, NaN where it has none."""
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+
 def listed(names: Sequence[str]) -> str:
     """`a, b and c`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
@@ -252,7 +257,7 @@ def _filtered_noise(log: Dataset, prepared: Prepared | None, compared: Dataset) 
     """Noise of the acceleration in `compared`: white noise as logged, or what the filter left."""
     price = {} if prepared is None else prepared.report.get("acceleration_noise", {})
     if "after" in price:
-        return np.array([np.nan if value is None else value for value in price["after"]], dtype=float) * HALF_CUTOFF
+        return numbers_of(price["after"]) * HALF_CUTOFF
     seen = white_noise(log)
     return np.zeros(compared.nv) if seen is None else seen
 

@@ -1,12 +1,12 @@
 """Does the motion show what is to be learned, and what does noise hide of it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 
 from forcegp.analytical.identifiability import base_parameters, excitation
-from forcegp.checks.check_input import CheckInput, Finding, listed, look, ok, plain
+from forcegp.checks.check_input import CheckInput, Finding, listed, look, numbers_of, ok, plain
 from forcegp.checks.successive_rows import white_noise
 from forcegp.errors import InvalidInput
 
@@ -128,11 +128,6 @@ def torque_noise(inputs: CheckInput, noise: np.ndarray) -> np.ndarray | None:
     with torch.no_grad():
         M = inputs.robot.mass_matrix(torch.tensor(inputs.rows().q, device=inputs.robot.device)).cpu().numpy()
     return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
-
-
-def numbers_of(values: Sequence[float | None]) -> np.ndarray:
-    """Numbers from a report, NaN where it has none."""
-    return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
 WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)

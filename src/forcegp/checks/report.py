@@ -6,15 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, plain, worst
+from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, numbers_of, plain, worst
 from forcegp.checks.dynamics import dynamics_findings
-from forcegp.checks.excitation import (
-    excitation_findings,
-    noise_findings,
-    numbers_of,
-    stated_noise_findings,
-    torque_noise,
-)
+from forcegp.checks.excitation import excitation_findings, noise_findings, stated_noise_findings, torque_noise
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings, sampling_findings
 from forcegp.checks.moving_base import base_findings, carried_findings

@@ -133,12 +133,10 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
 
 def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
     """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
-    given = {"learn": (), "prior": (), "mean": "analytical", "points": 200, "learning_points": None, "noise": "dataset"}
-    changed = [name for name, default in given.items() if getattr(command, name) != default]
-    if changed:
-        option = changed[0].replace("_", "-")
+    if given := command.words("learn", "prior", "mean", "points", "learning_points", "noise"):
+        option = given[0].partition("=")[0]
         raise InvalidInput(
-            f"--{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
+            f"{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
             "rows; leave it out, or use --model structured."
         )
 

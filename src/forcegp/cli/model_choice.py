@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -120,12 +120,11 @@ Options = TypeVar("Options", bound=ModelOptions)
 
 def resolved(command: Options) -> Options:
     """The command with the defaults of its model. Raises InvalidInput for options that mean nothing to it."""
-    defaults = {field.name: field.default for field in fields(command)}
     for name, models in MEANT_FOR.items():
-        if command.model not in models and getattr(command, name) != defaults[name]:
-            flag = name.replace("_", "-") if name != "hyperprior" else "no-hyperprior"
+        if command.model not in models and (given := command.words(name)):
             raise InvalidInput(
-                f"--{flag} means nothing to --model {command.model}; leave it out, or choose {' or '.join(models)}."
+                f"{given[0].partition('=')[0]} means nothing to --model {command.model}; leave it out, or choose "
+                f"{' or '.join(models)}."
             )
     if command.model in NETWORKS and command.noise == "learned":
         raise InvalidInput(

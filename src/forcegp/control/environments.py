@@ -144,10 +144,8 @@ class RobotEnv(gymnasium.Env):
     def __init__(self, **settings: Any) -> None:
         self.robots = RobotVectorEnv(1, **settings)
         self.metadata = {"render_modes": []}
-        self.observation_space, self.action_space = (
-            self.robots.single_observation_space,
-            self.robots.single_action_space,
-        )
+        self.observation_space = self.robots.single_observation_space
+        self.action_space = self.robots.single_action_space
 
     @override
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:

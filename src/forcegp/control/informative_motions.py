@@ -305,9 +305,8 @@ def excitation(
             raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
     if start is None:
         half = np.array([(x.upper - x.lower) / 2.0 for x in robot.joints])
-        middle = np.array([x.lower if np.isfinite(x.lower) else 0.0 for x in robot.joints]) + np.nan_to_num(
-            half, posinf=0.0
-        )
+        lowest = np.array([x.lower if np.isfinite(x.lower) else 0.0 for x in robot.joints])
+        middle = lowest + np.nan_to_num(half, posinf=0.0)
         start = model.training.q.mean(0).numpy() if isinstance(model, Posterior) else middle
         start = start.clip(middle - INSIDE * margin * half, middle + INSIDE * margin * half)
     start = finite_vector("start", start, robot.nv)

@@ -53,9 +53,8 @@ class TrackingController(Controller):
         if dt is not None or bool(self.integral.any()):
             check_time_step(dt)
         self.dt = dt or 0.0
-        self._range = torch.tensor([(joint.lower, joint.upper) for joint in robot.joints], dtype=torch.float64).unbind(
-            1
-        )
+        ends = [(joint.lower, joint.upper) for joint in robot.joints]
+        self._range = torch.tensor(ends, dtype=torch.float64).unbind(1)
 
     @override
     def restart(self) -> None:

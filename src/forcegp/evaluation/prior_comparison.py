@@ -234,11 +234,8 @@ def compare_priors(
     sizes = [_named(name, partial(_checked_size, model, rows)) for name, model in models.items()]
     needed = sum(8 * (size.rows * size.rank) ** 2 for size in sizes)  # all are kept
     needed += max(Exact().required_bytes(size) for size in sizes)
-    what, remedy = (
-        f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows",
-        "give fewer `points`, or fewer candidates",
-    )
-    require_memory(needed, what, remedy, known.robot.device)
+    what = f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows"
+    require_memory(needed, what, "give fewer `points`, or fewer candidates", known.robot.device)
     how: dict[str, Any] = {"restarts": restarts, "seed": seed, "backend": workers, "hyperprior": hyperprior}
     how |= {"options": options, "engine": "exact"}  # whatever the number of rows: no other engine can leave rows out
     posteriors = {}

@@ -163,10 +163,8 @@ def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] 
     return learn(train, seed=spec["seed"], **more)
 
 
-def search_report(posterior: Any) -> dict[str, Any] | None:
-    """How the search for hyper-parameters went; None for models without one."""
+def search_report(posterior: Any) -> dict[str, Any]:
+    """How the search for hyper-parameters went."""
     search = posterior.result
-    if search is None:
-        return None
     same = {name: getattr(search, name) for name in ("evaluations", "converged", "status", "cpu_seconds")}
     return {"objective": search.value, "iterations": len(search.history) - 1, **same}

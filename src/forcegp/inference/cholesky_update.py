@@ -20,28 +20,21 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.likelihood import DeflatedSystem, Deflation, deflate, deflated_covariance, whiten
+from forcegp.inference.likelihood import DeflatedSystem, Deflation, Terms, deflated_covariance
 from forcegp.inference.posterior import ExactPosterior
 
 COPIED_ROWS = 256
 """Rows of a factor that are copied at once, without what lies beyond their diagonal."""
 
 
-def with_rows(
-    latent: ExactPosterior,
-    features: Sequence[Float[Tensor, "m _"]],
-    W: Float[Tensor, "m D C"],
-    residual: Float[Tensor, "m D"],
-    noise: Float[Tensor, "#m D"] | Float[Tensor, "#m D D"],
-) -> ExactPosterior:
-    """The posterior of the old rows and m more, at the same kernels; the old posterior stays valid.
+def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
+    """The posterior of the old rows and those of `terms`, at the same kernels; the old posterior stays valid.
 
-    Equals `ExactPosterior.condition` on all rows but for rounding. The arguments are those of the new rows. Raises
-    NumericalError where they are not finite or the covariance cannot be factorised.
+    Equals `ExactPosterior.condition` on all rows but for rounding. Raises NumericalError where the new ones are not
+    finite or the covariance cannot be factorised.
     """
     with torch.no_grad():
-        W_white, y_white, _ = whiten(W, residual, noise)
-        added, old = deflate(W_white, y_white), latent.system.deflation
+        features, added, old = terms.features, terms.deflated(), latent.system.deflation
         rank = max(old.rank, added.rank)
         factor = _with_rank(latent.system.factor, len(old.t), old.rank, rank)
         old, added = _padded(old, rank), _padded(added, rank)

@@ -300,7 +300,7 @@ class LatentKernels(torch.nn.Module):
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
     ) -> list[Float[Tensor, "N N"]]:
         """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
-        return self._at(parameters, self.forward, features)
+        return self._at(parameters, lambda: self.forward(features))
 
     def crosses(
         self,
@@ -309,13 +309,13 @@ class LatentKernels(torch.nn.Module):
         right: Sequence[Float[Tensor, "_ _"]],
     ) -> list[Float[Tensor, "_ _"]]:
         """k_c(left_i, right_j) of every latent at `parameters`, differentiable in them."""
-        return self._at(parameters, self._crosses, left, right)
+        return self._at(parameters, lambda: [k.cross(x, y) for k, x, y in zip(self.dense, left, right, strict=True)])
 
     def diagonals(
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "_ _"]]
     ) -> list[Float[Tensor, " _"]]:
         """k_c(z_i, z_i) of every latent at `parameters`, differentiable in them."""
-        return self._at(parameters, self._diagonals, features)
+        return self._at(parameters, lambda: [k.diagonal(z) for k, z in zip(self.dense, features, strict=True)])
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density of the GPyTorch priors registered on the kernels, at `parameters`; 0 where there are none."""
@@ -336,16 +336,10 @@ class LatentKernels(torch.nn.Module):
             value.copy_(parameters[name].detach().reshape(value.shape))
         return self
 
-    def _at(self, parameters: Mapping[str, Tensor], function: Callable[..., Any], *arguments: object) -> Any:
-        """`function(*arguments)` while these kernels have `parameters`."""
+    def _at(self, parameters: Mapping[str, Tensor], function: Callable[[], Any]) -> Any:
+        """`function()` while these kernels have `parameters`."""
         named = {name: parameters[name] for name, _ in self.named_parameters()}
-        return functional_call(_Call(self.kernels, function), named, arguments)
-
-    def _crosses(self, left: Sequence[Tensor], right: Sequence[Tensor]) -> list[Tensor]:
-        return [kernel.cross(x, y) for kernel, x, y in zip(self.dense, left, right, strict=True)]
-
-    def _diagonals(self, features: Sequence[Tensor]) -> list[Tensor]:
-        return [kernel.diagonal(z) for kernel, z in zip(self.dense, features, strict=True)]
+        return functional_call(_Call(self.kernels, function), named, ())
 
     def _log_prior(self) -> Tensor:
         named = [entry for kernel in self for entry in kernel.named_priors()]  # once where latents share a kernel

@@ -114,7 +114,7 @@ class Exact(Engine):
     @override
     def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
-        return ExactPosterior.condition(kernels, *terms)
+        return ExactPosterior.condition(kernels, terms)
 
 
 @dataclass(frozen=True)

@@ -188,33 +188,6 @@ class WeightSpace:
             for lower, part in zip(self.lowers, self.slices, strict=True)
         ]
 
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        """Cov(f_c, f_d) at the same point: what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T."""
-        total, latents = self.count, len(self.points)
-        height = max(1, BLOCK_BYTES // max(1, 8 * total * latents))
-        count = len(features[0])
-        blocks = [self._covariance_block([z[i : i + height] for z in features]) for i in range(0, count, height)]
-        return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
-
-    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        count, latents = len(features[0]), len(self.points)
-        wide = features[0].new_zeros(self.count, latents, count)
-        remainders = []
-        for c, (part, phi) in enumerate(zip(self.slices, self.columns(features), strict=True)):
-            wide[part, c] = phi
-            diagonal = self.kernels.dense[c].diagonal(features[c])
-            remainders.append((diagonal - phi.square().sum(0)).clamp_min(0.0))
-        V = self.precision.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
-        return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
-
-    def variance_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
-        """Variance of one latent at points of its own features."""
-        phi = self.column(index, z)
-        wide = phi.new_zeros(self.count, len(z))
-        wide[self.slices[index]] = phi
-        remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
-        return remainder + self.precision.solve_lower(wide).square().sum(0)
-
 
 def with_left_out(C: Float[Tensor, "N r C"], left_out: Float[Tensor, "N C"]) -> Float[Tensor, "N r r"]:
     """D^-1 where the prior variances that the weights leave out of each latent count as noise of the rows."""
@@ -270,11 +243,30 @@ class InducingPosterior(LatentPosterior):
 
     @override
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        return self.space.covariance(features)
+        # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T
+        latents, count = len(self.features), len(features[0])
+        height = max(1, BLOCK_BYTES // max(1, 8 * self.space.count * latents))
+        blocks = [self._covariance_block([z[i : i + height] for z in features]) for i in range(0, count, height)]
+        return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
+
+    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+        space, count, latents = self.space, len(features[0]), len(self.features)
+        wide = features[0].new_zeros(space.count, latents, count)
+        remainders = []
+        for c, (part, phi) in enumerate(zip(space.slices, space.columns(features), strict=True)):
+            wide[part, c] = phi
+            diagonal = self.kernels.dense[c].diagonal(features[c])
+            remainders.append((diagonal - phi.square().sum(0)).clamp_min(0.0))
+        V = space.precision.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
+        return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
 
     @override
     def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return self.space.variance_of(index, z)
+        phi = self.space.column(index, z)
+        wide = phi.new_zeros(self.space.count, len(z))
+        wide[self.space.slices[index]] = phi
+        remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
+        return remainder + self.space.precision.solve_lower(wide).square().sum(0)
 
     @override
     def function_weights(
@@ -316,13 +308,7 @@ def inducing_pivots(
 
 
 def collapsed_bound(
-    W: Float[Tensor, "N D C"],
-    residual: Float[Tensor, "N D"],
-    noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
-    kernels: LatentKernels,
-    parameters: Mapping[str, Tensor],
-    features: Sequence[Float[Tensor, "N _"]],
-    points: Sequence[Float[Tensor, "_ _"]],
+    terms: Terms, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
 ) -> Float[Tensor, ""]:
     """An upper bound of `negative_log_likelihood`, differentiable in every argument but the inducing `points`.
 
@@ -330,6 +316,7 @@ def collapsed_bound(
     computed again in the backward pass. Raises NumericalError when a covariance cannot be factorised, or where rounding
     explains more than all of the prior variance, as at length scales of 1e-10: the sum would be no bound there.
     """
+    features, W, residual, noise = terms
     count, outputs, _ = W.shape
     W_white, y_white, log_noise = whiten(W, residual, noise)
     lowers = [_lower(K) for K in kernels.crosses(parameters, points, points)]

@@ -138,18 +138,11 @@ class ExactPosterior(FactorizedPosterior):
     system: DeflatedSystem
 
     @classmethod
-    def condition(
-        cls,
-        kernels: LatentKernels,
-        features: Sequence[Float[Tensor, "N _"]],
-        W: Float[Tensor, "N D C"],
-        residual: Float[Tensor, "N D"],
-        noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
-    ) -> "ExactPosterior":
-        """Condition on residual = y - m; the arguments are those of `negative_log_likelihood`."""
+    def condition(cls, kernels: LatentKernels, terms: Terms) -> "ExactPosterior":
+        """Condition on the residual y - m."""
         with torch.no_grad():
-            system = solve_deflated(Terms(list(features), W, residual, noise).deflated(), kernels(features))
-        return cls(kernels, tuple(z.detach() for z in features), system)
+            system = solve_deflated(terms.deflated(), kernels(terms.features))
+        return cls(kernels, tuple(z.detach() for z in terms.features), system)
 
     @property
     @override

@@ -148,25 +148,21 @@ OVERSHOOT = 0.5
 
 Rows = Callable[[Tensor], Tensor]
 """x (n, k) -> (n, m), each row of its own."""
-Linearized = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""x (n, k) -> the value (n, m) and the Jacobian (n, m, k)."""
 
 
-def find_roots(
-    residual: Rows, x: Float[Tensor, "n k"], linearize: Linearized | None = None
-) -> tuple[Float[Tensor, "n k"], Bool[Tensor, " n"]]:
+def find_roots(residual: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], Bool[Tensor, " n"]]:
     """The roots that Newton's method reaches from x, and where it found them; differentiable once in `residual`'s own.
 
     A step d is shortened, by the secant rule, where J^-1 r has turned round by more than half at its end: in one
     dimension, where it overshoots the root by more. To ask for a smaller |r|, as textbooks do, ends at bumps of a
     friction curve. A Jacobian with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with speed,
-    the plain step leads away from the root. `linearize` replaces `rows_jacobian` where there is a better way.
+    the plain step leads away from the root.
     """
     with torch.no_grad():
         x = x.detach()
         found = torch.zeros(len(x), dtype=torch.bool, device=x.device)
         for _ in range(MOST_STEPS):
-            r, J = rows_jacobian(residual, x) if linearize is None else linearize(x)
+            r, J = rows_jacobian(residual, x)
             finite = torch.isfinite(r).all(-1) & torch.isfinite(J).flatten(1).all(-1)
             identity = torch.eye(J.shape[-1], dtype=J.dtype, device=J.device)
             J = torch.where(finite[:, None, None], J, identity)

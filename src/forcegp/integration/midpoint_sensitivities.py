@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, find_roots
+from forcegp.integration.integrators import VECTORS, ImplicitMidpoint
 from forcegp.robots.manifold import ConfigurationSpace
 
 MOST_PASSES = 20
@@ -121,14 +121,9 @@ def _step_by_step(
     positions, velocities, ended = [], [], torch.ones(len(q), dtype=torch.bool, device=q.device)
     space = accelerations.space
     for force in u.unbind(1):
-        if space.is_vector_space:
-            residual, linearize = _step(accelerations, q, v, force, h)
-            middle, found = find_roots(residual, v, linearize)
-        else:
-            moved = ImplicitMidpoint(space).step(lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
-            middle, found = 0.5 * (v + moved.v), moved.found
-        ended &= found
-        middle = torch.where(ended[:, None], middle, v)  # the others only stay finite
+        moved = ImplicitMidpoint(space).step(lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
+        ended &= moved.found
+        middle = torch.where(ended[:, None], 0.5 * (v + moved.v), v)  # the others only stay finite
         step = space.midpoint_step(h * middle)
         positions.append(space.integrate(q, 0.5 * step))
         velocities.append(middle)
@@ -136,22 +131,6 @@ def _step_by_step(
         if not bool(ended.any()):
             return q[:, None], v[:, None], ended
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1), ended
-
-
-def _step(
-    accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float
-) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], tuple[Tensor, Tensor]]]:
-    """What a step's middle velocity must bring to zero, and the same with its Jacobian."""
-
-    def residual(at: Tensor) -> Tensor:
-        return at - v - 0.5 * h * accelerations.mean(q + 0.5 * h * at, at, u)
-
-    def linearize(at: Tensor) -> tuple[Tensor, Tensor]:
-        here = accelerations.linear(q + 0.5 * h * at, at, u, False)
-        identity = torch.eye(at.shape[-1], dtype=at.dtype, device=at.device)
-        return at - v - 0.5 * h * here.a, identity - 0.5 * h * (0.5 * h * here.a_q + here.a_v)
-
-    return residual, linearize
 
 
 def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:

@@ -149,27 +149,20 @@ def _stepped(
 ) -> list[Any]:
     """The formulas of `integration.integrators`."""
     (q, v, u), space, (nq, nv, _) = x, code.space, code.sizes
-    if not space.is_vector_space:
+    if space.is_vector_space:
+        moved, rate = operator.add, lambda step, at: at
+    else:
         moved, rate = _of_space(casadi, space.integrate, (nq, nv)), _of_space(casadi, space.chart_velocity, (nv, nv))
-        if integrator == "symplectic-euler":
-            v = v + dt * acceleration(q, v, u)
-            return [moved(q, dt * v), v]
+    if integrator == "symplectic-euler":
+        v = v + dt * acceleration(q, v, u)
+        return [moved(q, dt * v), v]
+    if integrator == "rk4":
         k = [(v, acceleration(q, v, u))]
         for share in (0.5 * dt, 0.5 * dt, dt):
             at, step = v + share * k[-1][1], share * k[-1][0]
             k.append((rate(step, at), acceleration(moved(q, step), at, u)))
         step, change = (dt / 6.0 * (a + 2.0 * b + 2.0 * c + d) for a, b, c, d in zip(*k, strict=True))
         return [moved(q, step), v + change]
-    if integrator == "symplectic-euler":
-        v = v + dt * acceleration(q, v, u)
-        return [q + dt * v, v]
-    if integrator == "rk4":
-        k = [(v, acceleration(q, v, u))]
-        for share in (0.5 * dt, 0.5 * dt, dt):
-            at = v + share * k[-1][1]
-            k.append((at, acceleration(q + share * k[-1][0], at, u)))
-        weights = (dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0)
-        return [y + sum(w * slope[part] for w, slope in zip(weights, k, strict=True)) for part, y in enumerate((q, v))]
     middle, half = casadi.MX.sym("middle", v.numel()), 0.5 * dt
     rest = middle - v - half * acceleration(q + half * middle, middle, u)
     solve = casadi.rootfinder("solve", "newton", {"x": middle, "p": casadi.vertcat(q, v, u), "g": rest})

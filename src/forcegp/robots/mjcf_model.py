@@ -10,6 +10,8 @@ import numpy as np
 from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
 from forcegp.robots.manifold import MOTIONS
 from forcegp.robots.problems import Problems
+from forcegp.robots.urdf_file import inertial_parts
+from forcegp.robots.xml_text import numbers
 
 KINDS = {0: "floating", 1: "spherical", 2: "prismatic", 3: "revolute"}
 """Of MuJoCo's joints (mjtJoint) in URDF."""
@@ -55,7 +57,8 @@ class CompiledModel:
         self.joints = []
         for k in range(model.njnt):
             kind = ("free", "ball", "slide", "hinge")[model.jnt_type[k]]
-            self.joints.append(self._named(model.joint(k).name or f"{self._body_of(k)}_{kind}", taken))
+            body = self.bodies[model.jnt_bodyid[k]]
+            self.joints.append(self._named(model.joint(k).name or f"{body}_{kind}", taken))
         self.taken_joints = taken
 
     def translation(self) -> Translation:
@@ -77,9 +80,6 @@ class CompiledModel:
         text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
         locked = {self.joints[joint]: value for joint, value in self.locked.items()}
         return Translation(text, gravity, self._rotor_inertias(), locked, loops, thrusters)
-
-    def _body_of(self, joint: int) -> str:
-        return self.bodies[self.model.jnt_bodyid[joint]]
 
     @staticmethod
     def _named(name: str, taken: set[str]) -> str:
@@ -104,7 +104,7 @@ class CompiledModel:
         self._joint(self._named(f"{child}_fixed", self.taken_joints), "fixed", parent, child, pose, "")
 
     def _joint(self, name: str, kind: str, parent: str, child: str, origin: np.ndarray, more: str) -> None:
-        xyz, rpy = _numbers(origin[:3, 3]), _numbers(rpy_from_rotation(origin[:3, :3]))
+        xyz, rpy = numbers(origin[:3, 3]), numbers(rpy_from_rotation(origin[:3, :3]))
         self.elements.append(
             f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
             f'<child link={quoteattr(child)}/><origin xyz="{xyz}" rpy="{rpy}"/>{more}</joint>'
@@ -143,17 +143,14 @@ class CompiledModel:
             return ""
         pose = self._pose(model.body_ipos[body], model.body_iquat[body])
         inertia = pose[:3, :3] @ np.diag(model.body_inertia[body]) @ pose[:3, :3].T
-        entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        moments = " ".join(f'{key}="{float(inertia[place])!r}"' for key, place in entries.items())
-        mass = f'<mass value="{float(model.body_mass[body])!r}"/>'
-        return f'<inertial><origin xyz="{_numbers(pose[:3, 3])}" rpy="0 0 0"/>{mass}<inertia {moments}/></inertial>'
+        return f"<inertial>{''.join(inertial_parts(model.body_mass[body], pose[:3, 3], inertia))}</inertial>"
 
     def _parts(self, joint: int, kind: str) -> str:
         """Axis, limits, damping, friction and coupling of one joint."""
         model, dof = self.model, self.model.jnt_dofadr[joint]
         parts = []
         if kind in ("revolute", "prismatic"):
-            parts.append(f'<axis xyz="{_numbers(model.jnt_axis[joint])}"/>')
+            parts.append(f'<axis xyz="{numbers(model.jnt_axis[joint])}"/>')
             lower, upper = model.jnt_range[joint]
             limits = {"lower": lower, "upper": upper} if model.jnt_limited[joint] else {}
             limits |= {"effort": effort} if np.isfinite(effort := self._effort(joint)) else {}
@@ -162,8 +159,8 @@ class CompiledModel:
         parts.append(_element("dynamics", {name: value for name, value in losses.items() if value}))
         if joint in self.couplings:
             driver, multiplier, offset = self.couplings[joint]
-            numbers = _element("mimic", {"multiplier": multiplier, "offset": offset})
-            parts.append(numbers.replace("<mimic", f"<mimic joint={quoteattr(self.joints[driver])}"))
+            ratio = _element("mimic", {"multiplier": multiplier, "offset": offset})
+            parts.append(ratio.replace("<mimic", f"<mimic joint={quoteattr(self.joints[driver])}"))
         return "".join(parts)
 
     def _actuators_of(self, joint: int) -> list[int]:
@@ -230,17 +227,17 @@ class CompiledModel:
         for k in range(model.neq):
             if model.eq_type[k] != kinds.mjEQ_JOINT or not model.eq_active0[k]:
                 continue
-            joint, other, numbers = model.eq_obj1id[k], model.eq_obj2id[k], model.eq_data[k][:5]
+            joint, other, law = model.eq_obj1id[k], model.eq_obj2id[k], model.eq_data[k][:5]
             name, start = self._equality(k), model.qpos0[model.jnt_qposadr[joint]]
-            if other >= 0 and numbers[2:].any():
+            if other >= 0 and law[2:].any():
                 self._lose("couplings of joints that are not linear", name)
             elif joint in self.couplings or joint in self.locked:
                 self._lose("second couplings of a joint", name)
             elif other < 0:
-                self.locked[joint] = float(start + numbers[0])
+                self.locked[joint] = float(start + law[0])
             else:
-                offset = start + numbers[0] - numbers[1] * model.qpos0[model.jnt_qposadr[other]]
-                self.couplings[joint] = int(other), float(numbers[1]), float(offset)
+                offset = start + law[0] - law[1] * model.qpos0[model.jnt_qposadr[other]]
+                self.couplings[joint] = int(other), float(law[1]), float(offset)
 
     def _equality(self, k: int) -> str:
         return self.model.equality(k).name or f"equality {k}"
@@ -356,10 +353,6 @@ def _any(model: Any, name: str, row: int | np.integer) -> bool:
     return bool(np.any(getattr(model, name, np.zeros((row + 1, 1)))[row]))
 
 
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
-def _element(tag: str, numbers: dict[str, float]) -> str:
-    inside = "".join(f' {name}="{float(value)!r}"' for name, value in numbers.items())
-    return f"<{tag}{inside}/>" if numbers else ""
+def _element(tag: str, given: dict[str, float]) -> str:
+    inside = "".join(f' {name}="{float(value)!r}"' for name, value in given.items())
+    return f"<{tag}{inside}/>" if given else ""

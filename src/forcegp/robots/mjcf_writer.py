@@ -6,7 +6,7 @@ a chain of joints between links without mass, all joints go to the link at its e
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -20,6 +20,7 @@ from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.problems import Problems
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import JointDescription, free_joint
+from forcegp.robots.xml_text import numbers
 
 SMALLEST = 2e-15
 """kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
@@ -53,7 +54,7 @@ class MjcfWriter:
         for loop in loops:  # sites: the anchors of bodies would be taken from the posture at q = 0
             for end, link, point in zip("12", loop.frames, loop.points, strict=True):
                 name = quoteattr(f"{loop.name}_{end}")
-                self.sites.setdefault(link, []).append(f'<site name={name} pos="{_numbers(point)}"/>')
+                self.sites.setdefault(link, []).append(f'<site name={name} pos="{numbers(point)}"/>')
             ends = " ".join(f"site{end}={quoteattr(f'{loop.name}_{end}')}" for end in "12")
             tag = "weld" if loop.turning else "connect"
             self.equalities.append(f"    <{tag} name={quoteattr(loop.name)} {ends}/>")
@@ -61,7 +62,8 @@ class MjcfWriter:
     def text(self) -> str:
         """The whole file."""
         robot, root = self.robot, next(iter(self.robot.layout.links))
-        if BASE in self.groups and self.groups[BASE].kind == robot.base and BASE not in self._names():
+        named = {joint.name for joint in robot.description.joints}
+        if BASE in self.groups and self.groups[BASE].kind == robot.base and BASE not in named:
             self._chain(free_joint(BASE, robot.base, OUTSIDE, root), np.eye(4), 2)
         elif root == "world" and not self._mass(root):
             self.lines += [f"    {site}" for site in self.sites.get(root, ())]
@@ -73,7 +75,7 @@ class MjcfWriter:
             [
                 f"<mujoco model={quoteattr(robot.name)}>",
                 '  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>',
-                f'  <option gravity="{_numbers(robot.gravity.tolist())}"/>',
+                f'  <option gravity="{numbers(robot.gravity.tolist())}"/>',
                 "  <worldbody>",
                 *self.lines,
                 "  </worldbody>",
@@ -82,9 +84,6 @@ class MjcfWriter:
                 "</mujoco>\n",
             ]
         )
-
-    def _names(self) -> set[str]:
-        return {joint.name for joint in self.robot.description.joints}
 
     def _mass(self, link: str) -> float:
         inertial = self.robot.description.links[link]
@@ -114,14 +113,14 @@ class MjcfWriter:
             self._body(joint.child, pose @ _motion(joint, self.held.get(joint.name, 0.0)), [], depth)
             return
         joints = self._axes(joint)
-        while not self._carries(joint.child):
+        while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
             below = self._next(joint.child)
             if len(below) != 1 or joint.type in ("floating", "spherical"):
                 raise RobotModelError(
                     f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
                     "two joints of one degree of freedom; give it a mass."
                 )
-            self.left_out += [link for link in self._rigid(joint.child)]
+            self.left_out += self._rigid(joint.child)
             step, joint = below[0]
             joints = [each._replace(pose=inverse(step) @ each.pose) for each in joints] + self._axes(joint)
             pose = pose @ step
@@ -143,9 +142,6 @@ class MjcfWriter:
                     found[joint.child] = found[name] @ still
                     names.append(joint.child)
         return found
-
-    def _carries(self, link: str) -> bool:
-        return any(self._mass(name) > 0.0 for name in self._rigid(link))
 
     def _next(self, link: str) -> list[tuple[np.ndarray, JointDescription]]:
         """The joints that move against these links, and the frames of their children."""
@@ -169,9 +165,9 @@ class MjcfWriter:
         return [_Axis(self._attributes(joint, name, kind, first), np.eye(4), axis)]
 
     def _attributes(self, joint: JointDescription, name: str, kind: str, rotor: str | None = None) -> str:
-        numbers = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}
-        numbers["frictionloss"] = joint.friction
-        parts = [f'{key}="{value!r}"' for key, value in numbers.items() if value]
+        given = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}
+        given["frictionloss"] = joint.friction
+        parts = [f'{key}="{value!r}"' for key, value in given.items() if value]
         if joint.lower < joint.upper and not math.isinf(joint.upper - joint.lower):
             parts.append(f'range="{joint.lower!r} {joint.upper!r}"')
         if 0.0 < joint.effort_limit < math.inf and kind in ("hinge", "slide"):
@@ -181,7 +177,7 @@ class MjcfWriter:
     def _couplings(self) -> list[str]:
         return [
             f"    <joint joint1={quoteattr(joint.name)} joint2={quoteattr(joint.mimics.joint)} "
-            f'polycoef="{_numbers((joint.mimics.offset, joint.mimics.multiplier, 0.0, 0.0, 0.0))}"/>'
+            f'polycoef="{numbers((joint.mimics.offset, joint.mimics.multiplier, 0.0, 0.0, 0.0))}"/>'
             for joint in self.robot.description.joints
             if joint.mimics is not None and joint.name in self.moving
         ]
@@ -204,13 +200,13 @@ def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:
     moments[2] = min(moments[2], (moments[0] + moments[1]) * (1.0 - 1e-15))
     pose = _placed(transform(axes, center))
     pose = pose if "pos" in pose else f' pos="0 0 0"{pose}'
-    return f'<inertial{pose} mass="{mass!r}" diaginertia="{_numbers(moments)}"/>'
+    return f'<inertial{pose} mass="{mass!r}" diaginertia="{numbers(moments)}"/>'
 
 
 def _axis(joint: _Axis) -> str:
     position = joint.pose[:3, 3]
-    place = f' pos="{_numbers(position)}"' if position.any() else ""
-    return f'{place} axis="{_numbers(joint.pose[:3, :3] @ np.array(joint.axis))}"'
+    place = f' pos="{numbers(position)}"' if position.any() else ""
+    return f'{place} axis="{numbers(joint.pose[:3, :3] @ np.array(joint.axis))}"'
 
 
 def _placed(pose: np.ndarray) -> str:
@@ -218,13 +214,9 @@ def _placed(pose: np.ndarray) -> str:
     from scipy.spatial.transform import Rotation
 
     quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
-    position = f' pos="{_numbers(pose[:3, 3])}"' if pose[:3, 3].any() else ""
-    return position + ("" if np.array_equal(pose[:3, :3], np.eye(3)) else f' quat="{_numbers(quaternion)}"')
+    position = f' pos="{numbers(pose[:3, 3])}"' if pose[:3, 3].any() else ""
+    return position + ("" if np.array_equal(pose[:3, :3], np.eye(3)) else f' quat="{numbers(quaternion)}"')
 
 
 def _block(tag: str, lines: Sequence[str]) -> list[str]:
     return [f"  <{tag}>", *lines, f"  </{tag}>"] if lines else []
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(repr(float(value)) for value in values)

@@ -12,7 +12,7 @@ from typing import Any
 
 from forcegp.atomic_files import write_json
 from forcegp.errors import InvalidNumber, MalformedUrdf, MissingExtra, RobotFileWarning
-from forcegp.robots.urdf_file import read_text, write_text
+from forcegp.robots.urdf_file import before_the_end, read_text, write_text
 
 COMMENT = "<!-- rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json -->\n"
 
@@ -70,12 +70,6 @@ def with_comment(text: str, armature: Mapping[str, float], *, source: str, stack
         stacklevel=stacklevel,
     )
     return text if COMMENT in text else before_the_end(text, COMMENT)
-
-
-def before_the_end(text: str, added: str) -> str:
-    """URDF text with more before its last tag, a comment for example."""
-    end = text.rindex("</robot")
-    return f"{text[:end]}{added}{text[end:]}"
 
 
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:

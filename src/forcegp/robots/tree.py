@@ -220,9 +220,8 @@ def merged_inertias(tree: Tree, layout: Layout, inertials: Inertials) -> Float[T
     batch = broadcast_batch({f"inertials[{name!r}]": inertials[name].shape[:-1] for name in names})
     parameters = torch.stack([inertials[name].expand(*batch, 10) for name in names])
     change = [moving.index(name) for name in names]
-    factor = tree.link_offsets[change].reshape(len(names), *(1 for _ in batch), 4, 4) @ pseudo_inertia_factor(
-        parameters
-    )
+    offsets = tree.link_offsets[change].reshape(len(names), *(1 for _ in batch), 4, 4)
+    factor = offsets @ pseudo_inertia_factor(parameters)
     given = (factor @ factor.mT).movedim((-2, -1), (1, 2))
     # sum over the links that stay rather than subtract those that change: no cancellation
     stay = [i for i, name in enumerate(moving) if name not in inertials]

@@ -234,23 +234,11 @@ class UnrolledKinematics:
                 wi = dwi = scalars([0.0] * 3)
             else:
                 wi, dwi = to_body @ w[joint.parent], to_body @ dw[joint.parent]
-            if joint.kind is not None:  # the terms of a single axis, along several
-                (moved, turned), own = self._six(joint, v), self._six(joint, a)
-                acceleration = acceleration + np.cross(2.0 * wi + turned, moved) + own[0]
-                w.append(wi + turned)
-                dw.append(dwi + np.cross(wi, turned) + own[1])
-                A.append(np.column_stack([_turning(w[i], dw[i]), acceleration]))
-                continue
-            own = 0.0 if a is None else a[i]
-            x, y = wi[1] * v[i], -(wi[0] * v[i])  # w x (z v), whose z is zero
-            if joint.revolute:
-                dwi = dwi + scalars([x, y, own])
-                wi = wi + scalars([0.0, 0.0, v[i]])
-            else:  # the term of Coriolis counts twice
-                acceleration = acceleration + scalars([2.0 * x, 2.0 * y, own])
-            w.append(wi)
-            dw.append(dwi)
-            A.append(np.column_stack([_turning(wi, dwi), acceleration]))
+            (moved, turned), own = self._six(joint, v), self._six(joint, a)
+            acceleration = acceleration + np.cross(2.0 * wi + turned, moved) + own[0]
+            w.append(wi + turned)
+            dw.append(dwi + np.cross(wi, turned) + own[1])
+            A.append(np.column_stack([_turning(w[i], dw[i]), acceleration]))
         return A
 
     def _joint_forces(self, v: _Values | None, a: _Values | None, inertias: Sequence[Scalars] | None) -> Scalars:
@@ -274,7 +262,7 @@ class UnrolledKinematics:
         return self._of_joints(scalars(out))
 
     def _six(self, joint: UnrolledJoint, values: _Values | None) -> list[Scalars]:
-        """Linear and angular entries (3,) of ``values`` along the axes of a joint of several; 0 if None."""
+        """Linear and angular entries (3,) of ``values`` along the axes of a joint; 0 if None."""
         six = scalars([0.0] * 6)
         if values is not None:
             for k in joint.rows:

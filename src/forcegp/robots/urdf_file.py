@@ -25,7 +25,7 @@ from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
 from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import RobotDescription, parse_urdf
-from forcegp.robots.xml_text import without_comments
+from forcegp.robots.xml_text import numbers, without_comments
 
 UNREADABLE = "\ufffd"
 LARGEST_FILE = 16 << 20
@@ -183,13 +183,17 @@ def _indent_of(data: bytes, position: int) -> bytes:
     return line if not line.strip() else b""
 
 
-def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, line_start: bytes) -> bytes:
-    xyz = " ".join(repr(float(value)) for value in center_of_mass)
+def inertial_parts(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> list[str]:
+    """The elements inside of an ``<inertial>``."""
     entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     moments = " ".join(f'{key}="{float(inertia[index])!r}"' for key, index in entries.items())
-    inner = [f'<origin xyz="{xyz}" rpy="0 0 0"/>', f'<mass value="{float(mass)!r}"/>', f"<inertia {moments}/>"]
-    lines = [b"<inertial>", *(b"  " + element.encode() for element in inner), b"</inertial>"]
-    return line_start.join(lines)
+    origin = f'<origin xyz="{numbers(center_of_mass)}" rpy="0 0 0"/>'
+    return [origin, f'<mass value="{float(mass)!r}"/>', f"<inertia {moments}/>"]
+
+
+def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, line_start: bytes) -> bytes:
+    inner = [b"  " + element.encode() for element in inertial_parts(mass, center_of_mass, inertia)]
+    return line_start.join([b"<inertial>", *inner, b"</inertial>"])
 
 
 InertiaChoice = Literal["strict", "nearest"]
@@ -280,5 +284,10 @@ IN_THE_FILE = (
 
 def with_root(text: str, root: str) -> str:
     """URDF text that defines the link ``root``, which it does not name as one."""
-    end = text.rfind("</robot")
-    return f"{text[:end]}<link name={quoteattr(root)}/>\n{text[end:]}"
+    return before_the_end(text, f"<link name={quoteattr(root)}/>\n")
+
+
+def before_the_end(text: str, added: str) -> str:
+    """URDF text with more before its last tag, a comment for example."""
+    end = text.rindex("</robot")
+    return f"{text[:end]}{added}{text[end:]}"

@@ -1,6 +1,7 @@
 """XML text of robot files: of a bounded size, without entities, and without macros in what is read."""
 
 import re
+from collections.abc import Iterable
 from xml.etree.ElementTree import Element, ParseError
 
 from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
@@ -66,6 +67,11 @@ def _with_prefixes(text: str) -> str:
     used = set(re.findall(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]", text)) - {"xml", "xmlns"}
     declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(used) if f"xmlns:{prefix}" not in text)
     return re.sub(r"<robot(?=[\s>])", f"<robot{declared}", text, count=1)
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Numbers as an attribute holds them, with digits that read back exactly."""
+    return " ".join(repr(float(value)) for value in values)
 
 
 def refuse_xacro(root: Element, source: str) -> None:

@@ -1,18 +1,17 @@
 """The `kuka-surface` scenario: an iiwa slides its tool on a surface with friction (after Rath, Geist, Trimpe 2021)."""
 
-import dataclasses
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
 
 import numpy as np
 
 from forcegp import __version__
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.errors import SimulationError
 from forcegp.mechanics import Actuation, Baumgarte, Contact, MechanicalSystem, RigidBodyBias
 from forcegp.robots import Robot
-from forcegp.simulation.kuka_motion import TOOL_LINK, Motion, kuka_urdf, random_stream, simulate_episode
+from forcegp.simulation.kuka_motion import TOOL_LINK, Motion, kuka_urdf, simulate_episode
+from forcegp.simulation.recording import recorded
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import table_of
 
@@ -103,24 +102,10 @@ def _dataset(config: KukaSurfaceConfig, robot: Robot, motions: list[Motion]) -> 
     def column(name: str) -> np.ndarray:
         return np.concatenate([getattr(motion, name) for motion in motions])
 
-    noise = [random_stream(config, number, 1).standard_normal(motion.a.shape) for number, motion in enumerate(motions)]
-    signals: dict[str, Any] = {name: column(name) for name in ("q", "v", "u", "time")}
-    return Dataset(
-        **signals,
-        a=column("a") + config.noise * np.concatenate(noise),
-        episode=np.repeat(np.arange(config.episodes), config.rows_per_episode),
-        joint_names=tuple(robot.joint_names),
-        units=units_for(robot),
-        system=_system(config, robot),
-        noise_std=np.full(robot.nv, config.noise) if config.noise > 0 else None,
-        truth=_truth(config, column),
-        metadata={
-            "scenario": "kuka-surface",
-            "config": dataclasses.asdict(config),
-            "u": "commanded torque minus joint damping",
-            "versions": {"forcegp": __version__, "pybullet": _pybullet_version(), "numpy": np.__version__},
-        },
-    )
+    signals = {name: column(name) for name in ("q", "v", "u", "a", "time")}
+    versions = {"forcegp": __version__, "pybullet": _pybullet_version(), "numpy": np.__version__}
+    more = {"u": "commanded torque minus joint damping", "versions": versions}
+    return recorded("kuka-surface", config, _system(config, robot), signals, _truth(config, column), more)
 
 
 def _pybullet_version() -> str:

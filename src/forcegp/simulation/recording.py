@@ -24,14 +24,18 @@ def recorded(
 ) -> Dataset:
     """Rows of `config.episodes` episodes of equal length: q, v, u and the true a of `motion`, which gets its noise.
 
-    The noise has a stream of its own for each episode, so that it leaves the motion of a seed as it is.
+    The noise has a stream of its own for each episode, so that it leaves the motion of a seed as it is. Rows are
+    1 / RATE apart, unless `motion` has their time.
     """
     nv, steps = system.robot.nv, len(motion["a"]) // config.episodes
     streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
     noise = np.concatenate([stream.standard_normal((steps, nv)) for stream in streams])
     return Dataset(
-        **{**motion, "a": motion["a"] + config.noise * noise},
-        time=np.tile(np.arange(steps) / RATE, config.episodes),
+        **{
+            "time": np.tile(np.arange(steps) / RATE, config.episodes),
+            **motion,
+            "a": motion["a"] + config.noise * noise,
+        },
         episode=np.repeat(np.arange(config.episodes), steps),
         units=units_for(system.robot),
         system=system,

@@ -277,14 +277,8 @@ _POSITIVE = (
 _NOT_NEGATIVE = (
     *("noise", "joint_damping", "viscous_coefficient", "coulomb_coefficient", "static_coefficient", "patch_factor"),
     *("press", "lift_height", "joint_coulomb", "joint_static", "joint_viscous", "baumgarte_omega", "baumgarte_zeta"),
-    *(
-        "joint_asymmetry",
-        "joint_load",
-        "controller_zeta",
-        "null_space_stiffness",
-        "null_space_damping",
-        "waypoint_depth",
-    ),
+    *("joint_asymmetry", "joint_load", "controller_zeta", "null_space_stiffness", "null_space_damping"),
+    "waypoint_depth",
 )
 _FINITE = (
     *("gravity", "base_height", "tool_center_of_mass", "tool_point", "surface_height", "tilt_axis", "patch_x"),
@@ -308,7 +302,24 @@ _CHOICES = {"friction": Friction, "joint_friction": JointFriction, "surface": Su
 
 
 @dataclass(frozen=True, kw_only=True)
-class FreeArmConfig:
+class CommonConfig:
+    """What every scenario without a surface has; `noise` is that of the acceleration."""
+
+    seconds: float = 60.0
+    seed: int = 0
+    noise: float = 0.1
+    episodes: int = 1
+
+    def _check(self, **ranges: Range) -> None:
+        """Raise InvalidInput for these numbers, and those that have one of the ranges."""
+        for name, allowed in {"seconds": POSITIVE, "noise": NOT_NEGATIVE, **ranges}.items():
+            checked_numbers(name, getattr(self, name), allowed, None)
+        require_integer("seed", self.seed, 0, 2**31)
+        require_integer("episodes", self.episodes, 1, 10_000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeArmConfig(CommonConfig):
     """PD control with gravity compensation along sines of random size and rate, two per joint, about a posture.
 
     Friction is (c + (s - c) exp(-(v / v_s)^2)) tanh(v / w) + d v, with c, s and d in proportion to the largest torque
@@ -316,24 +327,17 @@ class FreeArmConfig:
     """
 
     arm: Literal["ur5-free", "double-pendulum"]
-    seconds: float = 60.0
-    seed: int = 0
-    noise: float = 0.1
-    episodes: int = 1
     joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
 
     @usable_arguments("FreeArmConfig")
     def __post_init__(self) -> None:
-        checked_numbers("seconds", self.seconds, POSITIVE, None)
-        checked_numbers("noise", self.noise, NOT_NEGATIVE, None)
-        require_integer("seed", self.seed, 0, 2**31)
-        require_integer("episodes", self.episodes, 1, 10_000)
+        self._check()
         require_known("joint_friction", self.joint_friction, "a free arm", ("none", "coulomb", "stribeck"))
         require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadrupedConfig:
+class QuadrupedConfig(CommonConfig):
     """A robot that stands, shifts its weight and lifts its feet; `payload` in kg on its trunk is in no robot file.
 
     With `lift` each foot in turn leaves the ground for a second. Friction as in `FreeArmConfig`, equal in all joints.
@@ -341,46 +345,30 @@ class QuadrupedConfig:
     """
 
     seconds: float = 30.0
-    seed: int = 0
-    noise: float = 0.1
-    episodes: int = 1
     payload: float = 2.0
     lift: bool = True
     joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
 
     @usable_arguments("QuadrupedConfig")
     def __post_init__(self) -> None:
-        checked_numbers("seconds", self.seconds, POSITIVE, None)
-        checked_numbers("noise", self.noise, NOT_NEGATIVE, None)
-        checked_numbers("payload", self.payload, NOT_NEGATIVE, None)
-        require_integer("seed", self.seed, 0, 2**31)
-        require_integer("episodes", self.episodes, 1, 10_000)
+        self._check(payload=NOT_NEGATIVE)
         require_known("joint_friction", self.joint_friction, "a quadruped", ("none", "coulomb", "stribeck"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadrotorConfig:
+class QuadrotorConfig(CommonConfig):
     """A drone that follows a path in `wind` [m/s] from a random side, with gusts; rotors follow within `lag` [s].
 
     `seed` draws path, side and gusts; the drone is always the same. `noise` in rad/s^2 and m/s^2. Raises InvalidInput
     naming the field and its range.
     """
 
-    seconds: float = 60.0
-    seed: int = 0
-    noise: float = 0.1
-    episodes: int = 1
     wind: float = 4.0
     lag: float = 0.06
 
     @usable_arguments("QuadrotorConfig")
     def __post_init__(self) -> None:
-        checked_numbers("seconds", self.seconds, POSITIVE, None)
-        checked_numbers("noise", self.noise, NOT_NEGATIVE, None)
-        checked_numbers("wind", self.wind, ("from 0 to 15 m/s", 0.0, 15.0), None)
-        checked_numbers("lag", self.lag, ("from 0.005 to 0.2 s", 0.005, 0.2), None)
-        require_integer("seed", self.seed, 0, 2**31)
-        require_integer("episodes", self.episodes, 1, 10_000)
+        self._check(wind=("from 0 to 15 m/s", 0.0, 15.0), lag=("from 0.005 to 0.2 s", 0.005, 0.2))
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,6 @@ class Stretch:
     begin: float = -math.inf
     end: float = math.inf
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether this is a whole episode."""
-        return self.begin == -math.inf and self.end == math.inf
-
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; None where there is no end."""
         ends = {name: getattr(self, name) for name in ("begin", "end")}
@@ -105,7 +100,7 @@ class Split:
                     f"and the guard is {self.guard} s."
                 )
         sides = dataset.rows(train), dataset.rows(test)
-        whole = all(stretch.is_whole for stretch in self.held_out)
+        whole = all(stretch == Stretch(stretch.episode) for stretch in self.held_out)
         # Blocks of one episode have equal metadata by nature; of those only repeated rows are refused.
         require_disjoint(sides[0] if whole else replace(sides[0], metadata={}), sides[1])
         return sides

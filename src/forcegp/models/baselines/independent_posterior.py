@@ -17,6 +17,7 @@ from forcegp.inference import (
     LatentKernels,
     LeaveOut,
     OptimizationResult,
+    Terms,
     leave_blocks_out,
     negative_log_likelihood,
 )
@@ -74,25 +75,25 @@ class IndependentLikelihood:
     def __call__(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """The negative log marginal likelihood of one joint, at parameters named as by `joint_part`."""
         matrices = kernels.matrices(parameters, [self._training_features])
-        return negative_log_likelihood(*self.terms(joint, parameters), matrices)
+        terms = self.terms(joint, parameters)
+        return negative_log_likelihood(terms.W, terms.residual, terms.noise, matrices)
 
     def condition(self, joint: int, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> ExactPosterior:
         """The posterior of one joint's function at fixed parameters."""
-        terms = self.terms(joint, parameters)
-        return ExactPosterior.condition(kernels.at(parameters), [self._training_features], *terms)
+        return ExactPosterior.condition(kernels.at(parameters), self.terms(joint, parameters))
 
     @cached_property
     def _training_features(self) -> Tensor:
         return self.features(self.training.q, self.training.v, self.training.u)
 
-    def terms(self, joint: int, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Mixing W = 1, residual and noise variance of one joint."""
+    def terms(self, joint: int, parameters: Mapping[str, Tensor]) -> Terms:
+        """Of one joint, with mixing W = 1 and a noise variance."""
         target = self.training.a[:, joint : joint + 1]
         variance = (2.0 * parameters[ACCELERATION]).exp()[None]
         factors = self.training.noise_factors
         if factors is not None:
             variance = variance * factors[:, joint : joint + 1].square()
-        return torch.ones_like(target)[..., None], target, variance
+        return Terms([self._training_features], torch.ones_like(target)[..., None], target, variance)
 
     def _columns(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         states = {"q": q, "v": v, "u": u}

@@ -225,16 +225,13 @@ class MarginalLikelihood:
         Where k rows count as one, densities N(a | f, R) are taken to the power of 1/k: N(a | f, k R) times
         |2 pi k R|^(1/2) / |2 pi R|^(1 / (2 k)), so that learned noise stays that of a row.
         """
-        features, W, residual, noise = self.terms(parameters)
-        bound, k = (
-            collapsed_bound(W, residual, noise, kernels, parameters, features, points),
-            self.training.correlated_rows,
-        )
+        terms, k = self.terms(parameters), self.training.correlated_rows
+        bound = collapsed_bound(terms, kernels, parameters, points)
         if k == 1.0:
             return bound
-        spread = 2.0 * math.pi * noise  # of k R
-        logs = spread.log().sum(-1) if noise.ndim == 2 else torch.linalg.slogdet(spread).logabsdet
-        rows, outputs = residual.shape
+        spread = 2.0 * math.pi * terms.noise  # of k R
+        logs = spread.log().sum(-1) if spread.ndim == 2 else torch.linalg.slogdet(spread).logabsdet
+        rows, outputs = terms.residual.shape
         return bound - 0.5 * ((1.0 - 1.0 / k) * logs.expand(rows).sum() + rows * outputs * math.log(k) / k)
 
     def condition(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, InvalidInput, require_known
-from forcegp.inference import ExactPosterior, InducingPosterior, exact
+from forcegp.inference import ExactPosterior, InducingPosterior, Terms, exact
 from forcegp.inference.cholesky_update import with_only, with_rows
 from forcegp.inference.engines import ENOUGH, InducingWeights
 from forcegp.inference.memory import require_memory
@@ -48,7 +48,7 @@ def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, ke
         variance = variance.expand(len(W), *variance.shape[1:])
         for start in range(0, len(W), height):
             part = slice(start, start + height)
-            latent = with_rows(latent, [z[part] for z in features], W[part], residual[part], variance[part])
+            latent = with_rows(latent, Terms([z[part] for z in features], W[part], residual[part], variance[part]))
             training = _joined(training, _selected(added, part))
             if budget is not None and len(training.q) > budget:
                 kept = keep(latent, budget)
