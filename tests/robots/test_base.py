@@ -4,7 +4,7 @@ import pytest
 import torch
 from tests.robots.robot_models import CHAIN, MODELS, TREE
 
-from forcegp.errors import InvalidInput, UnstatedBase
+from forcegp.errors import InvalidInput, RobotModelError, UnstatedBase
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 
@@ -58,6 +58,23 @@ def test_robots_that_walk_drive_or_fly_are_asked(name):
 @pytest.mark.parametrize("name", BOLTED)
 def test_arms_hands_and_grippers_never_are(name):
     assert Robot.from_urdf_text(BOLTED[name]).base == "fixed"
+
+
+@pytest.mark.parametrize("mass", ["nan", "-5"])
+def test_a_base_whose_mass_is_a_mistake_is_asked_as_well(mass):
+    """Such a robot was welded to the world without a word."""
+    with pytest.raises(RobotModelError, match=r"link 'trunk': .*not bolted to the world") as caught:
+        Robot.from_urdf_text(LOOSE["legs"].replace('value="5.0"', f'value="{mass}"'))
+    assert [type(each) for each in caught.value.problems] == [str, str]
+
+
+@pytest.mark.parametrize("base", ["planar", "spherical"])
+def test_another_base_than_that_of_the_file_is_refused(base):
+    hung = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="trunk"/></joint>'
+    text = LOOSE["legs"].replace("</robot>", f"{hung}</robot>")
+    with pytest.raises(InvalidInput, match=f"base is '{base}'.* joint 'root' of type 'floating'; leave base out"):
+        Robot.from_urdf_text(text, base=base)
+    assert Robot.from_urdf_text(text, base="floating").nv == 8
 
 
 def test_a_file_that_says_so_itself_is_not_asked():

@@ -134,7 +134,13 @@ def lay_out(
     still = [root]
     for link in still:
         still += [joint.child for joint in children[link] if joint.type == "fixed" or joint.name in held]
-    own = any(joint.type in BASES for link in still for joint in children[link])
+    own = {joint.name: joint.type for link in still for joint in children[link] if joint.type in BASES}
+    other = next((name for name, kind in own.items() if base not in (None, "fixed", kind)), None)
+    if other is not None:
+        raise InvalidInput(
+            f"{description.source}: base is {base!r}, and the file holds its base by joint {other!r} of type "
+            f"{own[other]!r}; leave base out, give 'fixed', or take that joint out of the file."
+        )
     if base not in (None, "fixed") and not own:
         links = {OUTSIDE: Placement(WORLD, np.eye(4))}
         stack = [free_joint(BASE, str(base), OUTSIDE, root)]
