@@ -227,3 +227,9 @@ def test_forces_of_another_kind_are_something_to_look_at():
     (finding,) = quick_check(replace(log, u=2.0 * log.u))
     assert (finding.subject, finding.severity) == ("base force", "look")
     assert finding.numbers["force"] == pytest.approx(3.0 * 2.0 * 9.81, rel=0.1)
+
+
+def test_rows_that_were_left_out_are_no_jumps():
+    log, _ = flight(noise=False)
+    kept = np.flatnonzero(np.arange(len(log)) % 100 < 60)
+    assert not quick_check(log.rows(kept))

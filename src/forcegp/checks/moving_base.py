@@ -33,6 +33,8 @@ WINDOW, MOST_TURN = 0.1, 0.5
 """Seconds over which motion is averaged, and rad, since rates are averaged as vectors."""
 CARRIED = 0.5
 """Of the weight: a larger force in half of the rows carries the robot."""
+GAP = 1.5
+"""Times the usual time of so many rows: a longer one has a gap."""
 RPM = 2.0 * np.pi / 60.0
 IMU = {"axes": {"a": ("imu",)}}
 
@@ -56,6 +58,9 @@ class _Windows:
         length = int(np.clip(seconds / np.median(steps), 1, max(1, most))) + 1 if len(steps) else 2
         length = length if dataset.time_ordered else 1
         first = whole_windows(dataset, length)
+        if length > 1:  # rows that were left out leave gaps
+            lasts = dataset.time[first + length - 1] - dataset.time[first]
+            first = first[lasts < GAP * (length - 1) * np.median(steps)]
         first = first[:: max(1, -(-len(first) // min(MOST_ROWS, most_rows // length)))]
         rows = first[:, None] + np.arange(length)
         steps = np.diff(dataset.time[rows])
