@@ -1,5 +1,6 @@
 """Who is asked whether the robot is bolted to the world, and who is not."""
 
+import pinocchio as pin
 import pytest
 import torch
 from tests.robots.robot_models import CHAIN, MODELS, TREE
@@ -7,6 +8,7 @@ from tests.robots.robot_models import CHAIN, MODELS, TREE
 from forcegp.errors import InvalidInput, RobotModelError, UnstatedBase
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
+from forcegp.robots.base import BaseChoice
 
 BODY = '<inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 
@@ -75,6 +77,24 @@ def test_another_base_than_that_of_the_file_is_refused(base):
     with pytest.raises(InvalidInput, match=f"base is '{base}'.* joint 'root' of type 'floating'; leave base out"):
         Robot.from_urdf_text(text, base=base)
     assert Robot.from_urdf_text(text, base="floating").nv == 8
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_a_free_joint_on_a_body_carries_something_else(kind):
+    """A ball that lies on the robot: it does not hold the base, which was welded although the answer was floating."""
+    ball = f'<link name="ball">{BODY.format(0.5)}</link><joint name="lies" type="{kind}"><axis xyz="0 0 1"/>'
+    ball += '<parent link="trunk"/><child link="ball"/></joint>'
+    text = LOOSE["legs"].replace("</robot>", f"{ball}</robot>")
+    extra = {"floating": 6, "planar": 3}[kind]
+    answers: dict[BaseChoice, int] = {"fixed": 2, "floating": 8, "planar": 5}
+    for base, nv in answers.items():
+        robot = Robot.from_urdf_text(text, base=base)
+        assert (robot.base, robot.nv) == (base, nv + extra)
+        assert Robot.from_stored(robot.to_stored()).tree.equals(robot.tree)
+    robot, theirs = Robot.from_urdf_text(text, base="floating"), pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
+    assert robot.nv == theirs.nv
+    still = pin.crba(theirs, theirs.createData(), pin.neutral(theirs)).diagonal()
+    assert torch.allclose(robot.mass_matrix(robot.neutral()).diagonal().sort()[0], torch.tensor(still).sort()[0])
 
 
 def test_a_file_that_says_so_itself_is_not_asked():
