@@ -43,6 +43,7 @@ BASE = "base"
 """Name of the joint between the world and a base that moves."""
 BASES: tuple[BaseChoice, ...] = ("floating", "planar")
 """Joints by which a file itself holds its base."""
+BOLTED: BaseChoice = "fixed"
 OUTSIDE = "(world)"
 """What carries such a base; no link of the robot."""
 MOST_BODIES = 1000
@@ -191,7 +192,7 @@ def lay_out(
         tuple(origins),
         {name: place for name, place in links.items() if name != OUTSIDE},
         tuple(groups),
-        base or next(iter(own.values()), "fixed"),
+        base or (*own.values(), BOLTED)[0],
     )
 
 
