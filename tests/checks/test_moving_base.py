@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from forcegp import Dataset, MechanicalSystem, Robot, check, excitation
 from forcegp.checks import quick_check
+from forcegp.data.configurations import rates
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 BODY = """<robot name="drone"><link name="body"><inertial><mass value="2"/>
@@ -134,3 +136,100 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
 def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
         excitation(log.system)
+
+
+FLYING = 400.0  # Hz
+
+
+def flight(seed: int = 0, noise: bool = True) -> tuple[Dataset, np.ndarray]:
+    """A drone that flies to and fro, as motion capture sees it (1 mm, 0.2 degrees), and its velocities in the world."""
+    time, draw = np.arange(2400) / FLYING, np.random.default_rng(seed).normal
+    size, turns = np.array([1.5, 1.2, 0.4]), np.array([1.3, 1.9, 1.1])
+    position, velocity = (size * np.sin(turns * time[:, None])), size * turns * np.cos(turns * time[:, None])
+    acceleration = -size * turns**2 * np.sin(turns * time[:, None])
+    up = acceleration + np.array([0.0, 0.0, 9.81])
+    length = np.linalg.norm(up, axis=1, keepdims=True)
+    side = np.cross(up / length, [1.0, 0.3, 0.0])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    turned = Rotation.from_matrix(np.stack([np.cross(side, up / length), side, up / length], axis=2))
+    turning = np.zeros((2400, 3))
+    turning[1:-1] = (turned[:-2].inv() * turned[2:]).as_rotvec() * FLYING / 2.0
+    speeds = np.sqrt(2.0 * length / 4.0 / 1e-5) * np.ones(4)  # of rotors whose thrusts are equal, rad/s
+    rotors = Thrusters("body", [(0.1, 0.1, 0), (-0.1, 0.1, 0), (0.1, -0.1, 0), (-0.1, -0.1, 0)], thrust=1e-5, power=2)
+    robot = Robot.from_urdf_text(BODY, base="floating")
+    system = MechanicalSystem(robot, (), (Actuation(), rotors, RigidBodyBias()))
+    jitter = Rotation.from_rotvec(np.deg2rad(0.2) * noise * draw(size=(2400, 3)))
+    q = np.hstack([position + 0.001 * noise * draw(size=(2400, 3)), (turned * jitter).as_quat()])
+    world = velocity + 0.02 * noise * draw(size=(2400, 3))
+    v = np.hstack([(turned * jitter).inv().apply(world), turning])
+    log = {"q": q, "v": v, "u": speeds, "a": np.gradient(v, time, axis=0), "time": time}
+    return Dataset(**log, system=system).rows(slice(2, -2)), world[2:-2]
+
+
+def with_w_first(log: Dataset, world: np.ndarray) -> Dataset:
+    """The log as an import reads it that was given linear velocities of the world, and not the order of quaternions."""
+    q, v = log.q.copy(), log.v.copy()
+    q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
+    v[:, :3] = Rotation.from_quat(q[:, 3:7]).inv().apply(world)
+    stated = {"import": {"mapping": {"axes": {"v": ["world", "body"]}}}}
+    return replace(log, q=q, v=v, a=np.gradient(v, log.time, axis=0), metadata=stated)
+
+
+def test_noise_of_poses_at_a_high_rate_is_no_mistake():
+    """Differences of successive poses are 0.6 m/s and 2 rad/s off here."""
+    assert not quick_check(flight()[0])
+
+
+def test_what_a_log_at_a_high_rate_means_is_named():
+    log, world = flight()
+    (finding,) = quick_check(with_w_first(log, world))
+    assert (finding.severity, finding.correction) == ("wrong", {"orientation": {"q": ("wxyz",)}})
+    v = np.hstack([world, log.v[:, 3:]])
+    (finding,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0)))
+    assert (finding.severity, finding.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
+    stated = {
+        "import": {"mapping": {"axes": {"v": ["world"]}}}
+    }  # rates of the body, turned as if they were the world's
+    v = np.hstack([log.v[:, :3], Rotation.from_quat(log.q[:, 3:7]).inv().apply(log.v[:, 3:].copy())])
+    (finding,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0), metadata=stated))
+    assert (finding.severity, finding.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
+    assert "angular velocities in the axes of the base" in finding.seen
+
+
+def test_a_log_that_begins_at_rest_is_compared_where_it_moves():
+    log, world = flight()
+    wrong = with_w_first(log, world)
+    rest = {name: np.repeat(getattr(wrong, name)[:1] * (name != "a") * (name != "v"), 2500, 0) for name in "qvua"}
+    time = np.arange(2500 + len(log)) / FLYING
+    rows = {name: np.vstack([rest[name], getattr(wrong, name)]) for name in "qvua"}
+    findings = quick_check(Dataset(**rows, time=time, system=log.system, metadata=wrong.metadata))
+    assert [each.correction for each in findings if each.severity == "wrong"] == [{"orientation": {"q": ("wxyz",)}}]
+
+
+@pytest.mark.parametrize("speeds", [1.0, 60.0 / (2.0 * np.pi)])
+@pytest.mark.parametrize("w_first", [False, True])
+def test_thrust_shows_the_unit_of_rotors_and_the_order_of_quaternions(w_first, speeds):
+    """Velocities that were derived from such quaternions agree with them."""
+    log, _ = flight(noise=False)
+    q, stated = log.q.copy(), {}
+    if w_first:
+        q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
+        stated["orientation"] = {"q": ("wxyz",)}
+    if speeds != 1.0:
+        stated["unit"] = {"u": ("rpm",)}
+    v = rates(log.system.robot.space, q, log.time)
+    read = replace(log, q=q, v=v, u=speeds * log.u, a=np.gradient(v, log.time, axis=0)).rows(slice(3, -3))
+    assert [each.correction for each in quick_check(read)] == ([stated] if stated else [])
+
+
+def test_forces_of_another_kind_are_something_to_look_at():
+    log, _ = flight()
+    (finding,) = quick_check(replace(log, u=2.0 * log.u))
+    assert (finding.subject, finding.severity) == ("base force", "look")
+    assert finding.numbers["force"] == pytest.approx(3.0 * 2.0 * 9.81, rel=0.1)
+
+
+def test_rows_that_were_left_out_are_no_jumps():
+    log, _ = flight(noise=False)
+    (finding, *_) = check(log.rows(np.flatnonzero(np.arange(len(log)) % 800 < 50))).of("base")
+    assert finding.numbers["as recorded"] < 1e-4 * finding.numbers["speed"]  # across gaps a quarter

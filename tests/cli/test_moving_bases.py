@@ -130,3 +130,21 @@ def test_what_cannot_be_is_one_line_before_the_work(folder, forcegp, words, mess
     assert message in refused.stderr
     assert len(refused.stderr.strip().splitlines()) == 1
     assert not (folder / "x").exists()
+
+
+def test_a_base_that_was_not_measured_is_told_what_to_record(tmp_path, forcegp):
+    """And what can be learned without: doing so works."""
+    (tmp_path / "hopper.urdf").write_text(LIMBS)
+    joints = Robot.from_urdf_text(LIMBS, base="floating").single_joint_names
+    time = np.arange(200) / 100
+    table = np.column_stack([time, *(np.sin((k + 1) * time) for k in range(2 * len(joints)))])
+    names = ["t", *(f"q_{name}" for name in joints), *(f"u_{name}" for name in joints)]
+    np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header=",".join(names), comments="")
+    words = ("import", "log.csv", "--time", "t", "--q", "q_{joints}", "--u", "u_{joints}", "--robot", "hopper.urdf")
+    refused = forcegp(*words, "--base", "floating", "--out", "log.h5", folder=tmp_path)
+    assert refused.returncode == 2
+    assert len(refused.stderr.splitlines()) == 1
+    assert "was not measured: record its pose by motion capture" in refused.stderr
+    assert "on a stand: a robot with --base fixed" in refused.stderr
+    taken = forcegp(*words, "--base", "fixed", "--beyond-limits", "--out", "log.h5", folder=tmp_path)
+    assert taken.returncode == 0, taken.stderr

@@ -38,6 +38,16 @@ def test_json_holds_the_same(forcegp, file):
     assert (content["base"], content["repaired"]) == ("fixed", [])
 
 
+def test_joints_that_stand_still_are_shown_as_locked(forcegp, file):
+    hung = '<link name="odom"/><joint name="root" type="planar"><parent link="odom"/><child link="{}"/></joint></robot>'
+    root = CHAIN.split('<link name="')[1].split('"')[0]
+    file.write_text(CHAIN.replace("</robot>", hung.format(root)))
+    assert "root (planar)" in forcegp("robot", file).stdout
+    shown = forcegp("robot", file, "--base", "fixed").stdout
+    assert "root (locked)" in shown
+    assert shown.count("(locked)") == 1
+
+
 def test_one_error_and_its_options_take_the_file(forcegp, file):
     file.write_text(MANY)
     refused = forcegp("robot", file)

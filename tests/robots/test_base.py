@@ -1,12 +1,14 @@
 """Who is asked whether the robot is bolted to the world, and who is not."""
 
+import pinocchio as pin
 import pytest
 import torch
 from tests.robots.robot_models import CHAIN, MODELS, TREE
 
-from forcegp.errors import InvalidInput, UnstatedBase
+from forcegp.errors import InvalidInput, RobotModelError, UnstatedBase
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
+from forcegp.robots.base import BaseChoice
 
 BODY = '<inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 
@@ -58,6 +60,41 @@ def test_robots_that_walk_drive_or_fly_are_asked(name):
 @pytest.mark.parametrize("name", BOLTED)
 def test_arms_hands_and_grippers_never_are(name):
     assert Robot.from_urdf_text(BOLTED[name]).base == "fixed"
+
+
+@pytest.mark.parametrize("mass", ["nan", "-5"])
+def test_a_base_whose_mass_is_a_mistake_is_asked_as_well(mass):
+    """Such a robot was welded to the world without a word."""
+    with pytest.raises(RobotModelError, match=r"link 'trunk': .*not bolted to the world") as caught:
+        Robot.from_urdf_text(LOOSE["legs"].replace('value="5.0"', f'value="{mass}"'))
+    assert [type(each) for each in caught.value.problems] == [str, str]
+
+
+@pytest.mark.parametrize("base", ["planar", "spherical"])
+def test_another_base_than_that_of_the_file_is_refused(base):
+    hung = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="trunk"/></joint>'
+    text = LOOSE["legs"].replace("</robot>", f"{hung}</robot>")
+    with pytest.raises(InvalidInput, match=f"base is '{base}'.* joint 'root' of type 'floating'; leave base out"):
+        Robot.from_urdf_text(text, base=base)
+    assert Robot.from_urdf_text(text, base="floating").nv == 8
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_a_free_joint_on_a_body_carries_something_else(kind):
+    """A ball that lies on the robot: it does not hold the base, which was welded although the answer was floating."""
+    ball = f'<link name="ball">{BODY.format(0.5)}</link><joint name="lies" type="{kind}"><axis xyz="0 0 1"/>'
+    ball += '<parent link="trunk"/><child link="ball"/></joint>'
+    text = LOOSE["legs"].replace("</robot>", f"{ball}</robot>")
+    extra = {"floating": 6, "planar": 3}[kind]
+    answers: dict[BaseChoice, int] = {"fixed": 2, "floating": 8, "planar": 5}
+    for base, nv in answers.items():
+        robot = Robot.from_urdf_text(text, base=base)
+        assert (robot.base, robot.nv) == (base, nv + extra)
+        assert Robot.from_stored(robot.to_stored()).tree.equals(robot.tree)
+    robot, theirs = Robot.from_urdf_text(text, base="floating"), pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
+    assert robot.nv == theirs.nv
+    still = pin.crba(theirs, theirs.createData(), pin.neutral(theirs)).diagonal()
+    assert torch.allclose(robot.mass_matrix(robot.neutral()).diagonal().sort()[0], torch.tensor(still).sort()[0])
 
 
 def test_a_file_that_says_so_itself_is_not_asked():

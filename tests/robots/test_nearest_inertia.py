@@ -1,5 +1,6 @@
 """Inertias that no body has, replaced by the nearest possible one when asked for."""
 
+import math
 import warnings
 
 import numpy as np
@@ -94,9 +95,10 @@ def test_what_is_possible_stays_as_it_is():
         assert Robot.from_urdf_text(text, inertias="nearest").to_urdf() == text
 
 
-def test_a_negative_mass_is_not_mended():
-    with pytest.raises(NonPhysicalInertia, match="negative"):
-        Robot.from_urdf_text(URDF.format(mass=-1.0, ixx=0.02), inertias="nearest")
+@pytest.mark.parametrize(("mass", "why"), [(-1.0, "negative"), (math.inf, "not finite")])
+def test_an_impossible_mass_is_not_mended(mass, why):
+    with pytest.raises(NonPhysicalInertia, match=why):
+        Robot.from_urdf_text(URDF.format(mass=mass, ixx=0.02), inertias="nearest")
 
 
 def test_another_choice_is_refused():

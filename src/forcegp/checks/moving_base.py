@@ -1,23 +1,25 @@
 """Robots whose base moves: do positions, velocities and accelerations belong together, in which axes, in which order.
 
 State estimators differ: quaternions begin or end with w, velocities are those of the body's or of the world's axes.
-Each reading predicts how positions change from row to row; that which the log obeys shows.
+Each reading predicts how positions change; that which the log obeys shows. They are compared over a tenth of a second,
+not from row to row: noise of 1 mm and 0.2 degrees at 400 Hz is 0.6 m/s and 2 rad/s there. Thrusters have to carry a
+base that floats, which shows the unit of their speeds, and the order of a quaternion that velocities were derived from.
 """
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from forcegp.checks.check_input import Finding, import_flags, look, ok, wrong
-from forcegp.checks.successive_rows import consecutive
+from forcegp.checks.successive_rows import consecutive, whole_windows
 from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
 from forcegp.mechanics import MechanicalSystem
-from forcegp.robots import Robot
-from forcegp.robots.manifold import Group
+from forcegp.robots.manifold import Group, difference, pose
 
 CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
@@ -26,28 +28,71 @@ SURE = 20.0
 """Standard errors of independent rows by which other axes have to fit better: successive rows are not independent."""
 TINY = 1e-24
 MOST_ROWS = 2000
+MOST_WINDOW_ROWS, MOST_FORCES = 20_000, 4_000
+WINDOW, MOST_TURN = 0.1, 0.5
+"""Seconds over which motion is averaged, and rad, since rates are averaged as vectors."""
 CARRIED = 0.5
 """Of the weight: a larger force in half of the rows carries the robot."""
+GAP = 1.5
+"""Times the usual time of so many rows: a longer one has a gap."""
+RPM = 2.0 * np.pi / 60.0
 IMU = {"axes": {"a": ("imu",)}}
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Rows (windows, rows of one) of stretches of time, evenly over the log, and the weights of a mean over time."""
+
+    rows: np.ndarray
+    weights: Tensor
+    step: Tensor
+
+    @classmethod
+    def of(cls, dataset: Dataset, turning: np.ndarray, most_rows: int = MOST_WINDOW_ROWS) -> "_Windows":
+        """`turning`: columns of v that are rates."""
+        after = np.flatnonzero(consecutive(dataset)[:-1])
+        rate = float(np.linalg.norm(dataset.v[:, turning], axis=1).mean()) if len(turning) else 0.0
+        seconds = min(WINDOW, MOST_TURN / max(rate, 1e-9))
+        steps = np.diff(dataset.time)[after]
+        most = min(len(dataset) // 10, most_rows // 100)
+        length = int(np.clip(seconds / np.median(steps), 1, max(1, most))) + 1 if len(steps) else 2
+        length = length if dataset.time_ordered else 1
+        first = whole_windows(dataset, length)
+        if length > 1:  # rows that were left out leave gaps
+            lasts = dataset.time[first + length - 1] - dataset.time[first]
+            first = first[lasts < GAP * (length - 1) * np.median(steps)]
+        first = first[:: max(1, -(-len(first) // min(MOST_ROWS, most_rows // length)))]
+        rows = first[:, None] + np.arange(length)
+        steps = np.diff(dataset.time[rows])
+        weights = 0.5 * (np.pad(steps, ((0, 0), (0, 1))) + np.pad(steps, ((0, 0), (1, 0))))
+        whole = steps.sum(1, keepdims=True)
+        weights = weights / whole if length > 1 else np.ones(rows.shape)
+        return cls(rows, torch.tensor(weights)[..., None], torch.tensor(whole))
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Over each window (windows, k), of values (windows * rows of one, k)."""
+        return (self.weights * values.unflatten(0, self.rows.shape)).sum(1)
+
+    def of_signal(self, values: np.ndarray) -> Tensor:
+        return torch.tensor(values[self.rows.ravel()])
 
 
 def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
     """What is seen of the bases of a log; the joints of one degree of freedom are not looked at."""
-    after = np.flatnonzero(consecutive(dataset)[:-1])[:MOST_ROWS]
-    if not dataset.time_ordered or len(after) < 10:
+    if not dataset.time_ordered or consecutive(dataset).sum() < 10:
         yield look(subject="base", seen="too few successive rows to compare positions and velocities of the base.")
         return
-    step = torch.tensor(np.diff(dataset.time)[after])[:, None]
-    q0, q1 = (torch.tensor(dataset.q[rows]) for rows in (after, after + 1))
-    middle = torch.tensor(0.5 * (dataset.v[after] + dataset.v[after + 1]))
-    change = torch.tensor(dataset.v[after + 1] - dataset.v[after]) / step
-    a = torch.tensor(0.5 * (dataset.a[after] + dataset.a[after + 1]))
     for group in system.robot.layout.groups:
-        yield from _of_velocity(system.robot, group, q0, q1, step, middle, _stated_axes(dataset))
-        error, size = _rms(change[:, group.rows] - a[:, group.rows]), _rms(change[:, group.rows])
-        at, gravity = q0[:, group.places], system.robot.gravity
-        measured = in_base(group, at, a[:, group.rows], ("imu", "body"), middle[:, group.rows], gravity)
-        specific = _rms(change[:, group.rows] - measured)
+        own = np.arange(dataset.nv)[group.rows]
+        windows = _Windows.of(dataset, own[[k for k, free in enumerate(group.motion.free) if free > 2]])
+        q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
+        at, v, a = q[:, group.places], v[:, group.rows], a[:, group.rows]
+        yield from _of_velocity(windows, group, at, v, _stated_axes(dataset))
+        each = v.unflatten(0, windows.rows.shape)
+        change = (each[:, -1] - each[:, 0]) / windows.step
+        error, size = _rms(change - windows.mean(a)), _rms(change)
+        measured = in_base(group, at, a, ("imu", "body"), v, system.robot.gravity)
+        specific = _rms(change - windows.mean(measured))
         if error > 2.0 * size and specific < CLEARLY * error:
             yield wrong(
                 subject="base acceleration",
@@ -70,26 +115,68 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
 
 def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
     """A base that floats and does not fall, although no foot, thruster or known force of the system carries it."""
-    robot, rows = system.robot, np.linspace(0, len(dataset) - 1, min(len(dataset), MOST_ROWS)).astype(int)
+    robot, groups = system.robot, system.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * sum(robot.link(name).mass for name in robot.layout.moving)
-    for group in robot.layout.groups[:1]:
-        if group.kind != "floating" or system.contacts or thruster_columns(system) or not weight:
-            continue
-        inputs = dataset.u if dataset.u.shape[1] == len(system.inputs) else np.zeros((len(dataset), len(system.inputs)))
-        given = (dataset.q, dataset.v, inputs, dataset.a)
-        q, v, u, a = (torch.tensor(each[rows], device=robot.device) for each in given)
-        dynamics = system.dynamics(q, v, u)
-        force = ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :3]
-        size = float(torch.linalg.vector_norm(force, dim=-1).median())
-        if size > CARRIED * weight:
+    if not groups or groups[0].kind != "floating" or system.contacts or not weight:
+        return
+    group = groups[0]
+    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][3:], MOST_FORCES)
+    complete = dataset.u.shape[1] == len(system.inputs)
+    inputs = dataset.u if complete else np.zeros((len(dataset), len(system.inputs)))
+    q, v, u, a = (windows.of_signal(x).to(robot.device) for x in (dataset.q, dataset.v, inputs, dataset.a))
+
+    def missing(inputs: Tensor) -> Tensor:
+        """The linear part of M a less what the system knows of, in the axes of the base, in N."""
+        dynamics = system.dynamics(q, v, inputs)
+        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :3].cpu()
+
+    def size(force: Tensor) -> float:
+        return float(torch.linalg.vector_norm(windows.mean(force), dim=-1).median())
+
+    found, thrusters = size(missing(u)), sorted(thruster_columns(system)) if complete else []
+    if found <= CARRIED * weight:
+        return
+    numbers, weighs = {"force": found, "weight": weight}, f"(the robot weighs {weight:.3g} N)"
+    if not thrusters:
+        yield wrong(
+            subject="base force",
+            seen=f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the system explains, "
+            f"no foot that stands and no thruster {weighs}.",
+            remedy="Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
+            "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
+            numbers=numbers,
+        )
+        return
+    seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
+    still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
+    still[:, thrusters], slower[:, thrusters] = 0.0, RPM * u[:, thrusters]
+    needed, upright = missing(still), torch.eye(3, dtype=at.dtype)
+    turned = pose(group.kind, _reordered(group, at))[0].mT @ pose(group.kind, at)[0]
+    order, unit = {"orientation": {"q": ("wxyz",)}}, {"unit": {"u": ("rpm",)}}
+    readings = {
+        "rotor speeds in rpm": (upright, slower, unit),
+        "a quaternion w, x, y, z": (turned, u, order),
+        "a quaternion w, x, y, z and rotor speeds in rpm": (turned, slower, order | unit),
+    }
+    for what, (rotation, speeds, correction) in readings.items():
+        left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
+        if left < CLEARLY * min(found, weight):
+            remedy = f"forcegp import {import_flags(correction)}."
+            numbers[what] = left
             yield wrong(
                 subject="base force",
-                seen=f"{group.name!r} does not fall: it moves under {size:.3g} N that nothing in the system explains, "
-                f"no foot that stands and no thruster (the robot weighs {weight:.3g} N).",
-                remedy="Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
-                "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
-                numbers={"force": size, "weight": weight},
+                seen=f"{seen}; with {what} {left:.3g} N.",
+                remedy=remedy,
+                correction=correction,
+                numbers=numbers,
             )
+            return
+    yield look(
+        subject="base force",
+        seen=f"{seen}.",
+        remedy="Check the unit of u, the mass, coefficients of thrust and the axes of a; leave out rows on the ground.",
+        numbers=numbers,
+    )
 
 
 def _stated_axes(dataset: Dataset) -> tuple[str, str]:
@@ -100,42 +187,45 @@ def _stated_axes(dataset: Dataset) -> tuple[str, str]:
     return "body", "body"
 
 
-def _of_velocity(
-    robot: Robot, group: Group, q0: Tensor, q1: Tensor, step: Tensor, v: Tensor, stated: tuple[str, str]
-) -> Iterator[Finding]:
-    own = v[:, group.rows]
-    whole = list(range(own.shape[1]))
-    parts = {"linear ": [k for k in whole if group.motion.free[k] < 3]}
-    parts["angular "] = [k for k in whole if k not in parts["linear "]]
+def _of_velocity(windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: tuple[str, str]) -> Iterator[Finding]:
+    whole = list(range(v.shape[1]))
+    angular = [free > 2 for free in group.motion.free]
+    parts = {"linear ": [k for k in whole if not angular[k]], "angular ": [k for k in whole if angular[k]]}
 
     def mistaken(recorded: float, other: float, speed: float) -> bool:
         return recorded > CLEARLY * speed and other < CLEARLY * min(recorded, speed)
 
-    def best_axes(first: Tensor, second: Tensor) -> tuple[list[str], float]:
-        """Which parts of v fit in the axes of the world only, and the error that is left with them turned."""
-        moved = robot.space.difference(first, second)[:, group.rows] / step
-        body, turned, of_world = in_base(group, first[:, group.places], own, ("world", "world")), own.clone(), []
-        for name, part in parts.items():
-            if part and _explained((moved - own)[:, part], (body - own)[:, part]):
-                turned[:, part] = body[:, part]
-                of_world.append(name)
-        return of_world, _rms(moved - turned)
+    turned = _in_world(group, q, v)
+    raw = torch.where(torch.tensor([stated[part] == "world" for part in angular]), turned, v)
 
-    recorded = _rms(robot.space.difference(q0, q1)[:, group.rows] / step - own)
-    speed, meant, correction = _rms(own), list[str](), dict[str, dict[str, tuple[str, ...]]]()
-    of_world, other = best_axes(q0, q1)
+    def best_axes(at: Tensor) -> tuple[dict[str, str], float, float]:
+        """Parts of v that fit in other axes than stated, the error that is left with them, and that as stated."""
+        first, last = (at.unflatten(0, windows.rows.shape)[:, k] for k in (0, -1))
+        moved = _in_world(group, first, difference(group.kind, first, last))
+        linear = parts["linear "]  # a difference of poses has those of a screw
+        moved[:, linear] = (pose(group.kind, last)[1] - pose(group.kind, first)[1])[:, : len(linear)]
+        moved = moved / windows.step
+        read = {"world": windows.mean(raw), "body": windows.mean(_in_world(group, at, raw))}
+        found, best, own = dict[str, str](), moved.clone(), moved.clone()
+        for (name, part), axes in zip(parts.items(), stated, strict=True):
+            other = "body" if axes == "world" else "world"
+            own[:, part] = best[:, part] = read[axes][:, part]
+            if part and _explained((moved - own)[:, part], (read[other] - own)[:, part]):
+                best[:, part], found[name] = read[other][:, part], other
+        return found, _rms(moved - best), _rms(moved - own)
+
+    found, other, recorded = best_axes(q)
+    speed, meant, correction = _rms(windows.mean(raw)), list[str](), dict[str, dict[str, tuple[str, ...]]]()
     if group.kind != "planar":
-        turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
-        first, second = q0.clone(), q1.clone()
-        first[:, turn], second[:, turn] = q0[:, turn].roll(-1, -1), q1[:, turn].roll(-1, -1)
-        axes, reordered = best_axes(first, second)
+        axes, reordered, _ = best_axes(_reordered(group, q))
         if mistaken(recorded, reordered, speed) and reordered < other:
-            of_world, other = axes, reordered
+            found, other = axes, reordered
             meant, correction["orientation"] = ["a quaternion w, x, y, z"], {"q": ("wxyz",)}
-    if of_world:
-        both = len(of_world) == 2
-        meant.append(f"{'' if both else of_world[0]}velocities in the axes of the world")
-        axes = tuple("world" if part in of_world else now for part, now in zip(parts, stated, strict=True))
+    if found:
+        alike = len(found) == 2 and len(set(found.values())) == 1
+        named = {"": next(iter(found.values()))} if alike else found
+        meant += [f"{name}velocities in the axes of the {axes.replace('body', 'base')}" for name, axes in named.items()]
+        axes = tuple(found.get(name, now) for name, now in zip(parts, stated, strict=True))
         correction["axes"] = {"v": axes[:1] if len(set(axes)) == 1 else axes}
     reading = " and ".join(meant)
     remedy = (
@@ -161,6 +251,20 @@ def _of_velocity(
         )
     else:
         yield ok(subject="base", seen=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
+
+
+def _in_world(group: Group, q: Tensor, v: Tensor) -> Tensor:
+    """Velocities in the axes of the base, at its positions, in those of the world."""
+    free = torch.tensor(group.motion.free)
+    six = v.new_zeros(len(v), 6).index_copy(1, free, v).unflatten(-1, (2, 3))
+    return (pose(group.kind, q)[0][:, None] @ six[..., None]).flatten(1)[:, free]
+
+
+def _reordered(group: Group, q: Tensor) -> Tensor:
+    """Positions of a log whose quaternions begin with w."""
+    turned = q.clone()
+    turned[:, group.motion.turn] = q[:, group.motion.turn].roll(-1, -1)
+    return turned
 
 
 def _explained(error: Tensor, difference: Tensor) -> bool:

@@ -225,7 +225,9 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
 def _of_base(dataset: Dataset, system: MechanicalSystem) -> tuple[Finding, ...]:
     """What is seen of a base that moves and of what holds it; torques and filters are not looked at."""
     unmeasured = list(unmeasured_base_findings(dataset, system))
-    of_base = unmeasured or [*base_findings(dataset, system), *carried_findings(dataset, system)]
+    of_base = unmeasured or list(base_findings(dataset, system))
+    if not unmeasured and worst(of_base) != "wrong":  # forces in wrong axes show nothing
+        of_base += carried_findings(dataset, system)
     return _sorted([*of_base, *stance_findings(dataset, system)])
 
 

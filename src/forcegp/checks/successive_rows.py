@@ -95,7 +95,7 @@ def running_width(dataset: Dataset) -> int:
 def smoothed(dataset: Dataset) -> Dataset:
     """Running means of all signals within each episode, of one length for all: the equation of motion keeps holding."""
     width = running_width(dataset)
-    inside = _whole_windows(dataset, width)
+    inside = whole_windows(dataset, width)
     if width < 3 or not len(inside):
         return dataset
     means = {name: _means(getattr(dataset, name), inside, width) for name in ("q", "v", "u", "a")}
@@ -103,7 +103,7 @@ def smoothed(dataset: Dataset) -> Dataset:
     return replace(rows, **means, noise_std=None, truth={})
 
 
-def _whole_windows(dataset: Dataset, width: int) -> np.ndarray:
+def whole_windows(dataset: Dataset, width: int) -> np.ndarray:
     """First rows of the windows of so many rows that lie within an episode."""
     breaks = np.cumsum(np.insert(~consecutive(dataset), 0, False))
     first = np.arange(max(0, len(dataset) - width + 1))
@@ -125,7 +125,7 @@ def white_noise(log: Dataset, width: int = 1) -> Float[np.ndarray, " nv"] | None
         return None
     noise = []
     for order, variance in ((3, 20.0), (4, 70.0)):
-        first = _whole_windows(log, width * (order + 1))
+        first = whole_windows(log, width * (order + 1))
         if len(first) < FEWEST_DIFFERENCES:
             return None
         first = first[:: max(1, len(first) // MOST_DIFFERENCES)]

@@ -129,9 +129,10 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     root = next(iter(robot.layout.links))
     tree = Tree(line(root, f"  ({robot.base})" if root in robot.layout.moving else ""))
     branches = {root: tree}
+    moving = {"fixed", *(each.name for each in (*robot.layout.bodies, *robot.layout.groups))}
     for joint in robot.all_joints:
         mimic = content["mimics"].get(joint.name)
-        how = "locked" if joint.name in robot.locked else joint.type
+        how = joint.type if {joint.name, joint.type} & moving else "locked"
         how += "" if mimic is None else _followed(**mimic)
         branches[joint.child] = branches[joint.parent].add(line(joint.child, f"  {joint.name} ({how})"))
     header = {"lower": "lower", "upper": "upper", "velocity": "velocity_limit", "effort": "effort_limit"}

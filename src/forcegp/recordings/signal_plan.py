@@ -224,6 +224,11 @@ def _signals(
         remedy = f"name one column per {'joint' if what == 'joints' else 'entry'}."
         if signal == "q" and not plain:
             remedy = f"{remedy[:-1]}; `orientation` angles has roll, pitch and yaw instead of a quaternion."
+            if len(expressions) == len(set(names) & set(joints)):
+                remedy = (
+                    "the base was not measured: record its pose by motion capture or a state estimator (position and "
+                    "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
+                )
         elif not names:
             remedy = (
                 "leave u out, or give actuators: motors of an MJCF file, or a file that MechanicalSystem.to_json wrote "

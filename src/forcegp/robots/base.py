@@ -47,7 +47,7 @@ def check_base(description: RobotDescription, standing: Sequence[str], problems:
     root, still = standing[0], set(standing)
     mass = sum(inertial.mass for name in standing if (inertial := description.links[name]))
     asked = "base" in problems.given or any(isinstance(error, UnstatedBase) for error in problems.errors)
-    if asked or not mass > 0.0:
+    if asked or mass == 0.0:  # one that is NaN or negative is a mistake, and no sign of a robot that is bolted
         return
     holding = {joint.type for joint in description.joints if joint.parent == root}
     if root.lower() in WORLDS and description.links[root] is None and "fixed" in holding:

@@ -26,7 +26,7 @@ from forcegp.errors import (
     UnknownLink,
     require_known,
 )
-from forcegp.robots.base import BaseChoice
+from forcegp.robots.base import WORLDS, BaseChoice
 from forcegp.robots.inertia import (
     inverse,
     rotation_about,
@@ -43,6 +43,7 @@ BASE = "base"
 """Name of the joint between the world and a base that moves."""
 BASES: tuple[BaseChoice, ...] = ("floating", "planar")
 """Joints by which a file itself holds its base."""
+BOLTED: BaseChoice = "fixed"
 OUTSIDE = "(world)"
 """What carries such a base; no link of the robot."""
 MOST_BODIES = 1000
@@ -68,6 +69,7 @@ class Layout:
     origins: tuple[np.ndarray, ...]  # body frame at q = 0 in the parent body's frame
     links: dict[str, Placement]
     groups: tuple[Group, ...] = ()  # joints of several degrees of freedom
+    base: BaseChoice = "fixed"  # how the root is held: as asked for, or by a joint of the file
 
     @property
     def empty(self) -> frozenset[int]:
@@ -134,7 +136,16 @@ def lay_out(
     still = [root]
     for link in still:
         still += [joint.child for joint in children[link] if joint.type == "fixed" or joint.name in held]
-    own = any(joint.type in BASES for link in still for joint in children[link])
+    massive = any(inertial.mass for link in still if (inertial := description.links[link]))
+    hung = root.lower() in WORLDS or not massive  # else such a joint carries something else than the robot itself
+    below = [joint for link in still if hung for joint in children[link] if joint.name not in held]
+    own: dict[str, BaseChoice] = {joint.name: kind for joint in below for kind in BASES if kind == joint.type}
+    if own and base not in (None, "fixed", *own.values()):
+        other = next(iter(own))
+        raise InvalidInput(
+            f"{description.source}: base is {base!r}, and the file holds its base by joint {other!r} of type "
+            f"{own[other]!r}; leave base out, give 'fixed', or take that joint out of the file."
+        )
     if base not in (None, "fixed") and not own:
         links = {OUTSIDE: Placement(WORLD, np.eye(4))}
         stack = [free_joint(BASE, str(base), OUTSIDE, root)]
@@ -143,7 +154,7 @@ def lay_out(
         above = links[joint.parent]
         offset = above.offset @ joint.origin
         free = joint.type in MOTIONS
-        bolted = joint.type in BASES and base == "fixed" and above.body == WORLD
+        bolted = joint.name in own and base == "fixed"
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else _joint_motion(joint, held.get(joint.name, 0.0))
             links[joint.child] = Placement(above.body, offset @ still)
@@ -181,14 +192,8 @@ def lay_out(
         tuple(origins),
         {name: place for name, place in links.items() if name != OUTSIDE},
         tuple(groups),
+        base or (*own.values(), BOLTED)[0],
     )
-
-
-def free_base(layout: Layout) -> BaseChoice:
-    """How the root is held where nobody said it: by a joint of the file, or bolted."""
-    kinds = [group.kind for group in layout.groups if layout.parents[group.body] == WORLD]
-    held: list[BaseChoice] = [base for kind in kinds for base in BASES if base == kind]
-    return held[0] if held else "fixed"
 
 
 def _rows_of(joint: JointDescription) -> list[JointDescription]:

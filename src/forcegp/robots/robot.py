@@ -28,7 +28,7 @@ from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR, physical_from_parameters
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import free_base, lay_out
+from forcegp.robots.layout import lay_out
 from forcegp.robots.mjcf import is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
 from forcegp.robots.mjcf_writer import MjcfWriter
@@ -247,7 +247,7 @@ class Robot(RobotStructure):
             rotor_inertias = armature_values(armature, names, description.name)
             tree = compile_tree(description, layout, gravity, rotor_inertias)
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
-            robot = cls(description, layout, tree, text, tuple(locked.items()), frames, base or free_base(layout))
+            robot = cls(description, layout, tree, text, tuple(locked.items()), frames, layout.base)
             without = bodies_without_inertia(description, layout, tree, problems.broken)
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]

@@ -278,10 +278,11 @@ def _joint(
     element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place
 ) -> JointDescription:
     kind = _attribute(element, "type", place)
-    if kind not in (*MOVABLE, "fixed", *FREE):
-        close = difflib.get_close_matches(kind, (*MOVABLE, "fixed"), n=1)
+    kinds = (*MOVABLE, "fixed", *FREE)
+    if kind not in kinds:
+        close = difflib.get_close_matches(kind, kinds, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise UnsupportedJoint(f"{place} has the unknown type {kind!r}; allowed: {', '.join(MOVABLE)}, fixed.{hint}")
+        raise UnsupportedJoint(f"{place} has the unknown type {kind!r}; allowed: {', '.join(kinds)}.{hint}")
     ends = {}
     for end in ENDS:
         ends[end] = _attribute(_child(element, end, place), "link", place)

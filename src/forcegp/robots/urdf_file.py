@@ -248,8 +248,9 @@ def with_chosen_inertias(
             seen = f"{source}: link {name!r} has a mass and its <inertial> no <inertia>"
         elif objection is None:
             continue
-        if not (inertial.mass >= 0.0 and np.isfinite([given, center * np.eye(3)]).all()):
+        if not (inertial.mass >= 0.0 and np.isfinite([inertial.mass, *given.flat, *center]).all()):
             problems.broken.add(name)
+            links[name] = None  # what follows is computed without numbers that are not finite
             problems.errors.append(NonPhysicalInertia(seen, f"{IN_THE_FILE}."))
             continue
         nearest = nearest_inertia(given) if inertial.mass > 0.0 else np.zeros((3, 3))
