@@ -83,6 +83,7 @@ def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
     answer = "\n".join(content["answer"])
     assert "a base that moves and 0 joints" in answer
     assert "rotors follow within" in answer
+    assert answer.count("if thrust coefficients are right") == 2  # of the whole mass and the payload
     assert "dry friction" not in answer
     assert "forcegp excite" not in answer
     assert content["identified"]["total_mass"]["identified"] == pytest.approx(1.2 * 1.02 / 1.1, rel=0.05)  # by thrust

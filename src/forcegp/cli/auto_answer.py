@@ -59,6 +59,7 @@ def answer_lines(
         ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
     ]
     mass, error = identified.total_mass
+    by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.given) else ""
     q = "rad or m" if moving else q
     models = content["models"]
     scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
@@ -75,8 +76,8 @@ def answer_lines(
         ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *(of_joints if joints else []),
-        *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg")] if moving else []),
-        ("payload", held),
+        *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
+        ("payload", held + by),
         ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
         ("trust", f"{NAMES.get(best, best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
