@@ -1,4 +1,4 @@
-"""`FORCEGP_CHECK_SHAPES=1`, which `make test-all` sets, makes a wrong shape in a signature an error.
+"""`FORCEGP_CHECK_SHAPES=1`, which `make test-all` sets, makes a wrong shape in a signature an error (`shapes.py`).
 
 The last test does so in the fast tier for what users do with two robots, whose sizes of q, v and u are equal in one of
 them and all different in the other: what only `make test-all` would find goes wrong unseen.
@@ -9,12 +9,17 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from tests.models.arm import arm_data
 from tests.models.test_predictor_of_moving_bases import hopper
+from tests.shapes import MisfitError, checked, unchecked
 
 from forcegp import (
     Dataset,
@@ -27,9 +32,10 @@ from forcegp import (
     load_posterior,
     save_posterior,
 )
+from forcegp.errors import InvalidInput
 
 
-def checked(repository: Path, code: str) -> subprocess.CompletedProcess[str]:
+def run_checked(repository: Path, code: str) -> subprocess.CompletedProcess[str]:
     paths = os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "FORCEGP_CHECK_SHAPES": "1", "PYTHONPATH": paths}
     command = [sys.executable, "-c", "import tests.conftest\n" + code]
@@ -67,17 +73,72 @@ def whole_way() -> None:
         posterior.rollout(*(x[0] for x in states[:2]), states[2], 0.01, samples=2, seed=0).interval()
 
 
+@checked
+def length(x: Float[Tensor, " n"], scale: float = 1.0) -> Float[Tensor, ""]:
+    """Refuses one number; of a matrix it gives as many lengths as that has rows."""
+    if x.dim() == 0:
+        raise InvalidInput("x is a number; give a vector.")
+    return scale * x.norm(dim=-1)
+
+
+@checked
+def length_of_rows(x: Float[Tensor, "rows n"]) -> Float[Tensor, ""]:
+    return length(x)
+
+
+@checked
+def lengths(x: Float[Tensor, "rows n"]) -> Float[Tensor, ""]:
+    return x.norm(dim=-1)
+
+
+@checked
+@dataclass(frozen=True)
+class Weights:
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.values == "none":
+            raise InvalidInput("values is 'none'; give numbers.")
+        if isinstance(self.values, list):
+            object.__setattr__(self, "values", tuple(self.values))
+
+
+def test_what_does_not_fit_must_be_refused_by_the_function_itself():
+    assert length(torch.ones(4), scale=2) == 4.0
+    with pytest.raises(InvalidInput, match="give a vector"):
+        length(torch.ones(()))
+    for call in (lambda: length(torch.ones(2, 3)), lambda: length("abc"), lambda: length(torch.ones(3), scale="x")):
+        with pytest.raises(MisfitError, match="parameters of .*length"):
+            call()
+    with pytest.raises(MisfitError, match=r"parameters of .*\.length\."):  # the one inside
+        length_of_rows(torch.ones(2, 3))
+    with pytest.raises(MisfitError, match="return value of .*length"):
+        lengths(torch.ones(2, 3))
+    with unchecked():
+        assert length(torch.ones(2, 4)).tolist() == [2.0, 2.0]
+    with pytest.raises(MisfitError):  # checked again
+        length(torch.ones(2, 3))
+
+
+def test_the_fields_of_a_dataclass_are_checked_once_they_are_there():
+    assert Weights([1, 2]) == Weights((1, 2))
+    with pytest.raises(InvalidInput, match="give numbers"):
+        Weights("none")
+    with pytest.raises(MisfitError, match=r"Weights\.values is 'all'"):
+        Weights("all")
+
+
 def test_a_wrong_shape_is_refused_where_that_was_asked_for(repository):
     code = (
-        "import torch; from jaxtyping import TypeCheckError\n"
+        "import torch; from tests.shapes import MisfitError\n"
         "from forcegp.mechanics.surfaces import surface_axes\n"
         "try: surface_axes(torch.ones(4, dtype=torch.float64))\n"
-        "except TypeCheckError as error: print('surface_axes' in str(error))\n"
+        "except MisfitError as error: print('surface_axes' in str(error))\n"
     )
-    done = checked(repository, code)
+    done = run_checked(repository, code)
     assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr
 
 
 def test_right_shapes_pass_from_the_robot_to_its_predicted_motions(repository):
-    done = checked(repository, "from tests.test_shape_checks import whole_way; whole_way()")
+    done = run_checked(repository, "from tests.test_shape_checks import whole_way; whole_way()")
     assert (done.returncode, done.stdout) == (0, "(3, 3, 3)\n(8, 7, 4)\n"), done.stderr

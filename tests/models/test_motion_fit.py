@@ -203,7 +203,6 @@ def test_derivatives_in_every_unknown(contacts):
         torch.testing.assert_close(here.motions.in_parameters[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_refined_is_refused(along_the_law):
     posterior, short = analytical(along_the_law), along_the_law.rows(slice(40))
     for seconds in (0.0, -1.0, np.inf, True, "1"):

@@ -64,9 +64,6 @@ class ProblemSize:
 class Engine(ABC):
     """One way to compute a posterior; a frozen value whose fields are its settings."""
 
-    # Constructors are the check, with messages for people; run-time checks of annotations must not come before.
-    __no_type_check__: ClassVar[bool] = True
-
     name: ClassVar[str]
     remedy: ClassVar[str]
     """What to do where it needs more memory than is free."""
