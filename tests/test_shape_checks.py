@@ -5,6 +5,7 @@ them and all different in the other: what only `make test-all` would find goes w
 """
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -16,10 +17,10 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
-from torch import Tensor
 from tests.models.arm import arm_data
 from tests.models.test_predictor_of_moving_bases import hopper
 from tests.shapes import MisfitError, checked, unchecked
+from torch import Tensor
 
 from forcegp import (
     Dataset,
@@ -108,16 +109,35 @@ def test_what_does_not_fit_must_be_refused_by_the_function_itself():
     with pytest.raises(InvalidInput, match="give a vector"):
         length(torch.ones(()))
     for call in (lambda: length(torch.ones(2, 3)), lambda: length("abc"), lambda: length(torch.ones(3), scale="x")):
-        with pytest.raises(MisfitError, match="parameters of .*length"):
+        with pytest.raises(MisfitError, match=r"parameters of .*length"):
             call()
     with pytest.raises(MisfitError, match=r"parameters of .*\.length\."):  # the one inside
         length_of_rows(torch.ones(2, 3))
-    with pytest.raises(MisfitError, match="return value of .*length"):
+    with pytest.raises(MisfitError, match=r"return value of .*length"):
         lengths(torch.ones(2, 3))
     with unchecked():
         assert length(torch.ones(2, 4)).tolist() == [2.0, 2.0]
     with pytest.raises(MisfitError):  # checked again
         length(torch.ones(2, 3))
+
+
+SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
+ARMS = {"control/informative_motions", "experiments/fig4_jobs", "simulation/bullet", "simulation/joint_friction"}
+ARMS |= {"simulation/kuka_motion"}
+"""Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""
+
+
+def test_signatures_give_positions_nq_entries_and_inputs_nu(repository):
+    package = repository / "src" / "forcegp"
+    sources = {str(path.relative_to(package).with_suffix("")): path.read_text() for path in package.rglob("*.py")}
+    named = dict(re.findall(r'^(\w+) = Float\[[\w.]+, "(.+)"\]$', "\n".join(sources.values()), re.MULTILINE))
+    seen = 0
+    for module in sources.keys() - ARMS:
+        for name, shape, alias in re.findall(r'\b([qvau])\d?: (?:Float\[[\w.]+, "([^"]+)"|(\w+))', sources[module]):
+            size = (shape or named.get(alias, "")).split()[-1:]
+            seen += size == [SIZES[name]]
+            assert size == [SIZES[name]] or size not in (["nq"], ["nv"], ["nu"]), (module, name, shape or alias)
+    assert seen > 100
 
 
 def test_the_fields_of_a_dataclass_are_checked_once_they_are_there():
