@@ -10,8 +10,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -24,23 +23,22 @@ from torch import Tensor
 
 from forcegp import (
     Dataset,
+    IndependentGP,
     JointForces,
     JointFriction,
+    NetworkEnsemble,
+    NoForces,
     Noise,
     StructuredGP,
     check,
+    compare_priors,
     evaluate,
+    identify_analytical,
     load_posterior,
     save_posterior,
 )
 from forcegp.errors import InvalidInput
-
-
-def run_checked(repository: Path, code: str) -> subprocess.CompletedProcess[str]:
-    paths = os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "FORCEGP_CHECK_SHAPES": "1", "PYTHONPATH": paths}
-    command = [sys.executable, "-c", "import tests.conftest\n" + code]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+from forcegp.mechanics.surfaces import surface_axes
 
 
 def hopper_data(rows: int) -> Dataset:
@@ -56,10 +54,17 @@ def hopper_data(rows: int) -> Dataset:
 
 def whole_way() -> None:
     """Robot, Dataset, fit, predictions, motions, files; the program in C of the arm alone, as it takes long."""
+    with pytest.raises(MisfitError, match="surface_axes"):
+        surface_axes(torch.ones(4, dtype=torch.float64))
     warnings.simplefilter("ignore")
     for data, prior, compiled in ((arm_data(64, 0), JointForces(), True), (hopper_data(64), JointFriction(), False)):
         print(data.system.sizes)
         check(data)
+        free = replace(data, system=data.system.with_contacts(()), truth={}) if compiled else data
+        identify_analytical(free, friction=("viscous",)).scores(free)
+        compare_priors(data, {"one": prior, "none": NoForces()}, points=20, restarts=1)
+        evaluate(NetworkEnsemble(data.system, steps=2).fit(data), data)
+        evaluate(IndependentGP(data.system).fit(data, points=20, restarts=1), data)
         posterior = StructuredGP(data.system, prior, noise=Noise(0.05)).fit(data, points=64, restarts=1)
         evaluate(posterior, data)
         with tempfile.TemporaryDirectory() as folder:
@@ -68,6 +73,7 @@ def whole_way() -> None:
             posterior, data = load_posterior(f"{folder}/model"), Dataset.load(f"{folder}/data.h5")
         states = [torch.tensor(x[:5]) for x in (data.q, data.v, data.u)]
         posterior.components(*states)
+        posterior.leave_out()
         predictor = posterior.update(data[:2]).predictor(covariance="none", compile=compiled)
         predictor.linearize(*states)
         predictor.rollouts(*(x[:2] for x in states[:2]), states[2].expand(2, 5, -1), 0.01)
@@ -148,17 +154,9 @@ def test_the_fields_of_a_dataclass_are_checked_once_they_are_there():
         Weights("all")
 
 
-def test_a_wrong_shape_is_refused_where_that_was_asked_for(repository):
-    code = (
-        "import torch; from tests.shapes import MisfitError\n"
-        "from forcegp.mechanics.surfaces import surface_axes\n"
-        "try: surface_axes(torch.ones(4, dtype=torch.float64))\n"
-        "except MisfitError as error: print('surface_axes' in str(error))\n"
-    )
-    done = run_checked(repository, code)
-    assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr
-
-
-def test_right_shapes_pass_from_the_robot_to_its_predicted_motions(repository):
-    done = run_checked(repository, "from tests.test_shape_checks import whole_way; whole_way()")
+def test_a_wrong_shape_is_refused_and_right_ones_pass_from_the_robot_to_its_predicted_motions(repository):
+    paths = os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "FORCEGP_CHECK_SHAPES": "1", "PYTHONPATH": paths}
+    code = "import tests.conftest; from tests.test_shape_checks import whole_way; whole_way()"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "(3, 3, 3)\n(8, 7, 4)\n"), done.stderr
