@@ -167,6 +167,7 @@ def test_what_is_stored_predicts_the_same(beyond_the_law, tmp_path):
     refined = rough.refined_on_motions(train, 0.5)
     save_posterior(refined, tmp_path / "run")
     again = load_posterior(tmp_path / "run")
+    assert again.engine == refined.engine
     rows = train.q[:50], train.v[:50], train.u[:50]
     here, there = refined.predict(*rows), again.predict(*rows)
     torch.testing.assert_close(there.mean, here.mean, rtol=1e-10, atol=1e-10)
