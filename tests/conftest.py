@@ -14,14 +14,13 @@ THREADS = int(os.environ.get("FORCEGP_TEST_THREADS", "1"))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # numpy and torch read them at import
     os.environ[variable] = str(THREADS)
 
-import jaxtyping
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
-from jaxtyping import install_import_hook
+from tests import shapes
 
 if os.environ.get("FORCEGP_CHECK_SHAPES") == "1":
-    install_import_hook("forcegp", "beartype.beartype")  # before the first import of forcegp
+    shapes.install()  # before the first import of forcegp
 torch.set_num_threads(THREADS)
 
 # The same examples on every machine and no verdict by the clock: a failure here is a failure everywhere.
@@ -52,10 +51,9 @@ def shared() -> Callable[[str], Path]:
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Without the types of signatures checked, as users have it: forcegp's own checks speak, integers are numbers."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    """Without the types of signatures checked, as users have it: what does not fit may be taken, too."""
+    with shapes.unchecked():
+        yield
 
 
 @pytest.fixture

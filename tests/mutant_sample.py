@@ -26,7 +26,7 @@ OPERATORS += [f"ReplaceComparisonOperator_{old}_{new}" for old, new in ORDER]
 OPERATORS += ["ReplaceUnaryOperator_USub_UAdd", "ReplaceUnaryOperator_Delete_Not", "AddNot", "RemoveDecorator"]
 OPERATORS += ["ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr", "ReplaceOrWithAnd", "NumberReplacer"]
 OPERATORS += ["ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ExceptionReplacer", "ZeroIterationForLoop"]
-NO_BEHAVIOUR = ("no_type_check", "cache", "override", "overload", "runtime_checkable", "abstractmethod", "final")
+NO_BEHAVIOUR = ("cache", "override", "overload", "runtime_checkable", "abstractmethod", "final")
 """Words of decorators that change the time, the types or the reader's view, and no result."""
 
 Position = tuple[int, int]
@@ -68,7 +68,7 @@ def left_out(node: ast.AST) -> bool:
         return ast.unparse(node.func).endswith(("warn", "report", "progress"))
     if isinstance(node, ast.Assign | ast.AnnAssign):
         names = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
-        return names == "__no_type_check__" or names.endswith("_BYTES")  # for checkers; sizes of blocks
+        return names.endswith("_BYTES")  # sizes of blocks
     return isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert | ast.ImportFrom)
 
 

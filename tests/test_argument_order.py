@@ -19,8 +19,6 @@ from forcegp import (
 from forcegp.analytical import held_out_noise, motion_residuals
 from forcegp.errors import InvalidInput
 
-pytestmark = pytest.mark.usefixtures("unchecked")
-
 
 @pytest.fixture(scope="module")
 def data():

@@ -177,7 +177,6 @@ def test_joints_without_ends_move_within_their_velocities():
     assert 0.1 < np.abs(found.motion.q - START).max() <= 4.5
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -212,7 +211,6 @@ def test_without_a_start_it_is_inside_of_the_limits(posterior):
     np.testing.assert_allclose(excitation(posterior, **how).start, middle.clip(-0.57, 0.57))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_only_robots_and_models_move():
     with pytest.raises(InvalidInput, match=r"model is a int"):
         excitation(3)

@@ -156,7 +156,6 @@ def test_learned_friction_sees_what_the_urdf_does_not(posterior):
     assert limits["urdf"] < 0.05
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -105,7 +105,6 @@ def test_without_a_finite_cost_it_raises_or_holds(predictor):
     assert "held: 1" in repr(holding)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -129,7 +128,6 @@ def test_arguments_that_do_not_fit(predictor, changes, message):
         controller(predictor, **changes)([0.0], [0.0])
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_states_and_costs_of_another_shape(predictor):
     with pytest.raises(InvalidInput, match="q is"):
         controller(predictor)([0.0, 1.0], [0.0])

@@ -166,7 +166,6 @@ def test_models_that_do_not_fit(predictor, urdf, change, message):
         MujocoForces(predictor, model)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_forces_that_mujoco_cannot_have(posterior, predictor):
     with pytest.raises(InvalidInput, match="made with compile=False"):
         MujocoForces(posterior.predictor(compile=False), model_of())

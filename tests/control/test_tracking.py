@@ -186,7 +186,6 @@ def test_normal_forces_that_mean_nothing(touching, force):
         control(q, v, q, v, v, force)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_models_with_and_without_contacts(touching):
     with pytest.raises(InvalidInput, match="use HybridForce"):
         ComputedTorque(touching.predictor(covariance="none"), **GAINS)
@@ -198,7 +197,6 @@ def test_models_with_and_without_contacts(touching):
         ComputedTorque(URDF_ALONE, **GAINS, gain_factor=lambda std: std)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -73,7 +73,7 @@ class Interrupted(BaseException):
     pass
 
 
-@pytest.mark.usefixtures("unchecked")
+@pytest.mark.usefixtures("unchecked")  # its system is none
 @pytest.mark.parametrize("exists", [False, True])
 def test_an_interrupted_save_leaves_what_was_there_and_nothing_else(tmp_path, exists):
     path = tmp_path / "log.h5"

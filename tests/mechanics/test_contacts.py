@@ -144,13 +144,11 @@ def test_batch_dimensions_are_arbitrary(surface, batch):
 # ---------------------------------------------------------------- values
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_points_may_come_in_any_form():
     for point in ([0, 0, 1], np.array([0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, 1.0])):
         assert Contact("tool", point, FLOOR) == Contact("tool", (0.0, 0.0, 1.0), FLOOR)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -170,7 +168,6 @@ def test_wrong_contacts_are_named(arguments, message):
         Contact(*arguments)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

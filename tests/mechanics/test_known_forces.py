@@ -215,7 +215,7 @@ def test_a_coefficient_may_be_learned():
     assert known(ViscousJointFriction(damping)).to_json() == known(ViscousJointFriction(NUMBERS)).to_json()
 
 
-@pytest.mark.usefixtures("unchecked")
+@pytest.mark.usefixtures("unchecked")  # forces check their numbers where they meet a robot
 @pytest.mark.parametrize(
     ("kind", "arguments", "error", "message"),
     [
@@ -291,7 +291,6 @@ def test_every_known_force_of_files_is_tested_here():
     assert {type(make()) for make, _ in FORMULAS.values()} | elsewhere == set(KNOWN_FORCES.values())
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     "stored",
     [

@@ -176,7 +176,6 @@ def test_loops_survive_files_and_act_where_their_switch_is_on(tmp_path):
     assert (J @ free[1]).abs().max() > 1.0
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_states_that_do_not_fit_and_frames_of_one_body_are_refused(tmp_path):
     system = system_of(FOUR_BAR, tmp_path)
     system.check_states(*states(system))

@@ -59,7 +59,6 @@ class TestSubclassWithValueOnly(SurfaceConformance):
 # ---------------------------------------------------------------- what they mean
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_signs_and_distances():
     p = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 0.5]], dtype=torch.float64)
     for surface, expected in (
@@ -71,7 +70,6 @@ def test_signs_and_distances():
         torch.testing.assert_close(surface.gradient(p), torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_curvatures():
     """The Hessian of a signed distance holds the principal curvatures of the parallel surface: 0, 1 / r, 1 / r^2 ..."""
     p = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
@@ -83,7 +81,6 @@ def test_curvatures():
         torch.testing.assert_close(surface.hessian(p), torch.diag(torch.tensor(curvatures, dtype=torch.float64)))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_directions_need_not_be_unit_vectors():
     assert Plane((0, 0, 4), 2) == Plane((0, 0, 1), 0.5)
     assert Plane((0, 0, -1), 0.5) != Plane((0, 0, 1), -0.5)  # the other side is positive
@@ -106,7 +103,6 @@ def test_storing_changes_no_bit(direction, number):
         assert object_from_dict("surface", SURFACES, stored) == surface
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_they_cannot_be_changed():
     plane = Plane((0, 0, 1), 0)
     with pytest.raises(FrozenInstanceError):
@@ -124,7 +120,6 @@ def test_an_implicit_surface_may_hold_a_parameter_to_learn():
 # ---------------------------------------------------------------- what they refuse
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -150,7 +145,6 @@ def test_wrong_numbers_are_named(make, message):
         make()
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     "function", [lambda p: p, lambda p: p[:1], lambda p: 3.0], ids=["vector", "one entry", "number"]
 )
@@ -161,7 +155,6 @@ def test_a_function_must_return_a_scalar_tensor(function, batch, what):
         getattr(ImplicitSurface(function), what)(torch.ones(*batch, 3, dtype=torch.float64))
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     "stored",
     [

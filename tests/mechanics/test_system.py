@@ -68,7 +68,6 @@ def assert_same_dynamics(one: MechanicalSystem, other: MechanicalSystem) -> None
 # ---------------------------------------------------------------- what it holds
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_it_cannot_be_changed():
     built = system()
     with pytest.raises(FrozenInstanceError):
@@ -134,7 +133,6 @@ def test_held_points_need_not_be_unpacked():
     assert system.with_contacts([held, floor]).contacts == system.with_contacts([*held, floor]).contacts
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
@@ -152,7 +150,6 @@ def test_parts_of_the_wrong_kind(parts, message):
         MechanicalSystem(robot("chain"), **parts)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("shapes", "message"),
     [
@@ -170,7 +167,6 @@ def test_states_of_wrong_shape_are_never_stretched(shapes, message):
         MechanicalSystem(robot("chain")).dynamics(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_states_of_wrong_type():
     good = torch.zeros(4, dtype=torch.float64)
     for bad in (good.bool(), good.numpy(), [0.0] * 4):
@@ -307,7 +303,6 @@ def test_stored_text_is_plain_json():
     assert MechanicalSystem.from_dict(stored).robot.base == "fixed"
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     "text", ["", "{", "nothing", "[]", "3", "null", '"text"', "[" * 100_000, "{}", '{"format": 2}']
 )
@@ -364,7 +359,6 @@ def test_damage_anywhere_gives_an_error_of_forcegp_or_finite_numbers(place, rubb
         jaxtyping.config.update("jaxtyping_disable", False)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("part", ["urdf", "gravity", "armature", "locked", "contacts", "known_forces"])
 @pytest.mark.parametrize("empty", ["", None, 0, False], ids=repr)
 def test_an_emptied_part_is_not_taken_for_none(part, empty):

@@ -228,7 +228,6 @@ def test_a_wheel_off_the_ground_is_free():
     torch.testing.assert_close(a, free)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_what_is_no_wheel_is_refused():
     for wrong, message in (
         (lambda: rolling("w", 0.0), "radius is 0.0; it must be positive"),

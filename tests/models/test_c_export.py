@@ -439,7 +439,6 @@ def test_steps_that_cannot_be_exported(posterior, tmp_path, options, message):
         export_c(posterior, tmp_path / "arm", **options)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_other_models_are_refused(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

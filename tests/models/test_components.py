@@ -167,7 +167,6 @@ def test_a_curve_is_that_of_dense_conditioning(posterior, dense, train):
     close(constant.mean, parts["payload"].latents.mean[0], 1e-10)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_wrong_curves_are_refused(posterior, train):
     with pytest.raises(InvalidInput, match="no latent '0' in this model"):
         posterior.curve(0)  # a number is no name

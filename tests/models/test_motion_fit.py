@@ -167,6 +167,7 @@ def test_what_is_stored_predicts_the_same(beyond_the_law, tmp_path):
     refined = rough.refined_on_motions(train, 0.5)
     save_posterior(refined, tmp_path / "run")
     again = load_posterior(tmp_path / "run")
+    assert again.engine == refined.engine
     rows = train.q[:50], train.v[:50], train.u[:50]
     here, there = refined.predict(*rows), again.predict(*rows)
     torch.testing.assert_close(there.mean, here.mean, rtol=1e-10, atol=1e-10)
@@ -203,7 +204,6 @@ def test_derivatives_in_every_unknown(contacts):
         torch.testing.assert_close(here.motions.in_parameters[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_refined_is_refused(along_the_law):
     posterior, short = analytical(along_the_law), along_the_law.rows(slice(40))
     for seconds in (0.0, -1.0, np.inf, True, "1"):

@@ -6,11 +6,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from tests.models import floating_arm
 from tests.models.arm import NOISE, arm_data
 from tests.models.model_conformance import ModelConformance
 
 from forcegp.errors import FitError, InvalidInput
-from forcegp.models import Noise
+from forcegp.models import Noise, load_posterior, save_posterior
 from forcegp.models.baselines.network_ensemble import NetworkEnsemble
 from forcegp.models.baselines.neural_network import (
     Batches,
@@ -38,6 +39,18 @@ class TestNetworkEnsemble(ModelConformance):
     @classmethod
     def make(cls, system):
         return NetworkEnsemble(system, **SMALL)
+
+
+@pytest.mark.parametrize("model", [TestNeuralNetwork, TestNetworkEnsemble])
+def test_robots_whose_base_moves_have_other_numbers_of_positions_and_inputs(model, tmp_path):
+    log = floating_arm.recording(0, 1.2, floating_arm.satellite())
+    assert len(set(log.system.sizes)) == 3
+    posterior = model.make(log.system).fit(log)
+    save_posterior(posterior, tmp_path / "model")
+    found, again = (each.predict(log.q, log.v, log.u) for each in (posterior, load_posterior(tmp_path / "model")))
+    assert found.mean.shape == log.a.shape
+    assert torch.equal(found.mean, again.mean)
+    assert torch.equal(found.covariance, again.covariance)
 
 
 def smooth_data(rows, seed, noise=0.05):

@@ -16,7 +16,6 @@ from forcegp.models import StructuredGP, save_posterior
 from forcegp.priors import ContactFriction, ForcePrior, JointForces, JointFriction, SumPrior, kernel_of
 
 QUICK: dict[str, Any] = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
-pytestmark = pytest.mark.usefixtures("unchecked")
 
 
 @dataclass(frozen=True)

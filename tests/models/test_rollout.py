@@ -281,7 +281,6 @@ def test_gradients_flow_through_feedback(posterior, start):
     assert torch.autograd.gradcheck(end, gain, fast_mode=True)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_gradient_is_never_dropped_in_silence(posterior, start):
     arguments = dict(zip(("q0", "v0", "u"), start, strict=True))
     for name in arguments:

@@ -164,6 +164,7 @@ def test_noise_of_forces_is_learned_beside_that_of_accelerations():
     assert bool((fitted.noise_std < 0.2).all())
 
 
+@pytest.mark.usefixtures("unchecked")  # rows of a file are checked after they have become TrainingData
 def test_a_stored_model_keeps_the_noise_of_its_rows(tmp_path, train):
     noise = Noise(None, 0.05, learn=True)
     fitted = StructuredGP(train.system, noise=noise).fit(train, points=12, restarts=1, options=QUICK)

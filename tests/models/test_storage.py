@@ -245,6 +245,7 @@ def test_a_urdf_with_other_line_ends_comes_back(data, tmp_path):
     assert load_posterior(tmp_path / "run").system.robot.urdf_text == robot.urdf_text
 
 
+@pytest.mark.usefixtures("unchecked")  # rows of a file are checked after they have become TrainingData
 @pytest.mark.parametrize("name", ["training.a", "parameters.kernels.0.raw_outputscale"])
 @pytest.mark.parametrize(
     "damage", [lambda x: x.float(), lambda x: x * float("nan"), lambda x: x.reshape(-1)[:1].repeat(2, 1)]

@@ -117,7 +117,6 @@ def test_free_joints_elsewhere_can_be_locked_at_zero():
         Robot.from_urdf_text(text, locked={"tilt": 0.1})
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("base", ["Fixed", "free", 1])
 def test_other_bases_are_refused(base):
     with pytest.raises(InvalidInput, match="give one of fixed, floating, planar, spherical"):

@@ -247,7 +247,6 @@ def test_the_page_on_compiled_dynamics_runs(repository, tmp_path):
 # ---------------------------------------------------------------------- what cannot be
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_inputs_are_checked_as_those_of_the_robot(compiled):
     with pytest.raises(InvalidInput, match=r"tau must be a tensor of real numbers; given: torch\.bool"):
         compiled.forward_dynamics(random(3), random(3), random(3) > 0)

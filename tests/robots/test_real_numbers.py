@@ -13,7 +13,6 @@ from forcegp.models import IndependentGP, StructuredGP
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
-pytestmark = pytest.mark.usefixtures("unchecked")
 TEXT = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow="revolute")
 
 
@@ -80,6 +79,7 @@ def test_a_prediction_that_is_not_finite_is_an_error(posterior, state):
         posterior.predict(q + 1e308, v, u)
 
 
+@pytest.mark.usefixtures("unchecked")  # integers are promised nowhere
 @pytest.mark.parametrize("kind", [np.float32, np.float16, np.int64])
 def test_numbers_of_any_precision_are_converted_exactly_everywhere(posterior, data, state, kind):
     given = tuple(x.astype(kind) for x in state)

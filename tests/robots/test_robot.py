@@ -275,7 +275,6 @@ def test_ideal_rod_moves_but_is_no_parameter():
         robot.inertial_parameters("forearm")
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("value", "message"),
     [
@@ -297,7 +296,6 @@ def test_wrong_inputs(chain, value, message):
             function(*arguments)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_wrong_batches_points_and_parameters(chain):
     two, three = torch.zeros(2, 4, dtype=torch.float64), torch.zeros(3, 4, dtype=torch.float64)
     with pytest.raises(InvalidInput, match=r"do not broadcast: q \(2,\), v \(3,\)"):

@@ -70,7 +70,6 @@ def test_the_regressor_times_any_parameters_is_the_joint_force(model):
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("position", ["far", None, float("inf")])
 def test_a_locked_position_that_is_no_number_is_named(position):
     with pytest.raises(InvalidInput, match=r"locked\['slide'\] is .*finite position"):

@@ -81,7 +81,6 @@ def test_seeds_and_noise_have_streams_of_their_own():
     assert (abs(both.u) <= limits).all()
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("options", "message"),
     [

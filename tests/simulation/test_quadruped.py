@@ -71,7 +71,6 @@ def test_payload_friction_and_foot_forces_are_found():
     assert np.square(prediction.multiplier.mean.numpy() - forces).mean() < 0.05**2 * np.square(forces).mean()
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("wrong", [{"payload": -1.0}, {"joint_friction": "lugre"}, {"seconds": 0}])
 def test_other_numbers_are_refused(wrong):
     with pytest.raises(InvalidInput, match=next(iter(wrong))):

@@ -86,13 +86,15 @@ def residual_scores(
     }
 
 
+Positions = Float[np.ndarray, "rows nq"]
 Rows = Float[np.ndarray, "rows nv"]
+Inputs = Float[np.ndarray, "rows nu"]
 
 
 class RecordedRows:
-    """States (rows, nv) of a robot, the given forces there, and the terms of the equation of motion."""
+    """States of a robot, the given forces there, and the terms of the equation of motion."""
 
-    def __init__(self, system: MechanicalSystem, terms: JointTerms, q: Rows, v: Rows, u: Rows):
+    def __init__(self, system: MechanicalSystem, terms: JointTerms, q: Positions, v: Rows, u: Inputs):
         robot = system.robot
         given = kept_forces(system, terms)
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))

@@ -13,7 +13,7 @@ from forcegp.analytical.bodies import BodyCoordinates, FreeBodies, with_bodies, 
 from forcegp.analytical.identifiability import UNITS, BaseParameters, body_names, parameter_names
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import Fit, NoiseLevels, correlation_time
-from forcegp.analytical.recorded_rows import RecordedRows, residual_scores
+from forcegp.analytical.recorded_rows import Inputs, Positions, RecordedRows, Rows, residual_scores
 from forcegp.data import Dataset
 from forcegp.mechanics import (
     CoulombJointFriction,
@@ -24,8 +24,6 @@ from forcegp.mechanics import (
 )
 from forcegp.robots import Robot
 from forcegp.summary import Summary
-
-Rows = Float[np.ndarray, "rows nv"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,7 +157,7 @@ class AnalyticalIdentification(Summary):
             out.append((name, float((values < prior).sum())))
         return tuple(sorted((entry for entry in out if entry[1]), key=lambda entry: -entry[1]))
 
-    def accelerations(self, q: Rows, v: Rows, u: Rows) -> Rows:
+    def accelerations(self, q: Positions, v: Rows, u: Inputs) -> Rows:
         """Accelerations under the forces u, also of free inertias. Raises NumericalError for a singular M."""
         return self._recorded(q, v, u).acceleration(self.parameters, self._in_terms)[0]
 

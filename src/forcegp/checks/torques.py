@@ -97,7 +97,7 @@ def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"
 
 
 def fit_torques(
-    tau: Float[np.ndarray, "rows nv"], rows: Dataset, u: Float[np.ndarray, "rows nv"] | None = None
+    tau: Float[np.ndarray, "rows nv"], rows: Dataset, u: Float[np.ndarray, "rows nu"] | None = None
 ) -> TorqueFit:
     """Fit the torques of these rows, or others, to inverse dynamics tau of their motion."""
     u = rows.u if u is None else u

@@ -63,9 +63,6 @@ class Dataset(Summary):
     Raises DatasetError naming the array, row and column that break this, and what to do.
     """
 
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
-
     q: Float[np.ndarray, "rows nq"]
     v: Float[np.ndarray, "rows nv"]
     u: Float[np.ndarray, "rows nu"]

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 from warnings import warn
 
 import numpy as np
@@ -47,8 +47,6 @@ class Preparation:
 
     Raises InvalidInput for values that are not allowed.
     """
-
-    __no_type_check__: ClassVar[bool] = True  # the constructor is the check, with messages for people
 
     cutoff: float | Literal["auto"] | None = None
     order: int = 4

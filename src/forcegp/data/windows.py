@@ -74,8 +74,6 @@ class WeakForm:
     middle of a window only, and need longer ones.
     """
 
-    # The constructor is the check, with messages for people; run-time checks of annotations must not come before.
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str] = "weak-form"
     seconds: float = 0.1
     nodes: int = 6

@@ -64,9 +64,6 @@ class ProblemSize:
 class Engine(ABC):
     """One way to compute a posterior; a frozen value whose fields are its settings."""
 
-    # Constructors are the check, with messages for people; run-time checks of annotations must not come before.
-    __no_type_check__: ClassVar[bool] = True
-
     name: ClassVar[str]
     remedy: ClassVar[str]
     """What to do where it needs more memory than is free."""
@@ -219,7 +216,7 @@ def engine_from_dict(stored: object) -> Engine:
         stored = {"name": "inducing", "points": stored.get("points", 200), "tolerance": 0.0}
     kind = ENGINES.get(str(stored.get("name")))
     known = {field.name for field in fields(kind)} if kind is not None else set()  # type: ignore[arg-type]  # a dataclass
-    settings = {name: value for name, value in stored.items() if name != "name"}
+    settings = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items() if name != "name"}
     if kind is None or not set(settings) <= known:
         raise InvalidInput(f"stored engine {dict(stored)!r} is unknown; there are {', '.join(ENGINES)}")
     return kind(**settings)

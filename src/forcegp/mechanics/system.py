@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -47,9 +47,6 @@ class MechanicalSystem(Summary):
     URDF enter only where listed, for example `ViscousJointFriction.from_robot(robot)`.
     Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
     """
-
-    # This constructor takes other sequences, too, and is the check, with messages for people.
-    __no_type_check__: ClassVar[bool] = True
 
     robot: Robot
     contacts: tuple[Contact, ...] = ()

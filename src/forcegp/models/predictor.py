@@ -8,7 +8,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,8 +64,6 @@ class Predictor(Summary):
     NumericalError where the result is not finite. Where nothing can be compiled, torch computes the same, and one
     NumericalWarning says how much slower that is.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     space: ConfigurationSpace
     sizes: tuple[int, int, int]  # of q, v and u

@@ -364,9 +364,6 @@ class Posterior(MotionModel, Summary, ABC):
 class Model(ABC):
     """A model of the forward dynamics of one `system`. `fit` may take more keywords than those named here."""
 
-    # Constructors check their arguments, with messages for people; run-time checks of annotations must not come before.
-    __no_type_check__: ClassVar[bool] = True
-
     system: MechanicalSystem
 
     @abstractmethod

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -132,9 +132,6 @@ class Noise:
     `from_data` is set by a fit whose level of noise the dataset stated: rows that state another one are then warned of
     (`Posterior.update`).
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None

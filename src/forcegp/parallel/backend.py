@@ -29,8 +29,6 @@ class Backend(ABC):
     computes on one thread.
     """
 
-    # These constructors are the check, with messages for people; run-time checks of annotations come too early.
-    __no_type_check__: ClassVar[bool] = True
     name: ClassVar[str]
     jobs: int = 1
     """So many tasks are at work at once."""

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -41,9 +40,6 @@ class TabulatedCurve:
     Raises InvalidInput for anything but two or more finite places and as many finite values.
     """
 
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
-
     at: tuple[float, ...]
     values: tuple[float, ...]
 
@@ -75,9 +71,6 @@ class ExpectedFriction:
     sliding: friction coefficient over the sliding speed (m/s); joints: joint name -> resisting force (Nm or N) over the
     joint's velocity. Curves may be negative, as those that a fit has found can be where the data are few.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     sliding: TabulatedCurve
     joints: tuple[tuple[str, TabulatedCurve], ...] = ()

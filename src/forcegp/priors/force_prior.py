@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from itertools import accumulate, pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from gpytorch.kernels import Kernel
@@ -31,9 +31,6 @@ class ForcePrior(ABC):
     with it can be stored. All methods are pure: the same states give the same answer. Priors add up: `a + b` means that
     the unknown force is the sum of what the two describe.
     """
-
-    # Constructors check their arguments, with messages for people; run-time checks of annotations must not come before.
-    __no_type_check__: ClassVar[bool] = True
 
     @abstractmethod
     def latent_names(self, robot: Robot) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -52,8 +52,6 @@ class ImportOptions:
 
     Raises InvalidInput for numbers that make no sense.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     gap: float | None = None
     resample: Literal["auto", "no"] = "auto"

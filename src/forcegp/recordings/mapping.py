@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import yaml
@@ -112,8 +112,6 @@ class ColumnMapping:
 
     Raises InvalidInput for units that do not exist and numbers that make no sense.
     """
-
-    __no_type_check__: ClassVar[bool] = True
 
     time: str | None = None
     step: float | None = None

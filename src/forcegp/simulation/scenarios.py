@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import forcegp.data
 from forcegp.errors import InvalidInput, require_known, usable_arguments
@@ -58,9 +58,6 @@ class KukaSurfaceConfig:
     constants of their reference implementation. SI units and radians unless a name has another unit. Raises
     InvalidInput naming the field and its allowed range.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     seconds: float = 200.0
     """Recorded time of each episode [s]; `settle_seconds` are simulated before it and not recorded."""

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -49,9 +49,6 @@ class Split:
     held_out: the stretches to predict, none of them overlapping another.
     guard: seconds between any training row and a held-out stretch of the same episode.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     name: str
     words: str

@@ -111,8 +111,7 @@ class NetworkEnsemble(NetworkModel):
 
     @override
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
-        nv = self.system.robot.nv
-        return self.layers.shapes(self.members, 3 * nv, nv)
+        return self.layers.shapes(self.members, sum(self.system.sizes), self.system.robot.nv)
 
     @override
     def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:

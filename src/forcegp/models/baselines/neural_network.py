@@ -247,7 +247,7 @@ class NeuralNetwork(NetworkModel):
     @override
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
         nv = self.system.robot.nv
-        return SigmoidLayer(self.width).shapes(1, 3 * nv, nv) | {RESIDUAL: (nv,)}
+        return SigmoidLayer(self.width).shapes(1, sum(self.system.sizes), nv) | {RESIDUAL: (nv,)}
 
     @override
     def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:

@@ -14,7 +14,6 @@ exist. The search moves z with s = T z; T makes its steps comparable (`structure
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -58,9 +57,6 @@ class Coefficients:
         theirs.
     start: start value in the force's unit; None takes the system's own, which must be positive.
     """
-
-    # This constructor is the check, with messages for people; run-time checks of annotations must not come before it.
-    __no_type_check__: ClassVar[bool] = True
 
     force: str
     joints: tuple[str, ...] | None = None

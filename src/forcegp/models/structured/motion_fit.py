@@ -130,8 +130,8 @@ class MotionFit:
             patient = near is None
             motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True, patient=patient)
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
-            nowhere = torch.full_like(q, math.nan)
-            motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
+            nowhere_q, nowhere_v = (q.new_full(x.shape, math.nan) for x in (q, self.recorded.v))
+            motions = WindowMotions(nowhere_q, nowhere_v, *guess, torch.zeros(len(q), dtype=torch.bool))
         residual = self.residual(motions) / noise
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
