@@ -307,7 +307,7 @@ def _pointers(count: int, rows: Iterable[Tensor]) -> list[int]:
 
 def are_plain(given: Sequence[object], size: int) -> bool:
     """Whether these are tensors (size,) or (n, size), all of one shape, that need neither conversion nor a graph."""
-    shape = getattr(given[0], "shape", ())
+    shape = getattr(given[0], "shape", ()) if given else (size,)
     if len(shape) not in (1, 2) or shape[-1:] != (size,):
         return False
     for x in given:  # not a generator: every prediction of one state passes here
