@@ -172,10 +172,9 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
     chosen = given
     if given.cutoff == "auto":
         spectrum = motion_spectrum(dataset, given.differentiate)
-        each = spectrum.cutoff
-        known = np.isfinite(each)
-        cutoff = float(f"{each[known].max():.3g}") if known.any() else None
-        reasons["cutoff"] = _why(cutoff, spectrum, dataset)
+        each, decisive = spectrum.cutoff, _decisive(spectrum.cutoff, dataset)
+        cutoff = float(f"{np.nanmax(decisive):.3g}") if np.isfinite(decisive).any() else None
+        reasons["cutoff"] = _why(cutoff, decisive, spectrum, dataset)
         system = dataset.system
         if cutoff is not None and system is not None and not system.contacts and torques_of_joints(dataset):
             with contextlib.suppress(DatasetError):  # too short, or sampled too slowly: the spectrum has to do
@@ -204,13 +203,24 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
     return chosen, reasons
 
 
-def _why(cutoff: float | None, spectrum: MotionSpectrum, dataset: Dataset) -> str:
+def _decisive(each: Float[np.ndarray, " nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
+    """The cut-offs that count: of a robot whose base stands on contacts those of its base, where it shows one.
+
+    No actuator acts on a base, so its rows are homogeneous in the masses: noise of its acceleration draws these to 0.
+    """
+    base = np.full_like(each, np.nan)
+    for group in dataset.system.robot.layout.groups[:1] if dataset.system and dataset.system.touching else ():
+        base[group.rows] = each[group.rows]
+    return base if np.isfinite(base).any() else each
+
+
+def _why(cutoff: float | None, decisive: Float[np.ndarray, " nv"], spectrum: MotionSpectrum, dataset: Dataset) -> str:
     if cutoff is None:
         return f"the spectrum of {spectrum.source} shows no noise worth a filter; nothing is filtered"
-    joint = dataset.joint_names[int(np.nanargmax(spectrum.cutoff))]
+    joint, fastest = dataset.joint_names[int(np.nanargmax(decisive))], np.nanmax(spectrum.cutoff)
+    others = "no other joint moves faster" if np.nanmax(decisive) == fastest else f"joints do up to {fastest:.3g} Hz"
     return (
-        f"up to {cutoff:g} Hz the motion of joint {joint!r} is stronger than the noise of {spectrum.source}; "
-        "no other joint moves faster"
+        f"up to {cutoff:g} Hz the motion of joint {joint!r} is stronger than the noise of {spectrum.source}; {others}"
     )
 
 
