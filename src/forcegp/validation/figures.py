@@ -30,22 +30,31 @@ def figures_of(document: Mapping[str, Any]) -> dict[str, Figure]:
     return figures
 
 
-def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Figure:
-    """One row per model, one column per joint: normalised errors of accelerations above, force errors below.
+MOST_COLUMNS = 7
+"""Panels beside each other that a page still shows large enough to read."""
 
-    A dot is the median over runs, the line behind it the range.
+
+def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Figure:
+    """One row per model, one panel per joint: normalised errors of accelerations above, force errors below.
+
+    Many joints take several lines of at most `MOST_COLUMNS` panels. A dot is the median over runs, the line behind it
+    the range.
     """
     joints, looks = style.short_joint_names(document["joint_names"]), _looks(models)
     scores = {
         "nrmse": "Acceleration: RMSE / standard deviation of the measurement",
         "force_rms": f"Force: RMS of M (predicted − measured acceleration) [{_unit(document, 'u')}]",
     }
-    figure = style.new_figure(2.4 + max(4.2, 1.35 * len(joints)), 1.4 + 0.44 * len(models))
+    lines = -(-len(joints) // MOST_COLUMNS)
+    columns = -(-len(joints) // lines)
+    figure = style.new_figure(2.4 + max(4.2, 1.35 * columns), 0.5 + lines * (0.9 + 0.44 * len(models)))
     halves: Any = figure.subfigures(2, 1)
     for part, (score, title) in zip(halves, scores.items(), strict=True):
-        panels = part.subplots(1, len(joints), sharey=True, squeeze=False)[0]
+        panels = part.subplots(lines, columns, sharey=True, squeeze=False)
         style.heading(part, title, size=style.NORMAL)
-        for joint, axes in enumerate(panels):
+        for axes in panels.flat[len(joints) :]:
+            axes.set_visible(False)
+        for joint, axes in enumerate(panels.flat[: len(joints)]):
             for row, (name, model) in enumerate(models.items()):
                 value = model[f"{score}_per_joint"][joint]
                 if value is not None:
@@ -56,8 +65,8 @@ def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fig
             axes.set_xscale("log")
             axes.margins(x=0.12)
             style.plain_ticks(axes.xaxis)
-        panels[0].set_yticks(range(len(models)), list(models))
-        panels[0].set_ylim(len(models) - 0.5, -0.5)
+        panels[0, 0].set_yticks(range(len(models)), list(models))
+        panels[0, 0].set_ylim(len(models) - 0.5, -0.5)
     return figure
 
 
