@@ -154,9 +154,9 @@ def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():
 def test_too_little_time_to_show_a_large_difference_decides_for_it(squared, taken):
     found = paired_test("nrmse", "gp", "ls", np.array([[squared]]), np.ones((1, 1, 3)))
     assert found.outcome == "no difference"
-    assert found.speaks_for_it == taken
+    assert found.favours_challenger == taken
     nats = paired_test("nlpd", "gp", "ls", np.array([[[-4.0, 0.9, 0.9]]]), np.ones((1, 1, 3)))
-    assert (nats.outcome, nats.ahead, nats.speaks_for_it) == ("no difference", 3, False)
+    assert (nats.outcome, nats.ahead, nats.favours_challenger) == ("no difference", 3, False)
 
 
 def test_a_model_whose_motions_diverge_is_not_the_best():

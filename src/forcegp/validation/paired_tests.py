@@ -72,7 +72,7 @@ class PairedTest:
         return "better" if high < equal else "worse" if low > equal else "no difference"
 
     @property
-    def speaks_for_it(self) -> bool:
+    def favours_challenger(self) -> bool:
         """Whether the challenger is the one to take: shown to be better, or a third better in most stretches.
 
         A short log shows nothing, however large the difference; to stay with the worse model would be no caution.
@@ -167,7 +167,7 @@ def conclusions(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) 
 
 
 def winners(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) -> dict[str, dict[str, str]]:
-    """By score the model to take, and why: the best parametric one, unless the test speaks for another.
+    """By score the model to take, and why: the best parametric one, unless the test favours another.
 
     A score that no model has is missing.
     """
@@ -180,7 +180,7 @@ def winners(summary: Mapping[str, Any], runs: Runs, margin: float = MARGIN) -> d
                 out[score] = {"model": only, "why": f"the lowest {words}; there is no other kind of model"}
             continue
         answer = compared(score, other, simple, runs, margin)
-        if answer is not None and answer.speaks_for_it:
+        if answer is not None and answer.favours_challenger:
             sure = "" if answer.outcome == "better" else "a third better or more, on too little time to be sure: "
             out[score] = {"model": other, "why": sure + answer.sentence}
         else:
