@@ -1,59 +1,127 @@
-"""CPU time of what arms with a fixed base use most, to compare two versions of forcegp on one machine.
+"""CPU time of what arms with a fixed base use most: that of one version of forcegp over that of another.
 
-Run it alternately with the two versions, for instance
     git worktree add /tmp/before COMMIT
-    for k in 1 2 3; do for tree in /tmp/before .; do PYTHONPATH=$tree/src python benchmarks/arm_cost.py; done; done
-and compare medians over the runs. It uses only what both versions have. The commit before bases could move is f1fc32b^.
+    python benchmarks/arm_cost.py /tmp/before .
+
+The commit before bases could move is f1fc32b^. Each version runs in a process of its own, and the two take turns in
+short slices, so that both see the same load of the machine. Processes differ by some percent for no reason of the code,
+such as the layout of memory: so there are several pairs of them. Printed are the median ratio of successive slices (its
+median and range over the pairs) and the ratio of the least times (its median). The same tree given twice shows what
+noise remains. It uses only what both versions have.
 """
 
+import argparse
 import json
+import os
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable
-
-import torch
-
-from forcegp import JointFriction, StructuredGP
-from forcegp.simulation import FreeArmConfig, simulate_free_arm
+from pathlib import Path
+from statistics import median
+from typing import Any
 
 
-def cpu(job: Callable[[], object], times: int) -> float:
-    """Least CPU seconds, since noise only adds."""
-    seconds = []
-    for _ in range(times):
-        begun = time.process_time()
-        job()
-        seconds.append(time.process_time() - begun)
-    return min(seconds)
+def prepared() -> tuple[dict[str, Callable[[], object]], list[float]]:
+    """What is timed, and what the fit found: equal results are a condition of a fair comparison."""
+    import torch
 
+    from forcegp import JointFriction, StructuredGP
+    from forcegp.inference import OptimizerOptions
+    from forcegp.models.structured.search import FitObjective
+    from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
-def main() -> None:
-    warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     data = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=10.0, seed=1))
-    system, model = data.system, StructuredGP(data.system, JointFriction())
+    system = data.system
+    assert system is not None, "simulated data have one"
+    model = StructuredGP(system, JointFriction())
     posterior = model.fit(data, points=60, restarts=1)
-    predictor = posterior.predictor()
+    fixed = posterior.model.split_noise[1]
+    objective = FitObjective(posterior.likelihood, posterior.kernels, posterior.model.known_noise, fixed, True)
+    free = {name: x.clone().requires_grad_() for name, x in posterior.parameters.items() if name not in fixed}
+    predictor, compiled = posterior.predictor(), system.robot.compile()
     q, v, u = (torch.tensor(x[:1000]) for x in (data.q, data.v, data.u))
-    one = tuple(x[0] for x in (data.q, data.v, data.u))
-    rest = torch.zeros_like(v)
-    compiled = system.robot.compile()
-    at = tuple(torch.tensor(x) for x in one)
-    jobs: dict[str, tuple[Callable[[], object], int]] = {
-        "fit, 60 rows": (lambda: model.fit(data, points=60, restarts=1), 5),
-        "predict, 1,000 rows": (lambda: posterior.predict(q, v, u), 25),
-        "predict, 20 x one row": (lambda: [posterior.predict(q[0], v[0], u[0]) for _ in range(20)], 25),
-        "dynamics, 1,000 rows": (lambda: system.dynamics(q, v, u).acceleration(rest), 25),
-        "dynamics, 100 x one row": (
-            lambda: [system.dynamics(q[0], v[0], u[0]).acceleration(rest[0]) for _ in range(100)],
-            25,
-        ),
-        "predictor, 2,000 x one row of tensors": (lambda: [predictor(*at) for _ in range(2000)], 25),
-        "predictor, 2,000 x one row of arrays": (lambda: [predictor(*one) for _ in range(2000)], 25),
-        "compiled dynamics, 2,000 x one row": (lambda: [compiled.forward_dynamics(*at) for _ in range(2000)], 25),
+    one, arrays, rest = (q[0], v[0], u[0]), (data.q[0], data.v[0], data.u[0]), torch.zeros_like(v)
+    short = OptimizerOptions(iterations=1)
+    jobs: dict[str, Callable[[], object]] = {
+        "fit, 60 rows": lambda: model.fit(data, points=60, restarts=1),
+        "fit without its search": lambda: model.fit(data, points=60, restarts=1, options=short),
+        "objective and gradient": lambda: [torch.autograd.grad(objective(free), [*free.values()]) for _ in range(10)],
+        "predict, 1,000 rows": lambda: posterior.predict(q, v, u),
+        "predict, one row": lambda: [posterior.predict(*one) for _ in range(40)],
+        "dynamics, 1,000 rows": lambda: [system.dynamics(q, v, u).acceleration(rest) for _ in range(40)],
+        "dynamics, one row": lambda: [system.dynamics(*one).acceleration(rest[0]) for _ in range(400)],
+        "predictor, one row of tensors": lambda: [predictor(*one) for _ in range(4000)],
+        "predictor, one row of arrays": lambda: [predictor(*arrays) for _ in range(2000)],
+        "compiled dynamics, one row": lambda: [compiled.forward_dynamics(*one) for _ in range(4000)],
     }
-    print(json.dumps({name: round(cpu(*job), 6) for name, job in jobs.items()}))
+    return jobs, [posterior.result.evaluations, posterior.result.value]
+
+
+def work() -> None:
+    """Run the jobs whose names come in, and print the CPU seconds of each."""
+    warnings.simplefilter("ignore")
+    jobs, found = prepared()
+    for job in jobs.values():
+        job()
+    print(json.dumps([list(jobs), found]), flush=True)
+    for name in sys.stdin:
+        begun = time.process_time()
+        jobs[name.strip()]()
+        print(time.process_time() - begun, flush=True)
+
+
+class Worker:
+    """A process of the version in `tree`, which waits for names of jobs."""
+
+    def __init__(self, tree: str) -> None:
+        environment = os.environ | {"PYTHONPATH": str(Path(tree).resolve() / "src"), "OMP_NUM_THREADS": "1"}
+        call, pipe = [sys.executable, __file__, "--work"], subprocess.PIPE
+        self.process = subprocess.Popen(call, env=environment, text=True, stdin=pipe, stdout=pipe)
+
+    def answer(self, name: str | None = None) -> Any:
+        """CPU seconds of that job; without a name what the process says once it is prepared."""
+        assert self.process.stdin is not None, "a pipe"
+        assert self.process.stdout is not None, "a pipe"
+        if name is not None:
+            print(name, file=self.process.stdin, flush=True)
+        return json.loads(self.process.stdout.readline())
+
+
+def main(trees: list[str], pairs: int, turns: int) -> None:
+    """Print the ratios, the second tree over the first."""
+    ratios: dict[str, list[tuple[float, float]]] = {}
+    for _ in range(pairs):
+        workers = [Worker(tree) for tree in trees]
+        (names, found), (_, others) = (worker.answer() for worker in workers)
+        print(f"evaluations and value of the fit: {found}, {others}", file=sys.stderr)
+        seconds: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in names}
+        for turn in range(turns):
+            for name in names:
+                for k in (0, 1) if turn % 2 else (1, 0):
+                    seconds[name][k].append(workers[k].answer(name))
+        for worker in workers:
+            worker.process.communicate()
+        for name, (first, second) in seconds.items():
+            middle = median(b / a for a, b in zip(first, second, strict=True))
+            ratios.setdefault(name, []).append((middle, min(second) / min(first)))
+    for name, each in ratios.items():
+        (low, middle, high), (_, least, _) = ((min(x), median(x), max(x)) for x in zip(*each, strict=True))
+        print(f"{name:30} median {middle:.3f} ({low:.3f} to {high:.3f}), least times {least:.3f}")
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trees", nargs="*", help="two checkouts: the ratio is the second over the first")
+    parser.add_argument("--pairs", type=int, default=5, help="pairs of processes (default: %(default)s)")
+    parser.add_argument("--turns", type=int, default=10, help="slices of each job and process (default: %(default)s)")
+    parser.add_argument("--work", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.work:
+        work()
+    elif len(given.trees) == 2:
+        main(given.trees, given.pairs, given.turns)
+    else:
+        parser.error("give two trees")
