@@ -147,7 +147,7 @@ def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknow
     np.testing.assert_allclose(fit.noise, noise, rtol=0.5)
 
 
-@pytest.mark.parametrize("likelihood", ["torque", "acceleration"])
+@pytest.mark.parametrize("likelihood", ["torque", "acceleration", "both"])
 def test_a_walker_is_found_again(walker, likelihood):
     """Feet stand row by row, forces on them unknown: total mass, base parameters and friction come from the rest."""
     heavier = body_pseudo_inertias(walker.robot).numpy() * np.array([1.5, 1.2, 0.9, 1.1])[:, None, None]
@@ -167,6 +167,65 @@ def test_a_walker_is_found_again(walker, likelihood):
     test = recorded(truth, 50, seed=9)
     np.testing.assert_allclose(found.accelerations(test.q, test.v, test.u), test.a, atol=0.05 * np.abs(test.a).max())
     np.testing.assert_allclose(found.system.sizes, walker.sizes)
+
+
+def test_likely_accelerations_cost_least(walker):
+    """The cost r^T S^-1 r is the least, over a* and forces of contacts, of both squared errors; its slope is theirs.
+
+    What moves the base without an actuator is an error of a, whose covariance stays that of the last estimates.
+    """
+    q, v, u = (x.numpy() for x in rows_of(walker, 6))
+    a = np.random.default_rng(1).normal(size=v.shape)
+    terms = joint_terms(walker, ("viscous",), None, q, v, u, a)
+    rows = RecordedRows(walker, terms, q, v, u)
+    bodies = ConsistentBodies(body_pseudo_inertias(walker.robot).numpy())
+    regressor, split = rows.regressor(a), bodies.size
+    x = np.concatenate([np.zeros(split), terms.start()]) + np.random.default_rng(2).uniform(
+        0.05, 0.2, split + terms.size
+    )
+    likely = rows.likely(bodies.parameters(x[:split]), x[split:], a, regressor)
+    levels = likely.noise
+    of_base, of_joints = np.split(levels.force**2, [6])
+    _, _, H = rows.acceleration(bodies.parameters(x[:split]), x[split:])
+    e_a = np.diag(levels.acceleration**2) + H[:, :, :6] * of_base @ H[:, :6]
+
+    def cost(x):
+        """By least squares with a* and lambda as unknowns."""
+        parameters, total = bodies.parameters(x[:split]), 0.0
+        r, _, _ = rows.in_torque(parameters, x[split:], a, regressor)
+        _, M, _ = rows.acceleration(parameters, x[split:])
+        for row in range(len(a)):  # of e_a and lambda: e_a itself, and the forces of joints that are missing
+            ones, held = np.linalg.inv(np.linalg.cholesky(e_a[row])), rows.held[row].T
+            force = np.concatenate([-M[row], held], 1) / np.sqrt([*(1e-10 * of_base), *of_joints])[:, None]
+            matrix = np.concatenate([np.concatenate([ones, 0.0 * held], 1), force])
+            wanted = np.concatenate([0.0 * a[row], -r[row] / np.sqrt([*(1e-10 * of_base), *of_joints])])
+            found = np.linalg.lstsq(matrix, wanted, rcond=1e-13)[0]
+            total += ((matrix @ found - wanted) ** 2).sum()
+        return total
+
+    r, in_parameters, in_terms = rows.in_torque(bodies.parameters(x[:split]), x[split:], likely.a, likely.regressor)
+    np.testing.assert_allclose(
+        r + likely.offset, rows.in_torque(bodies.parameters(x[:split]), x[split:], a, regressor)[0], atol=1e-9
+    )
+    white = (likely.whitening @ (r + likely.offset)[..., None])[..., 0]
+    np.testing.assert_allclose((white**2).sum(), cost(x), rtol=1e-7)
+    in_bodies = np.einsum("nibp,bpk->nibk", in_parameters, bodies.derivatives(x[:split])).reshape(*r.shape, -1)
+    slope = 2.0 * np.einsum("ni,nij,njk->k", white, likely.whitening, np.concatenate([in_bodies, in_terms], -1))
+    direction = np.random.default_rng(3).normal(size=len(x))
+    numeric = (cost(x + 1e-6 * direction) - cost(x - 1e-6 * direction)) / 2e-6
+    assert slope @ direction == pytest.approx(numeric, rel=1e-5)
+
+
+def test_noise_of_accelerations_takes_no_mass_away(walker):
+    """Least squares of torque find a robot of some grams."""
+    log = recorded(walker, 400)
+    noisy = replace(log, a=log.a + 3.0 * np.random.default_rng(0).normal(size=log.a.shape))
+    mass = standard_parameters(walker.robot)[::10].sum().item()
+    with pytest.warns(DataWarning, match="by this log the robot weighs"):
+        assert identify_analytical(noisy, likelihood="torque").total_mass[0] < 0.5 * mass
+    found = identify_analytical(noisy)
+    assert found.likelihood == "both"
+    assert found.total_mass[0] == pytest.approx(mass, rel=0.02)
 
 
 def test_free_inertias_explain_the_same_rows(walker):
@@ -249,7 +308,7 @@ def test_feet_that_are_said_to_swing_are_named_by_the_mass(walker):
     identify_analytical(log)  # without a warning
     lifted = log.u.copy()
     lifted[:, -2:] = 0.0
-    with pytest.warns(DataWarning, match="by this log the robot weighs .* Check flags of stance"):
+    with pytest.warns(DataWarning, match="9.* m/s.2 on average: what holds it up .* Check flags of stance"):
         identify_analytical(replace(log, u=lifted, a=0.0 * log.a))
 
 

@@ -1,6 +1,7 @@
 """`identify_analytical`: rigid-body parameters from a recording; and how wrong such systems are about other motions."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 from warnings import warn
 
@@ -9,10 +10,10 @@ import torch
 from scipy.linalg import block_diag
 
 from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies, thickened
-from forcegp.analytical.identifiability import body_pseudo_inertias
+from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import Fit, NoiseLevels, weighted_least_squares
-from forcegp.analytical.recorded_rows import RecordedRows
+from forcegp.analytical.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares
+from forcegp.analytical.recorded_rows import LikelyAccelerations, RecordedRows, Rows
 from forcegp.analytical.result import AnalyticalIdentification
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
@@ -21,11 +22,17 @@ from forcegp.mechanics import MechanicalSystem
 from forcegp.robots.arguments import whole_number
 
 Inertias = Literal["consistent", "free"]
-Likelihood = Literal["torque", "acceleration"]
+Likelihood = Literal["torque", "acceleration", "both"]
 ROWS = 5_000
 """Rows that are used at most, evenly spread: more of a filtered recording add little."""
 REWEIGHTINGS = 2
 """Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
+SEARCHES = 20
+"""Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
+STEPS = 6
+"""Evaluations in each, since the next one begins with other accelerations."""
+UNMOVED = 1.0
+"""They end where all coordinates together moved by less than a standard error of independent rows."""
 
 
 def identify_analytical(
@@ -35,7 +42,7 @@ def identify_analytical(
     friction: Sequence[str] = ("viscous", "coulomb"),
     rotors: Literal["armature", "rotor"] | None = "armature",
     inertias: Inertias = "consistent",
-    likelihood: Likelihood = "torque",
+    likelihood: Likelihood | None = None,
     prior_strength: float = 1.0,
     robust: bool = False,
     rows: int = ROWS,
@@ -54,8 +61,10 @@ def identify_analytical(
     inertias: "consistent": every estimate belongs to a body (log-Cholesky coordinates, Rucker & Wensing 2022). "free":
         any numbers, that is, ordinary least squares of base parameters, which often give no robot.
     likelihood: "torque": residuals of inverse dynamics. "acceleration": of forward dynamics, maximum likelihood where
-        accelerations are noisy (differentiated positions) and forces are, too (`NoiseLevels`); needs consistent
-        inertias.
+        accelerations are noisy (differentiated positions) and forces are, too (`NoiseLevels`). "both": of inverse
+        dynamics with the accelerations that were there, where u and a are noisy (`forcegp.analytical.recorded_rows`).
+        The last two need consistent inertias. None: "both" where the base moves, whose rows noise of a alone would
+        draw to masses of zero; else, and for free inertias, "torque".
     prior_strength: weight w of a prior w/2 d^2 around the system that is given, with d the affine-invariant distance of
         bodies (one heavier throughout by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
         decides what the data do not, and hardly what they do.
@@ -71,14 +80,16 @@ def identify_analytical(
         require_rows("dataset", dataset, system.robot.joint_names, "the robot")
         for name, given, allowed in (
             ("inertias", inertias, ("consistent", "free")),
-            ("likelihood", likelihood, ("torque", "acceleration")),
+            ("likelihood", likelihood, ("torque", "acceleration", "both")),
         ):
-            if given not in allowed:
+            if given not in allowed and (name, given) != ("likelihood", None):
                 raise InvalidInput(f"{name} is {given!r}; give one of {', '.join(allowed)}.")
-        if inertias == "free" and likelihood == "acceleration":
+        if likelihood is None:
+            likelihood = "torque" if inertias == "free" or system.robot.space.is_vector_space else "both"
+        if inertias == "free" and likelihood != "torque":
             raise InvalidInput(
                 "accelerations need a mass matrix that can be inverted, which free inertias need not have; use "
-                "inertias='consistent' with likelihood='acceleration'."
+                f"inertias='consistent' with likelihood={likelihood!r}."
             )
         if not (np.isfinite(prior_strength) and prior_strength > 0.0):
             raise InvalidInput(
@@ -97,13 +108,16 @@ def identify_analytical(
     recorded = RecordedRows(system, terms, q, v, u)
     regressor = recorded.regressor(a)
     split = bodies.size
-    held = recorded.held if likelihood == "torque" and recorded.held.shape[1] else None
+    held = recorded.held if likelihood != "acceleration" and recorded.held.shape[1] else None
     if held is not None and held.any(-1).sum(1).min() == a.shape[1]:
         raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")
 
-    def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def residual(x: np.ndarray, likely: LikelyAccelerations | None = None) -> tuple[np.ndarray, np.ndarray]:
         parameters = bodies.parameters(x[:split])
-        if likelihood == "torque":
+        if likely is not None:
+            r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], likely.a, likely.regressor)
+            r = r + likely.offset
+        elif likelihood == "torque":
             r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
         else:
             r, in_parameters, in_terms = recorded.in_acceleration(parameters, x[split:], a)
@@ -127,15 +141,38 @@ def identify_analytical(
     longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
     bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
 
-    def search(start: np.ndarray, whitening: np.ndarray | None = None) -> Fit:
+    def search(
+        start: np.ndarray, whitening: np.ndarray | None = None, likely: LikelyAccelerations | None = None
+    ) -> Fit:
         def white(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            r, jacobian = residual(x)
+            r, jacobian = residual(x, likely)
             return (r, jacobian) if whitening is None else ((whitening @ r[..., None])[..., 0], whitening @ jacobian)
 
-        options: dict[str, Any] = {"longest": longest, "robust": robust, "progress": progress}
-        return weighted_least_squares(white, prior, start, bounds, held=held, **options)
+        options: dict[str, Any] = {"longest": longest, "robust": robust}
+        if likely is not None:  # its whitening holds the levels of noise, without forces of contacts
+            one = np.ones(a.shape[1])
+            return weighted_least_squares(white, prior, start, bounds, known=one, evaluations=STEPS, **options)
+        return weighted_least_squares(white, prior, start, bounds, held=held, progress=progress, **options)
 
-    fit, noise = search(np.concatenate([np.zeros(split), terms.start()])), None
+    def search_with_noise_in_both(x: np.ndarray) -> tuple[Fit, NoiseLevels]:
+        noise, least, number, evaluations = None, None, 0, 0
+        while True:
+            likely = recorded.likely(bodies.parameters(x[:split]), x[split:], a, regressor, noise, least)
+            noise, least = likely.noise, likely.noise.scaled(LEAST) if least is None else least
+            fit = search(x, likely.whitening, likely)
+            moved, x = fit.x - x, fit.x
+            number, evaluations = number + 1, evaluations + fit.evaluations
+            if progress is not None:
+                progress(number, float(np.sqrt((fit.white**2).mean())))
+            settled = bool(moved @ (fit.information + fit.prior_information) @ moved <= UNMOVED)
+            if settled or number == SEARCHES:
+                return replace(fit, evaluations=evaluations, settled=settled), noise
+
+    start, noise = np.concatenate([np.zeros(split), terms.start()]), None
+    if likelihood == "both":
+        fit, noise = search_with_noise_in_both(start)
+    else:
+        fit = search(start)
     for _ in range(REWEIGHTINGS if likelihood == "acceleration" else 0):
         predicted, M, H = recorded.acceleration(bodies.parameters(fit.x[:split]), fit.x[split:])
         noise = NoiseLevels.of(a - predicted, M, H)
@@ -152,14 +189,8 @@ def identify_analytical(
         thickened=thick,
         noise=noise,
     )
-    mass, given = found.total_mass[0], float(bodies.parameters(np.zeros(split))[:, 0].sum())
-    if not system.robot.space.is_vector_space and not given / OTHER_ROBOT <= mass <= given * OTHER_ROBOT:
-        warn(
-            f"by this log the robot weighs {mass:.3g} kg, by its file {given:.3g} kg: what holds it up is not what the "
-            "log states. Check flags of stance, thrust coefficients and the unit of u.",
-            DataWarning,
-            stacklevel=2,
-        )
+    if not system.robot.space.is_vector_space:
+        _warn_of_what_holds_it_up(found, recorded, a)
     return found
 
 
@@ -190,7 +221,31 @@ def joint_terms(
 
 
 OTHER_ROBOT = 2.0
-"""Factor between the masses of log and file from which on they are not those of one robot with a load."""
+"""Factor between the masses of log and file, or of what holds the robot up, from which on one of them is wrong."""
+
+
+def _warn_of_what_holds_it_up(found: AnalyticalIdentification, rows: RecordedRows, a: Rows) -> None:
+    """Where log and file have different masses, or the base lacks a force of the size of gravity."""
+    robot, mass, missing = found.given.robot, found.total_mass[0], 0.0
+    given = float(found.bodies.parameters(np.zeros(found.bodies.size))[:, 0].sum())
+    if robot.base == "floating":
+        residual = a - rows.acceleration(found.parameters, found.fit.x[found.bodies.size :])[0]
+        rotation = rows.kinematics.frame_pose(body_names(robot)[0])[:, :3, :3].cpu().numpy()
+        missing = float(np.linalg.norm((rotation @ residual[:, :3, None]).mean(0)))
+    wrong = ""
+    if not given / OTHER_ROBOT <= mass <= given * OTHER_ROBOT:
+        wrong = f"by this log the robot weighs {mass:.3g} kg, by its file {given:.3g} kg"
+    elif missing * OTHER_ROBOT > np.linalg.norm(robot.gravity.cpu().numpy()) > 0.0:
+        wrong = f"accelerations of the base are wrong by {missing:.3g} m/s^2 on average"
+    if wrong:
+        warn(
+            f"{wrong}: what holds it up is not what the log states. Check flags of stance, thrust coefficients and the "
+            "unit of u.",
+            DataWarning,
+            stacklevel=3,
+        )
+
+
 STRETCHES = 4
 """Stretches of time that logs of fewer than three episodes are cut into."""
 
@@ -220,7 +275,7 @@ def held_out_noise(dataset: Dataset, system: MechanicalSystem, **how: Any) -> No
         residuals.append(rows.a - dynamics.acceleration_map().offset.cpu().numpy())
         masses.append(dynamics.M.cpu().numpy())
         mobilities.append(dynamics.H.cpu().numpy())
-    return NoiseLevels.of(*map(np.concatenate, (residuals, masses, mobilities)))
+    return NoiseLevels.of(np.concatenate(residuals), np.concatenate(masses), np.concatenate(mobilities))
 
 
 def _stretches(dataset: Dataset) -> list[np.ndarray]:

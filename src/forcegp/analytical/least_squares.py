@@ -49,33 +49,44 @@ class NoiseLevels:
         residual: Float[np.ndarray, "rows nv"],
         M: Float[np.ndarray, "rows nv nv"],
         H: Float[np.ndarray, "rows nv nv"] | None = None,
+        near: "NoiseLevels | None" = None,
     ) -> "NoiseLevels":
         """Those of largest likelihood, by L-BFGS on their logarithms, each between `LEAST` and `MOST` times the whole.
 
-        `H` is that of Gauss' principle under constraints; None is M^-1.
+        `H` is that of Gauss' principle under constraints; None is M^-1. The search begins `near` others, if given.
         """
         chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
         inverse = torch.as_tensor(np.linalg.inv(M[chosen]) if H is None else H[chosen])
         r = torch.as_tensor(residual[chosen])
         in_force = (torch.as_tensor(M[chosen]) @ r[..., None])[..., 0]
         whole = torch.stack([x.square().mean(0).sqrt().clamp_min(1e-12) for x in (r, in_force)])
-        start = np.full(whole.numel(), np.log(0.5))
+        middle = np.full(whole.numel(), np.log(0.5))
+        bounds, start = (np.log(LEAST), np.log(MOST)), middle
+        if near is not None:
+            start = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(*bounds)
 
         def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-            logs = torch.tensor(x, requires_grad=True)
-            acceleration, force = whole * logs.view_as(whole).exp()
+            acceleration, force = whole * torch.as_tensor(x).exp().view_as(whole)
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
-            white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)
-            # a weak pull to the start keeps a level that the residuals do not inform from running away
-            pull = 0.5 * (logs - torch.as_tensor(start)).square().sum()
-            value = 0.5 * white.square().sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum() + pull
-            (gradient,) = torch.autograd.grad(value, logs)
-            return float(value.detach()), gradient.numpy()
+            precision = torch.cholesky_inverse(lower)
+            weighted = precision @ r[..., None]
+            # a weak pull to the middle keeps a level that the residuals do not inform from running away
+            value = 0.5 * (r * weighted[..., 0]).sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum()
+            left = precision - weighted @ weighted.mT
+            in_logs = (
+                acceleration**2 * left.diagonal(dim1=-2, dim2=-1).sum(0),
+                force**2 * (inverse @ left * inverse).sum((0, -1)),
+            )
+            return float(value) + 0.5 * ((x - middle) ** 2).sum(), torch.cat(in_logs).numpy() + x - middle
 
         # scipy's search, since the import of torch.optim takes seconds
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(np.log(LEAST), np.log(MOST))] * len(start))
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[bounds] * len(start))
         acceleration, force = whole.numpy() * np.exp(found.x).reshape(whole.shape)
         return cls(acceleration, force)
+
+    def scaled(self, factor: float) -> "NoiseLevels":
+        """All levels times this."""
+        return NoiseLevels(factor * self.acceleration, factor * self.force)
 
     def whitening(self, H: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
         """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance. H as in `of`."""
@@ -154,11 +165,14 @@ def weighted_least_squares(
     robust: bool = False,
     progress: Callable[[int, float], None] | None = None,
     held: Float[np.ndarray, "rows m nv"] | None = None,
+    known: Float[np.ndarray, " nv"] | None = None,
+    evaluations: int = MOST_EVALUATIONS,
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
     `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
-    are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count.
+    are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count. `known`
+    is sigma where it is not to be found. A round takes so many `evaluations` at most.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
@@ -173,15 +187,16 @@ def weighted_least_squares(
     some = slice(None) if held is None else np.unique(np.linspace(0, len(r) - 1, min(ROWS, len(r))).astype(int))
     seen = None if held is None else held[some]
     span = _span(held, np.ones(r.shape[1]))
-    noise, evaluations, settled, converged = _noise(r, robust, span), 0, False, False
+    noise, total, settled, converged = _noise(r, robust, span) if known is None else known, 0, False, False
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
-        x, nfev, converged = _minimized(at, prior, x, bounds, longest, noise, robust, span)
-        evaluations += nfev
+        x, nfev, converged = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations)
+        total += nfev
         r, jacobian = at(x)
         before = noise
-        for _ in range(1 if held is None else PASSES):  # forces of contacts hide most of it at first
+        # forces of contacts hide most of it at first
+        for _ in range(0 if known is not None else 1 if held is None else PASSES):
             noise = np.maximum(noise * _noise(r[some] / noise, robust, _span(seen, noise)), floor)
         if progress is not None:
             progress(round_number, float(np.sqrt((without(r, _span(held, np.ones_like(noise))) ** 2).mean())))
@@ -191,7 +206,7 @@ def weighted_least_squares(
     span = _span(held, noise)
     weight = _weights(without(r / noise, span), robust)
     in_prior = prior(x)[1]
-    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, evaluations, settled and converged, span)
+    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, total, settled and converged, span)
 
 
 def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:
@@ -206,7 +221,11 @@ def _span(held: np.ndarray | None, noise: np.ndarray) -> np.ndarray | None:
     """Orthonormal columns for the directions `held` of residuals over this noise."""
     if held is None:
         return None
-    directions = held / noise
+    return orthonormal_columns(held / noise)
+
+
+def orthonormal_columns(directions: Float[np.ndarray, "rows m nv"]) -> Float[np.ndarray, "rows nv m"]:
+    """Of the space of these independent rows, the last of which may be zeros."""
     columns = np.linalg.qr(directions.swapaxes(1, 2))[0]
     return columns * (directions != 0.0).any(-1)[:, None, : columns.shape[-1]]
 
@@ -230,6 +249,7 @@ def _minimized(
     noise: np.ndarray,
     robust: bool,
     span: np.ndarray | None,
+    most: int,
 ) -> tuple[np.ndarray, int, bool]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, and whether it converged.
 
@@ -237,7 +257,7 @@ def _minimized(
     """
     low, high = bounds
     here, damping, idle = _point(at, prior, x, noise, robust, span), 1e-4, 0
-    for evaluation in range(1, MOST_EVALUATIONS + 1):
+    for evaluation in range(1, most + 1):
         held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
         free = ~held
         curvature = here.curvature[np.ix_(free, free)]
@@ -259,7 +279,7 @@ def _minimized(
             return here.x, evaluation, True
         # Marquardt's rule: trust the quadratic model more where it was right, less where it was wrong
         damping = max(0.2 * damping, 1e-12) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
-    return here.x, MOST_EVALUATIONS, False
+    return here.x, most, False
 
 
 def _point(
@@ -274,8 +294,8 @@ def _point(
         white = without(r / noise, span)
         weight = _weights(white, robust)
         cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
-        flat = without(jacobian / noise[:, None], span) * np.sqrt(weight)[..., None]
-        flat = flat.reshape(-1, len(x))
+        flat = without(jacobian / noise[:, None], span)
+        flat = (flat * np.sqrt(weight)[..., None] if robust else flat).reshape(-1, len(x))
         gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
         curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
         cost = float(cost + 0.5 * (prior_r**2).sum())

@@ -18,17 +18,26 @@ Friction g(x; v) |u| under load makes u the solution of u = z + g |u|, with z al
     u = z / (1 - g s),    s = sign z = sign u for |g| < 1,    du/dx = (dz/dx + u s dg/dx) / (1 - g s).
 
 The measured |u| in its place would explain the measured torque by itself: g tends to 1, whatever the robot is.
+
+Where a and u are both noisy, the a* that was there is unknown as well. Over it, (e_a / sigma_a)^2 + (e_F / sigma_F)^2
+is least at
+
+    r^T S^-1 r,    S = M diag(sigma_a^2) M^T + diag(sigma_F^2),    a* = a - diag(sigma_a^2) M^T S^-1 r
+
+(errors in variables: Fuller, "Measurement Error Models", 1987, section 3.2). As S changes with pi, its derivative in pi
+is 2 Y(q, v, a*)^T S^-1 r. Least squares of torque take Y(q, v, a) there, whose noise draws inertias to zero: without a
+bound where rows are homogeneous in them, as those of a base without actuators are.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import without
+from forcegp.analytical.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.mechanics import (
@@ -179,6 +188,52 @@ class RecordedRows:
         Y = self.regressor(predicted)
         _, in_x = self.terms.torque(x, self.v, predicted, self.load)
         return a - predicted, (H @ Y.reshape(*predicted.shape, -1)).reshape(Y.shape), H @ in_x
+
+    def likely(
+        self,
+        parameters: np.ndarray,
+        x: np.ndarray,
+        a: np.ndarray,
+        regressor: np.ndarray,
+        near: NoiseLevels | None = None,
+        least: NoiseLevels | None = None,
+    ) -> "LikelyAccelerations":
+        """What was there where a and u are noisy, by these estimates. Levels are sought `near` others, above `least`.
+
+        Noise of forces on coordinates without an actuator, those of a base, moves the robot: it belongs to a*.
+        """
+        predicted, M, H = self.acceleration(parameters, x)
+        noise = NoiseLevels.of(a - predicted, M, H, near)
+        if least is not None:
+            noise = NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
+        needed, in_z, _ = self._needed(parameters, x, a, regressor)
+        M = in_z[..., None] * M
+        of_joints = np.isin(np.arange(M.shape[-1]), self.terms.rows)
+        e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
+        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
+        whitening = np.linalg.inv(np.linalg.cholesky(S))
+        held = orthonormal_columns((self.held * in_z[:, None]) @ whitening.swapaxes(1, 2))
+        whitening = without(whitening, held)
+        weighted = whitening.swapaxes(1, 2) @ (whitening @ (needed - self.force)[..., None])
+        there = a - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0]
+        at_there = self.regressor(there)
+        return LikelyAccelerations(
+            there, at_there, needed - self._needed(parameters, x, there, at_there)[0], whitening, noise
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LikelyAccelerations:
+    """Accelerations a* where a and u are noisy, and Y there; ``needed(a) - needed(a*)`` (rows, nv).
+
+    `whitening` (rows, nv, nv) are L^-1 with S = L L^T, without the directions of contact forces.
+    """
+
+    a: Rows
+    regressor: Float[np.ndarray, "rows nv bodies 10"]
+    offset: Rows
+    whitening: Float[np.ndarray, "rows nv nv"]
+    noise: NoiseLevels
 
 
 def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce, ...]:

@@ -24,7 +24,7 @@ import forcegp.recordings
 import forcegp.report
 import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
-from forcegp.cli.auto_answer import METHOD, NAMES, answer_lines, best_sentence, default_models, payload_text
+from forcegp.cli.auto_answer import NAMES, answer_lines, best_sentence, default_models, identification, payload_text
 from forcegp.cli.command import CONFIG, URDF, Resuming, listed, unless_given
 from forcegp.cli.fit import calibrated_with_progress
 from forcegp.cli.import_log import Import
@@ -248,7 +248,7 @@ class Auto(Resuming, Import):
             system,
             forcegp.split_named(rows, "auto"),
             points=min(100, len(rows) // 4),
-            identification=METHOD,
+            identification=identification(system),
             restarts=1,
             friction=laws,
         )

@@ -13,18 +13,26 @@ from forcegp.cli.import_log import stance_text
 from forcegp.cli.terminal import number
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
-METHOD = "torque-all"
-NAMES = {"analytical": "the URDF", f"identified-{METHOD}": "identified", f"joint-friction@{METHOD}": "friction learned"}
+FIXED, MOVING = "torque-all", "both-all"  # how the robot is identified
+NAMES = {"analytical": "the URDF"}
+NAMES |= {f"identified-{each}": "identified" for each in (FIXED, MOVING)}
+NAMES |= {f"joint-friction@{each}": "friction learned" for each in (FIXED, MOVING)}
 NAMES |= {"aerodynamic": "air forces learned", "joint-friction + aerodynamic": "friction and air forces learned"}
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 
 
+def identification(system: forcegp.MechanicalSystem) -> str:
+    """The method of `forcegp validate`."""
+    return FIXED if system.robot.space.is_vector_space else MOVING
+
+
 def default_models(system: forcegp.MechanicalSystem) -> tuple[str, ...]:
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given."""
-    identified, friction = f"identified-{METHOD}", bool(system.robot.single_joint_names)
+    method, friction = identification(system), bool(system.robot.single_joint_names)
+    identified = f"identified-{method}"
     if forcegp.data.thruster_columns(system):
         return "analytical", identified, "joint-friction + aerodynamic" if friction else "aerodynamic"
-    return "analytical", identified, *([f"joint-friction@{METHOD}"] if friction else [])
+    return "analytical", identified, *([f"joint-friction@{method}"] if friction else [])
 
 
 def answer_lines(

@@ -46,9 +46,12 @@ class IdentifyOptions(FitOptions):
     friction that depends on the direction); none for no friction."""
     rotors: Literal["armature", "rotor", "none"] = "armature"
     """With the last two models: armature: one rotor inertia per joint. rotor: those of the system's coupled rotors."""
-    likelihood: Literal["torque", "acceleration"] = "torque"
+    likelihood: Annotated[
+        Literal["torque", "acceleration", "both"] | None,
+        unless_given("torque|acceleration|both", "torque; both where the base moves"),
+    ] = None
     """With the last two models: torque: residuals of inverse dynamics, where torque sensors are good. acceleration: of
-    forward dynamics, where arms are light."""
+    forward dynamics, where arms are light. both: torque and acceleration are noisy."""
     robust: Annotated[bool, arg(help_behavior_hint="")] = False
     """With the last two models: count outliers by their absolute value."""
     test: Annotated[Path | None, DATASET, unless_given("TEST.h5", "none", Path)] = None

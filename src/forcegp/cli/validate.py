@@ -51,9 +51,10 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
     PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
     identified. NAME/motions: refined on the motions of the training rows."""
-    identification: Annotated[str, arg(metavar="METHOD")] = "acceleration-all"
+    identification: Annotated[str, arg(metavar="METHOD")] = "auto"
     """What @identified takes, and whose mass matrix turns errors of accelerations into forces: from all training rows
-    acceleration-all or torque-all, from --points acceleration, torque or least-squares."""
+    acceleration-all, torque-all or both-all, from --points acceleration, torque, both or least-squares. auto:
+    acceleration-all, or both-all where the base moves."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
     """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, offset and direction; or
     none."""

@@ -22,7 +22,13 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, has_few_inputs, named_prior
-from forcegp.validation.comparison import DEFAULT_IDENTIFICATION, IDENTIFICATIONS, LAWS_AFTER, identification_named
+from forcegp.validation.comparison import (
+    DEFAULT_IDENTIFICATION,
+    IDENTIFICATIONS,
+    LAWS_AFTER,
+    identification_named,
+    resolved_identification,
+)
 
 Kind = Literal["given", "identified", "residual", "black box", "force prior"]
 """Parametric physics as given or identified, a Gaussian process on what it leaves of the acceleration, a model without
@@ -219,7 +225,7 @@ def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT
     if mean not in ("given", "identified", *IDENTIFICATIONS) or (colon and mean == "given"):
         allowed = ", ".join(("given", "identified", *IDENTIFICATIONS))
         raise InvalidInput(f"model {name!r} takes its mean from {mean!r}; give PRIOR{MEAN}MEAN with one of {allowed}.")
-    method = {"given": None, "identified": identification}.get(mean, mean)
+    method = {"given": None, "identified": resolved_identification(identification, system)}.get(mean, mean)
     method = f"{method}{colon}{laws}" if colon else method
     try:
         prior = named_prior(expression, system)

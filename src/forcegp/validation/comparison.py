@@ -71,7 +71,11 @@ def _noise(system: MechanicalSystem, rows: Dataset, friction: Sequence[str], **h
 
 def _consistent(likelihood: str, rows: str, all_rows: bool) -> Identification:
     how = {"inertias": "consistent", "likelihood": likelihood}
-    method = {"torque": "least squares of joint forces", "acceleration": "maximum likelihood of accelerations"}
+    method = {
+        "torque": "least squares of joint forces",
+        "acceleration": "maximum likelihood of accelerations",
+        "both": "regression with noise of forces and of accelerations",
+    }
     summary = f"{method[likelihood]}{rows}, physically consistent"
     noise = partial(_noise, **how) if all_rows else None
     return Identification(summary, partial(_identified, **how), all_rows, noise)
@@ -84,8 +88,10 @@ IDENTIFICATIONS: dict[str, Identification] = {
     ),
     "torque": _consistent("torque", "", False),
     "acceleration": _consistent("acceleration", "", False),
+    "both": _consistent("both", "", False),
     "torque-all": _consistent("torque", " of ALL training rows", True),
     "acceleration-all": _consistent("acceleration", " of ALL training rows", True),
+    "both-all": _consistent("both", " of ALL training rows", True),
 }
 """By name. Add your own: IDENTIFICATIONS["mine"] = Identification("how", identify_mine)."""
 
@@ -102,7 +108,7 @@ def identification_named(name: str) -> Identification:
     if found is None or (colon and not set(laws) <= set(LAWS)):
         raise InvalidInput(
             f"no identification is called {name!r}; there are {', '.join(IDENTIFICATIONS)}, each with friction laws of "
-            f"its own as in {DEFAULT_IDENTIFICATION}:viscous,coulomb (out of {', '.join(LAWS)})."
+            f"its own as in acceleration-all:viscous,coulomb (out of {', '.join(LAWS)})."
         )
     if not colon:
         return found
@@ -120,8 +126,15 @@ def _with_laws(
 FRICTION = ("viscous", "coulomb")
 """Laws that are identified where nothing else is asked for."""
 
-DEFAULT_IDENTIFICATION = "acceleration-all"
-"""What `@identified` and the mass matrix of force errors take where nothing else is asked for."""
+DEFAULT_IDENTIFICATION = "auto"
+"""What `@identified` and the mass matrix of force errors take: acceleration-all, or both-all where the base moves."""
+
+
+def resolved_identification(name: str, system: MechanicalSystem) -> str:
+    """The name, or that of this robot for "auto"."""
+    if name != DEFAULT_IDENTIFICATION:
+        return name
+    return "acceleration-all" if system.robot.space.is_vector_space else "both-all"
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +149,8 @@ class Comparison:
     splits: what is held out; with several of them everything is done for each.
     points: training rows of every model.
     horizons, starts, integrator: of the predicted motions.
-    identification: what `@identified` and the mass matrix of force errors take, see `identification_named`.
+    identification: what `@identified` and the mass matrix of force errors take, see `identification_named` and
+        `resolved_identification`.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins; None is none.
     measured_torque: whether predictions account for a u that is as noisy (`Noise`); needs `force_noise`, or models that
@@ -163,6 +177,7 @@ class Comparison:
 
     def __post_init__(self) -> None:
         require_type("system", self.system, MechanicalSystem)
+        object.__setattr__(self, "identification", resolved_identification(self.identification, self.system))
         names = tuple(self.system.robot.joint_names)
         for what, dataset in (("rows", self.rows), ("recording", self.recording)):
             require_rows(what, dataset, names, "the robot")
