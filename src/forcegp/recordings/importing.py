@@ -232,7 +232,7 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
-                "seconds": float(recording.time[-1] - recording.time[0]),
+                "seconds": float(sum(recording.time[x.end - 1] - recording.time[x.start] for x in own.stretches)),
                 "median_step": own.step,
                 "largest_deviation_of_a_step": own.worst,
                 "repeated_stamps_dropped": own.repeated,
