@@ -23,6 +23,7 @@ DEFAULT_STARTS = 10
 MOMENTS = (0.1, 0.25, 0.5, 1.0)
 """Parts of the duration at which the table shows the errors."""
 LOW_COVERAGE = 0.8
+ENOUGH_SAMPLES = 20  # fewer span less by chance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +94,7 @@ class Rollout(Command):
             figure = forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title)
             forcegp.evaluation.save_figure(figure, folder / "rollout.png")
         held = summary["moments"][-1]["inside_95"]
-        if held is not None and held < LOW_COVERAGE:
+        if self.samples >= ENOUGH_SAMPLES and held is not None and held < LOW_COVERAGE:
             terminal.warn(
                 f"the 95 % intervals hold {held:.0%} of the recorded motion: functions that --samples draws leave out "
                 "noise, gusts and errors of the start. `forcegp fit --motions` finds intervals on motions left out."
