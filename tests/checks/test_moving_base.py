@@ -131,6 +131,10 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
     q, v, u = (torch.tensor(x) for x in (bare.q, bare.v, bare.u))
     falls = bare.system.dynamics(q, v, 0.0 * u).acceleration_map().offset.numpy()
     assert not [each for each in check(replace(bare, a=falls)).findings if each.subject == "base force"]
+    lifted = replace(log, u=np.hstack([bare.u, np.zeros((len(log), 4))]), truth={})
+    (carried,) = [each for each in check(lifted).findings if each.subject == "base force"]
+    assert (carried.severity, carried.numbers) == ("wrong", pytest.approx(finding.numbers, rel=1e-9))
+    assert "--feet" in carried.remedy
 
 
 def test_what_needs_a_fixed_base_says_so(log):

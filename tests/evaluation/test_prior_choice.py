@@ -19,6 +19,7 @@ from forcegp.models import load_posterior, save_posterior
 from forcegp.models.training_data import ACCELERATION, TrainingData
 from forcegp.priors import named_prior
 from forcegp.robots import Robot
+from forcegp.validation.candidates import candidates, default_models
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +67,13 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
     drones = [MechanicalSystem(robot, (), rotors) for robot in robots]
     limbs = Robot.from_urdf_text(LIMBS, base="floating")
     walker = MechanicalSystem(limbs, fixed_point("a_foot", switch="a_stands"))
-    found = [usual_prior(system) for system in (*drones, walker)]
-    assert found == ["aerodynamic", "joint-friction + aerodynamic", "joint-friction"]
-    for system, name in zip((*drones, walker), found, strict=True):
+    rock = MechanicalSystem(robots[0], (), (RigidBodyBias(),))
+    systems = *drones, walker, rock
+    found = [usual_prior(system) for system in systems]
+    assert found == ["aerodynamic", "joint-friction + aerodynamic", "joint-friction", "joint"]
+    for system, name in zip(systems, found, strict=True):
         named_prior(name, system)
+        assert "analytical" in candidates(default_models(system), system)
     with pytest.raises(InvalidInput, match="none but its base; leave it out"):
         named_prior("aerodynamic + joint-friction", drones[0])
 

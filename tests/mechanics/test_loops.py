@@ -8,7 +8,7 @@ import torch
 from tests.robots.mjcf_models import BAR, FOUR_BAR, QUADROTOR
 from tests.robots.mujoco_oracle import MujocoOracle
 
-from forcegp.errors import ContactError, InvalidInput
+from forcegp.errors import ContactError, InvalidInput, RobotFileWarning
 from forcegp.integration import ConstraintManifold, integrate
 from forcegp.integration.integrators import integrator_named
 from forcegp.mechanics import Baumgarte, Held, LoopClosure, MechanicalSystem, Plane, loop_frame, loop_point
@@ -203,3 +203,21 @@ def test_motors_at_sites_of_a_free_body_are_inputs(tmp_path):
     oracle.at(q[0].numpy(), v[0].numpy())
     np.testing.assert_allclose(system.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
     assert MechanicalSystem.from_json(system.to_json()).inputs == system.inputs
+
+
+def test_a_servo_and_a_tendon_leave_the_rotors_of_a_drone(tmp_path):
+    """Of a joint with a law of its own u holds the force, once; what drives no single joint is left out by name."""
+    arm = '<site name="r2" pos="-.1 .1 0"/><body><joint name="tilt" axis="0 1 0"/><geom size=".03" mass=".1"/></body>'
+    laws = '<position joint="tilt" kp="5"/><velocity joint="tilt" kv="1"/><motor name="pull" tendon="t"/></actuator>'
+    tendon = '<tendon><fixed name="t"><joint joint="tilt" coef="2"/></fixed></tendon></mujoco>'
+    text = QUADROTOR.replace('<site name="r2" pos="-.1 .1 0"/>', arm)
+    text = text.replace("</actuator>", laws).replace("</mujoco>", tendon)
+    with pytest.warns(RobotFileWarning, match=r"drive no single joint \(pull\)"):
+        system = system_of(text, tmp_path)
+    assert system.inputs == ("1", "2", "3", "4", "tilt")
+    u = torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    delivered = system.state(system.robot.neutral(), torch.zeros(7, dtype=torch.float64), u).delivered
+    assert delivered.tolist() == [0.0] * 6 + [1.0]
+    with pytest.warns(RobotFileWarning):
+        held = MechanicalSystem.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.0})
+    assert held.inputs == ("1", "2", "3", "4")

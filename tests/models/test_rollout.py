@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 import torch
+from tests.mechanics.test_thrusters import DRONE
 from tests.models.arm import arm_data, arm_system
 
+from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Baumgarte
+from forcegp.mechanics import Baumgarte, MechanicalSystem, RigidBodyBias
 from forcegp.models import StructuredGP
 from forcegp.models.baselines.independent_gp import IndependentGP
 from forcegp.models.protocol import Posterior
 from forcegp.models.rollout import roll_out
-from forcegp.priors import NoForces
+from forcegp.priors import BaseWrench, NoForces
+from forcegp.robots import Robot
 
 DT, STEPS = 1 / 240, 12
 QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=15)}
@@ -291,3 +294,20 @@ def test_a_gradient_is_never_dropped_in_silence(posterior, start):
             assert not posterior.rollout(**changed, dt=DT).q.requires_grad
     with pytest.raises(InvalidInput, match="grad is a str; give a bool"):
         posterior.rollout(**arguments, dt=DT, grad="yes")
+
+
+def test_a_body_without_actuators_moves_too():
+    """u has no columns; the first step is that of `predict`, and samples are many motions."""
+    system = MechanicalSystem(
+        Robot.from_urdf_text(DRONE, base="floating", locked={"tilt": 0.0}), (), (RigidBodyBias(),)
+    )
+    draw = torch.Generator().manual_seed(0)
+    q, v = system.robot.random(draw, 12), torch.randn(12, 6, generator=draw, dtype=torch.float64)
+    u = torch.zeros(12, 0, dtype=torch.float64)
+    a = system.dynamics(q, v, u).acceleration(-v)
+    rows = {name: x.numpy() for name, x in {"q": q, "v": v, "u": u, "a": a, "time": 0.1 * torch.arange(12)}.items()}
+    body = StructuredGP(system, BaseWrench(), noise=0.1).fit(Dataset(**rows, system=system), points=12, restarts=1)
+    found = body.rollout(q[:2], v[:2], torch.zeros(2, 3, 0).double(), 0.01, samples=4)
+    expected = v[:2] + 0.01 * body.predict(q[:2], v[:2], u[:2]).mean
+    torch.testing.assert_close(found.v[:, 1], expected, rtol=1e-9, atol=1e-9)
+    assert found.samples.q.shape == (4, 2, 4, 7)

@@ -172,6 +172,9 @@ def test_gaps_split_and_repeated_stamps_are_dropped(tmp_path):
     done = found.metadata["import"]["recordings"][0]
     assert (done["repeated_stamps_dropped"], done["rows_in_stretches_too_short"]) == (1, 3)
     assert len(done["gaps"]) == 2
+    assert done["seconds"] == pytest.approx(
+        np.sum([data["time"][b] - data["time"][a] for a, b in ((0, 99), (100, 196))])
+    )
     kept = np.r_[0:11, 12:197]
     np.testing.assert_array_equal(found.q, data["q"][kept])
     np.testing.assert_array_equal(found.episode, np.where(kept < 100, 0, 1))

@@ -12,6 +12,7 @@ from tests.recordings.log_files import write_text
 from forcegp import MechanicalSystem, Robot
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.mechanics import rolling
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 from forcegp.simulation import QuadrotorConfig, QuadrupedConfig, simulate_quadrotor, simulate_quadruped
 
@@ -359,3 +360,27 @@ def test_signs_and_scales_of_the_actuators_leave_flags_alone(tmp_path):
         np.testing.assert_array_equal(u[:, 12:], walk.u[:, 12:])
         [values] = [x["u"] for x in change.values()]
         np.testing.assert_allclose(u[:, :12], walk.u[:, :12] * np.array(values), rtol=1e-6)
+
+
+def test_a_wheel_may_turn_often(tmp_path):
+    """A joint that no wheel stands for, and that turns as often, may be in degrees."""
+    part = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    part += "</inertial></link>"
+    text = f'<robot name="cart">{part.format("base")}{part.format("wheel")}<joint name="axle" type="continuous">'
+    text += '<parent link="base"/><child link="wheel"/><axis xyz="0 1 0"/></joint></robot>'
+    cart = MechanicalSystem(Robot.from_urdf_text(text, base="planar"))
+    turn = np.linspace(0.0, 60.0, 200)
+    table = {
+        "time": 0.01 * np.arange(200),
+        "x": 0.1 * turn,
+        "y": 0 * turn,
+        "c": 1 + 0 * turn,
+        "s": 0 * turn,
+        "axle": turn,
+    }
+    path = write_text(tmp_path / "log.csv", table)
+    mapping = ColumnMapping(time="time", q=("x", "y", "c", "s", "axle"), u=("0",))
+    import_recordings([path], tmp_path / "out.h5", mapping, system=cart.with_contacts(rolling("wheel", 0.1)))
+    np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q[:, -1], turn)
+    with pytest.raises(DatasetError, match="more than two turns"):
+        import_recordings([path], tmp_path / "no.h5", mapping, system=cart)

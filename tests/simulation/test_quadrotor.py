@@ -11,7 +11,7 @@ from forcegp import AerodynamicForce, StructuredGP
 from forcegp.cli.fit import fit_summary
 from forcegp.data import estimate_thruster_lag, recorded_motions
 from forcegp.data.delay import lagged
-from forcegp.errors import DataWarning, InvalidInput
+from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
 from forcegp.evaluation.predicted_rows import predict_rows
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Actuation, RigidBodyBias
@@ -183,7 +183,11 @@ def test_a_mass_beside_unknown_thrust_is_warned_of(train):
     rows, body = acting(train).rows(np.arange(0, 4000, 100)), train.system.robot.link("body").inertial("mass")
     quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
     with pytest.warns(DataWarning, match="a heavier robot with as much more thrust moves the same"):
-        StructuredGP(train.system, AerodynamicForce()).identify(rows, body, **quick)
+        found = StructuredGP(train.system, AerodynamicForce()).identify(rows, body, **quick).identification
+    with pytest.warns(NumericalWarning, match="not ended at a minimum"):
+        assert found.standard_errors == {"body.mass": np.inf}
+    assert "The data do not identify body.mass: an unknown share of the thrust takes its place." in found.verdict
+    assert "every" not in found.verdict
     known = AerodynamicForce(inputs=("velocity", "drag", "angular-velocity", "attitude"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

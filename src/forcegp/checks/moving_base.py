@@ -117,11 +117,16 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     """A base that floats and does not fall, although no foot, thruster or known force of the system carries it."""
     robot, groups = system.robot, system.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * sum(robot.link(name).mass for name in robot.layout.moving)
-    if not groups or groups[0].kind != "floating" or system.contacts or not weight:
+    if not groups or groups[0].kind != "floating" or not weight:
+        return
+    complete, feet = dataset.u.shape[1] == len(system.inputs), {contact.switch for contact in system.touching}
+    if None in feet or (feet and not complete):
+        return
+    flags = dataset.u[:, [column for column, name in enumerate(system.inputs) if name in feet]] > 0.5
+    if flags.any(1).mean() > 0.5:  # the median window shows less of flight
         return
     group = groups[0]
     windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][3:], MOST_FORCES)
-    complete = dataset.u.shape[1] == len(system.inputs)
     inputs = dataset.u if complete else np.zeros((len(dataset), len(system.inputs)))
     q, v, u, a = (windows.of_signal(x).to(robot.device) for x in (dataset.q, dataset.v, inputs, dataset.a))
 
@@ -142,7 +147,9 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
             subject="base force",
             seen=f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the system explains, "
             f"no foot that stands and no thruster {weighs}.",
-            remedy="Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
+            remedy=f"Let --feet name what stands, and compare {', '.join(sorted(map(str, feet)))} with heights."
+            if feet
+            else "Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
             "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
             numbers=numbers,
         )

@@ -64,6 +64,7 @@ class Robot(RobotFileOptions):
         for text in repaired:
             terminal.warn(text)
         content = _content(robot) | {"file": str(self.file), "repaired": repaired}
+        content["inputs"] = list(system.inputs)
         content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in system.loops))
         terminal.show(*_shown(robot, content))
         drawn = self.out
@@ -140,4 +141,5 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     rows = [[each["name"], *(shown(each[key]) for key in header.values())] for each in content["joints"]]
     title = f"{robot.name}: {robot.nv} joints, {content['moving_mass']:.4g} kg that move; in rad or m, s, Nm or N"
     loops = [f"closed loop: {first} and {second} are held together" for first, second in content["loops"]]
-    return [tree, *loops, columns(title, ["joint", *header], rows, long_names=True)]
+    inputs = [f"u: {', '.join(content['inputs']) or 'none'}"] if tuple(content["inputs"]) != robot.joint_names else []
+    return [tree, *loops, *inputs, columns(title, ["joint", *header], rows, long_names=True)]

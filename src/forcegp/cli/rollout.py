@@ -22,6 +22,8 @@ from forcegp.errors import InvalidInput
 DEFAULT_STARTS = 10
 MOMENTS = (0.1, 0.25, 0.5, 1.0)
 """Parts of the duration at which the table shows the errors."""
+LOW_COVERAGE = 0.8
+ENOUGH_SAMPLES = 20  # fewer span less by chance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +93,12 @@ class Rollout(Command):
             title = f"{errors.time[-1]:.3g} s under recorded torques, {self.integrator}{stabilised}"
             figure = forcegp.evaluation.rollout_figure(rollout, recorded, errors, dataset, title)
             forcegp.evaluation.save_figure(figure, folder / "rollout.png")
+        held = summary["moments"][-1]["inside_95"]
+        if self.samples >= ENOUGH_SAMPLES and held is not None and held < LOW_COVERAGE:
+            terminal.warn(
+                f"the 95 % intervals hold {held:.0%} of the recorded motion: functions that --samples draws leave out "
+                "noise, gusts and errors of the start. `forcegp fit --motions` finds intervals on motions left out."
+            )
         terminal.note(f"figure: {self.out / 'rollout.png'}")
         terminal.show(*_report(summary))
         return summary

@@ -156,7 +156,7 @@ class WeakForm:
         def at_nodes(values: np.ndarray) -> np.ndarray:
             shares = (positive[:, part] / positive[:, part].sum(axis=1, keepdims=True) for part in parts)
             means = [np.einsum("km,kmj->kj", w, values[:, part]) for w, part in zip(shares, parts, strict=True)]
-            return np.stack(means, axis=1).reshape(-1, values.shape[-1])
+            return np.stack(means, axis=1).reshape(len(rows) * self.nodes, values.shape[-1])
 
         v, u = at_nodes(dataset.v[rows]), at_nodes(dataset.u[rows])
         held = switches(dataset)

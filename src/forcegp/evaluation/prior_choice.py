@@ -22,6 +22,7 @@ from forcegp.priors import named_prior
 FREE_MOTION = "joint-friction", "joint", "joint + joint-friction"
 IN_CONTACT = "tool-friction", "joint", "tool-friction + joint-friction"
 FLYING = "aerodynamic", "base-wrench"
+FREE_BODY = "joint", "base-wrench"
 FLYING_ARM = "joint-friction + aerodynamic", "joint-friction", "aerodynamic"
 """Priors that are looked at, the one that is taken without a look first."""
 
@@ -44,6 +45,8 @@ def _looked_at(system: MechanicalSystem) -> tuple[tuple[str, ...], str]:
         return FLYING_ARM if system.robot.single_joint_names else FLYING, "in flight"
     if any(slides(contact) for contact in system.touching):
         return IN_CONTACT, "in contact"
+    if not system.robot.single_joint_names:
+        return FREE_BODY, "of a body without joints"
     return FREE_MOTION, "where nothing slides" if system.touching else "in free motion"
 
 

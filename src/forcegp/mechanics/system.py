@@ -115,7 +115,8 @@ class MechanicalSystem(Summary):
         if known_forces is None:
             known_forces = (Actuation(), RigidBodyBias())
             if found.thrusters and robot.base != "fixed":
-                names, columns = zip(*found.thrusters, strict=True)
+                moving = set(robot.joint_names)  # without those that are locked
+                names, columns = zip(*(x for x in found.thrusters if moving & set(x[1])), strict=True)
                 matrix = [[column.get(joint, 0.0) for column in columns] for joint in robot.joint_names]
                 known_forces = (Actuation(matrix, names), RigidBodyBias())
         return cls(robot, tuple(contacts), known_forces, baumgarte)

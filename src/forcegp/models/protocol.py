@@ -197,7 +197,7 @@ class Posterior(MotionModel, Summary, ABC):
             raise InvalidInput(
                 f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state."
             ) from None
-        return [x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in given], batch
+        return [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]) for x in given], batch
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
         """What `rollout` integrates, under this stabilisation.

@@ -224,7 +224,8 @@ def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunct
     """A function of (samples, n, nv) as one of (samples * n, nv)."""
 
     def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return function(*(x.reshape(samples, -1, x.shape[-1]) for x in (q, v, u))).reshape(v.shape)
+        rows = v.shape[:-1].numel() // samples  # not -1: u may have no columns
+        return function(*(x.reshape(samples, rows, x.shape[-1]) for x in (q, v, u))).reshape(v.shape)
 
     return flat
 

@@ -121,7 +121,8 @@ def import_recordings(
             report(index, steps, f"reading {label}")
             found = read_recording(source, own, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
             if not options.beyond_limits:
-                require_plausible_positions(found, own, robot, stated="q" in mapping.unit)
+                believed = own.joints if "q" in mapping.unit else _wheels(system)
+                require_plausible_positions(found, own, robot, believed)
             warn_of_implausible_forces(found, own, robot)
             recordings.append(found)
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
@@ -194,6 +195,13 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
 
 
+def _wheels(system: forcegp.mechanics.MechanicalSystem | None) -> set[str]:
+    """Joints of wheels that roll, which turn as often as they like."""
+    contacts = () if system is None else system.contacts
+    rolling = [each.frame for each in contacts if isinstance(each, forcegp.mechanics.RollingContact)]
+    return {system.robot.layout.bodies[system.robot.frame(frame)[0]].name for frame in rolling} if system else set()
+
+
 def _require_no_jumps(stretch: Stretch) -> None:
     """Refuse positions that jump by a turn inside an episode: derivatives would take it for motion."""
     recording = stretch.recording
@@ -232,7 +240,7 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
-                "seconds": float(recording.time[-1] - recording.time[0]),
+                "seconds": float(sum(recording.time[x.end - 1] - recording.time[x.start] for x in own.stretches)),
                 "median_step": own.step,
                 "largest_deviation_of_a_step": own.worst,
                 "repeated_stamps_dropped": own.repeated,

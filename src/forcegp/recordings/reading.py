@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -236,11 +237,11 @@ STRONGER = 3.0
 
 
 def require_plausible_positions(
-    recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None, stated: bool
+    recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None, believed: Collection[str]
 ) -> None:
     """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees.
 
-    `stated`: the unit of q was given, which is then believed where no URDF contradicts it.
+    `believed`: joints that may turn often, such as wheels; all where the unit of q was given.
     Raises DatasetError naming the joint, its range and what to do.
     """
     limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
@@ -259,7 +260,7 @@ def require_plausible_positions(
                 hint = "Is it in degrees? Then add `unit` q=deg. `beyond_limits` accepts it."
                 raise MistakenUnit(f"{seen} {hint}", "q", "deg")
             raise DatasetError(f"{seen} Are unit, sign, offset and URDF right? `beyond_limits` accepts it.")
-        if degrees and not stated and not np.isfinite(upper - lower):
+        if degrees and item.joint not in believed and not np.isfinite(upper - lower):
             hint = "Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
             raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", "deg")
 

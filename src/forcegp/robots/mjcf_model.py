@@ -194,16 +194,23 @@ class CompiledModel:
         return not any(kinds)
 
     def _thrusters(self) -> tuple[tuple[str, dict[str, float]], ...]:
-        """Motors whose joint forces no posture changes, where some act at sites of a free body; else none."""
+        """Motors whose joint forces no posture changes, where some act at sites of a free body; else none.
+
+        Of an actuator with a law of its own, such as a servo, the input is the force on its joint, under the joint's
+        name. What drives no single joint, such as a tendon, is left out.
+        """
         model, found, taken, at_sites = self.model, [], set[str](), False
         for k in range(model.nu):
             gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])
+            name, motor = model.actuator(k).name or f"actuator_{k + 1}", self._is_motor(k)
+            at_site = model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_SITE and model.actuator_trnid[k][1] < 0
             joints = [joint for joint in range(model.njnt) if k in self._actuators_of(joint)]
-            if not self._is_motor(k):
-                return ()
             if joints and model.jnt_type[joints[0]] >= 2 and joints[0] not in {*self.couplings, *self.locked}:
-                column = {self.joints[joints[0]]: gain * float(gear[0])}
-            elif model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_SITE and model.actuator_trnid[k][1] < 0:
+                name = name if motor else self.joints[joints[0]]
+                column = {self.joints[joints[0]]: gain * float(gear[0]) if motor else 1.0}
+                if not motor and (name, column) in found:  # a second law of this joint
+                    continue
+            elif motor and at_site:
                 site = model.actuator_trnid[k][0]
                 body, pose = model.site_bodyid[site], self._pose(model.site_pos[site], model.site_quat[site])
                 while body and not model.body_jntnum[body]:
@@ -216,9 +223,11 @@ class CompiledModel:
                 wrench = [*force, *(pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force))]
                 names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
                 column, at_sites = dict(zip(names, (gain * float(x) for x in wrench), strict=True)), True
-            else:
+            elif joints or at_site:
                 return ()
-            found.append((self._named(model.actuator(k).name or f"actuator_{k + 1}", taken), column))
+            else:
+                continue
+            found.append((self._named(name, taken), column))
         return tuple(found) if at_sites else ()
 
     def _couple(self) -> None:
@@ -313,7 +322,7 @@ class CompiledModel:
 
     def _note_losses(self, thrusters: bool) -> None:
         """Note what acts on the joints in MuJoCo and not here."""
-        model = self.model
+        model, site = self.model, self.mujoco.mjtTrn.mjTRN_SITE
 
         def names(of: str, places: Iterable[Any]) -> None:
             for what, place in places:
@@ -334,7 +343,9 @@ class CompiledModel:
         for k in range(model.nu):
             if not self._is_motor(k):
                 self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
-            elif not thrusters and not any(k in self._actuators_of(joint) for joint in range(model.njnt)):
+            elif not (thrusters and model.actuator_trntype[k] == site) and not any(
+                k in self._actuators_of(joint) for joint in range(model.njnt)
+            ):
                 self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")
         if model.nflex:
             self._lose("forces of deformable bodies", f"{model.nflex} <flex>")

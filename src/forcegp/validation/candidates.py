@@ -15,9 +15,9 @@ from functools import partial
 from typing import Literal, get_args
 
 from forcegp.analytical import NoiseLevels
-from forcegp.data import Dataset
+from forcegp.data import Dataset, thruster_columns
 from forcegp.errors import FitError, InvalidInput
-from forcegp.evaluation import all_rows_at_once, allowing_for_correlation, with_force_noise
+from forcegp.evaluation import all_rows_at_once, allowing_for_correlation, usual_prior, with_force_noise
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
@@ -195,7 +195,13 @@ DEFAULT_MODELS = (
 
 
 def default_models(system: MechanicalSystem) -> tuple[str, ...]:
-    """Models that are compared where none is named: without refinements on motions where the base moves."""
+    """Models that are compared where none is named: without refinements on motions where the base moves.
+
+    Regression takes air for inertia, and a body without joints has no friction: both learn on the robot as given.
+    """
+    if thruster_columns(system) or not system.robot.single_joint_names:
+        physics = ("analytical", "identified-acceleration-all")
+        return (*physics, "independent-gp", "ensemble", RESIDUAL, usual_prior(system))
     fixed = system.robot.space.is_vector_space
     return tuple(name for name in DEFAULT_MODELS if fixed or not name.endswith(MOTIONS))
 

@@ -133,7 +133,7 @@ class IndependentPosterior(Posterior):
 
         def through(functions: Sequence[Callable[[list[Tensor]], Tensor]]) -> AccelerationFunction:
             def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-                z = self.likelihood.features(*(x.reshape(-1, x.shape[-1]) for x in (q, v, u)))
+                z = self.likelihood.features(*(x.reshape(q.shape[:-1].numel(), x.shape[-1]) for x in (q, v, u)))
                 points = [z.reshape(*q.shape[:-1], -1)]
                 return torch.cat([function(points) for function in functions], dim=-1)
 

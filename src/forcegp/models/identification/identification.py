@@ -179,6 +179,7 @@ class Identification(Summary):
     `history` holds their values at the start and after every iteration of the search that won. Standard errors, their
     covariance and the weak directions are computed when first asked for, which takes one evaluation of the
     objective for each free parameter and two for each physical one; `progress(done, of)` is called after every one.
+    Parameters in `confounded` have infinite ones, since an unknown force of the prior takes their place.
     """
 
     physical: PhysicalParameters
@@ -186,15 +187,21 @@ class Identification(Summary):
     parameters: dict[str, Tensor]
     history: tuple[dict[str, float], ...]
     covariance_rows: int
+    confounded: tuple[str, ...] = ()
     progress: Report | None = None
 
     @classmethod
     def of(
-        cls, physical: PhysicalParameters, objective: Objective, result: OptimizationResult, covariance_rows: int
+        cls,
+        physical: PhysicalParameters,
+        objective: Objective,
+        result: OptimizationResult,
+        covariance_rows: int,
+        confounded: tuple[str, ...] = (),
     ) -> "Identification":
         """From the result of a search that kept its iterates; `covariance_rows` is the size of what it factorised."""
         history = tuple(physical.named(point[PHYSICAL]) for point in result.iterates)
-        return cls(physical, objective, result.parameters, history, covariance_rows)
+        return cls(physical, objective, result.parameters, history, covariance_rows, confounded)
 
     @override
     def facts(self) -> dict[str, object]:
@@ -284,7 +291,8 @@ class Identification(Summary):
         moved = (self._jacobian @ lost).abs().amax(1) if lost.shape[1] else torch.zeros(len(vectors)).double()
         reach = self._jacobian.abs().amax(1)
         errors = torch.where(moved > 1e-3 * reach, torch.inf, self.covariance.diagonal().sqrt())
-        return dict(zip(self.physical.names, errors.tolist(), strict=True))
+        found = dict(zip(self.physical.names, errors.tolist(), strict=True))
+        return found | dict.fromkeys(self.confounded, float("inf"))
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
@@ -311,8 +319,13 @@ class Identification(Summary):
         """What the data do not identify, as a sentence, after what the search did not reach."""
         doubts = "; ".join(self.curvature.doubts)
         begin = f"The search has not ended at a minimum ({doubts}): let it go on. " if doubts else ""
+        other = ""
+        if self.confounded:
+            names, other = ", ".join(self.confounded), "other "
+            begin += f"The data do not identify {names}: an unknown share of the thrust takes its place. "
         if not self.weak_directions:
-            return f"{begin}The data identify every parameter that was learned."
+            rest = len(self.units) > len(self.confounded)
+            return f"{begin}{f'The data identify every {other}parameter that was learned.' if rest else ''}".strip()
         named, count = "; ".join(map(str, self.weak_directions)), len(self.weak_directions)
         noun = "combination" if count == 1 else f"{count} combinations"
         return (

@@ -71,7 +71,7 @@ def friction_margins(
         raise InvalidInput(f"the friction coefficient is {coefficient!r}; give a number of at least 0.")
     states, batch = posterior.checked_states(q, v, u)
     with torch.no_grad():
-        dynamics = posterior.dynamics(*(x.reshape(*batch, -1) for x in states))
+        dynamics = posterior.dynamics(*(x.reshape(*batch, x.shape[-1]) for x in states))
         forces = _forces(posterior, dynamics, feet.values(), torch.tensor(Held(normal).normal))
         moments = [margin_moments(force, coefficient) for force in forces]
         stands = torch.stack([_acts(dynamics, rows[0]) for rows in feet.values()], dim=-1)

@@ -315,7 +315,7 @@ class StructuredGP(StructuredModel):
             objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior)
             result, of_search = search.best(objective, kernels.initial_parameters() | learned_noise)
             return fitted.condition(training, result.parameters | fixed, result, {**described, **of_search})
-        warn_of_thrust(self.prior, search.learn)
+        confounded = tuple(f"{link}.mass" for link in warn_of_thrust(self.prior, search.learn))
         strength = search.prior_strength
         begin = PhysicalStart.of(search.learn, likelihood, learned_noise | fixed, strength)
         kernels = with_variance_priors(begin.kernels) if search.hyperprior else begin.kernels
@@ -329,7 +329,7 @@ class StructuredGP(StructuredModel):
             "prior_strength": strength,
             "log_variance_spread": LOG_VARIANCE_SPREAD if search.hyperprior else None,
         }
-        identification = Identification.of(begin.physical, objective, result, training.q.numel())
+        identification = Identification.of(begin.physical, objective, result, training.q.numel(), confounded)
         parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
         result = replace(result, parameters=parameters)
         fitted = replace(fitted, system=identification.system)

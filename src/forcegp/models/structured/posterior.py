@@ -183,7 +183,7 @@ class StructuredPosterior(Posterior):
         """
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
-        dynamics = self.dynamics(*(x.reshape(*batch, -1) for x in states))
+        dynamics = self.dynamics(*(x.reshape(*batch, x.shape[-1]) for x in states))
         latents = self.latents(dynamics, covariance)
         return components_of(self.model.prior, dynamics, latents, self.model.mean == "analytical")
 

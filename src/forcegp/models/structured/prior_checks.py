@@ -202,10 +202,13 @@ def warn_of_contacts(system: MechanicalSystem, dataset: Dataset) -> None:
         warnings.warn(str(doubt), ContactWarning, stacklevel=4)
 
 
-def warn_of_thrust(prior: ForcePrior, learned: Learned | Sequence[Learned]) -> None:
-    """Warn where a mass is learned beside an unknown share of the thrust: c times both accelerate the same."""
+def warn_of_thrust(prior: ForcePrior, learned: Learned | Sequence[Learned]) -> tuple[str, ...]:
+    """Warn where masses are learned beside an unknown share of the thrust: c times both accelerate the same.
+
+    Returns their links.
+    """
     each = learned if isinstance(learned, Sequence) else (learned,)
-    masses = [one.link for one in each if isinstance(one, LinkInertia) and "mass" in one.parts]
+    masses = tuple(one.link for one in each if isinstance(one, LinkInertia) and "mass" in one.parts)
     for term in prior.summands():
         free = {"thrust", "actuation"} & set(term.inputs if isinstance(term, BaseWrench) else ())
         if masses and free:
@@ -216,3 +219,5 @@ def warn_of_thrust(prior: ForcePrior, learned: Learned | Sequence[Learned]) -> N
                 DataWarning,
                 stacklevel=5,
             )
+            return masses
+    return ()
