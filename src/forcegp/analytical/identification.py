@@ -25,6 +25,8 @@ Inertias = Literal["consistent", "free"]
 Likelihood = Literal["torque", "acceleration", "both"]
 ROWS = 5_000
 """Rows that are used at most, evenly spread: more of a filtered recording add little."""
+EQUATIONS = 40_000
+"""As many rows hold these equations, one per degree of freedom, at most."""
 REWEIGHTINGS = 2
 """Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
 SEARCHES = 20
@@ -45,7 +47,7 @@ def identify_analytical(
     likelihood: Likelihood | None = None,
     prior_strength: float = 1.0,
     robust: bool = False,
-    rows: int = ROWS,
+    rows: int | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> AnalyticalIdentification:
     """Inertial parameters of every body, friction and rotor inertia by weighted least squares.
@@ -69,7 +71,7 @@ def identify_analytical(
         bodies (one heavier throughout by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
         decides what the data do not, and hardly what they do.
     robust: count residuals beyond 1.5 standard deviations by their absolute value (soft L1).
-    rows: use so many at most, evenly spread.
+    rows: use so many at most, evenly spread. None: 5,000, and fewer beyond eight degrees of freedom.
     progress: called as progress(round, rms of the residual).
 
     Raises InvalidInput for options that make no sense and for contacts that slide, whose friction is not measured.
@@ -96,6 +98,7 @@ def identify_analytical(
                 f"prior_strength is {prior_strength}; it must be > 0, since data never determine all of it."
             )
         require_type("robust", robust, bool)
+        rows = min(ROWS, EQUATIONS // system.robot.nv) if rows is None else rows
         if whole_number("rows", rows, 0) < 1:
             raise InvalidInput(f"rows is {rows}; it must be at least 1.")
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(rows, len(dataset))).astype(int))

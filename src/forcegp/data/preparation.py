@@ -203,22 +203,25 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
     return chosen, reasons
 
 
-def _decisive(each: Float[np.ndarray, " nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
-    """The cut-offs that count: of a robot whose base stands on contacts those of its base, where it shows one.
+BEYOND_BASE = 8.0
+"""The cut-off of a robot on contacts is at most so many times that of its base, whose accelerations are noise there."""
 
-    No actuator acts on a base, so its rows are homogeneous in the masses: noise of its acceleration draws these to 0.
-    """
-    base = np.full_like(each, np.nan)
+
+def _decisive(each: Float[np.ndarray, " nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
+    """The cut-offs that count: of a robot whose base stands on contacts none far beyond those of the base."""
     for group in dataset.system.robot.layout.groups[:1] if dataset.system and dataset.system.touching else ():
-        base[group.rows] = each[group.rows]
-    return base if np.isfinite(base).any() else each
+        if np.isfinite(each[group.rows]).any():
+            return np.minimum(each, BEYOND_BASE * np.nanmax(each[group.rows]))
+    return each
 
 
 def _why(cutoff: float | None, decisive: Float[np.ndarray, " nv"], spectrum: MotionSpectrum, dataset: Dataset) -> str:
     if cutoff is None:
         return f"the spectrum of {spectrum.source} shows no noise worth a filter; nothing is filtered"
     joint, fastest = dataset.joint_names[int(np.nanargmax(decisive))], np.nanmax(spectrum.cutoff)
-    others = "no other joint moves faster" if np.nanmax(decisive) == fastest else f"joints do up to {fastest:.3g} Hz"
+    others = "no other joint moves faster"
+    if np.nanmax(decisive) < fastest:
+        others = f"joints do up to {fastest:.3g} Hz, where accelerations of the base are noise"
     return (
         f"up to {cutoff:g} Hz the motion of joint {joint!r} is stronger than the noise of {spectrum.source}; {others}"
     )

@@ -199,11 +199,13 @@ def default_models(system: MechanicalSystem) -> tuple[str, ...]:
 
     Regression takes air for inertia, and a body without joints has no friction: both learn on the robot as given.
     """
+    identified = f"{IDENTIFIED}{resolved_identification(DEFAULT_IDENTIFICATION, system)}"
     if thruster_columns(system) or not system.robot.single_joint_names:
-        physics = ("analytical", "identified-acceleration-all")
+        physics = ("analytical", identified)
         return (*physics, "independent-gp", "ensemble", RESIDUAL, usual_prior(system))
     fixed = system.robot.space.is_vector_space
-    return tuple(name for name in DEFAULT_MODELS if fixed or not name.endswith(MOTIONS))
+    named = (name.replace(DEFAULT_MODELS[1], identified) for name in DEFAULT_MODELS)
+    return tuple(name for name in named if fixed or not name.endswith(MOTIONS))
 
 
 def candidate(name: str, system: MechanicalSystem, identification: str = DEFAULT_IDENTIFICATION) -> Candidate:
