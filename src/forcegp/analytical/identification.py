@@ -32,9 +32,9 @@ REWEIGHTINGS = 2
 SEARCHES = 20
 """Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
 STEPS = 6
-"""Evaluations in each, since the next one begins with other accelerations."""
-UNMOVED = 1.0
-"""They end where all coordinates together moved by less than a standard error of independent rows."""
+"""Evaluations in each, since the next one begins with other accelerations; twice as many after a search in vain."""
+REACHED = 0.02
+"""They end where a step is to lower the cost by fewer nats per coordinate: each is within a fifth of its error."""
 
 
 def identify_analytical(
@@ -145,7 +145,10 @@ def identify_analytical(
     bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
 
     def search(
-        start: np.ndarray, whitening: np.ndarray | None = None, likely: LikelyAccelerations | None = None
+        start: np.ndarray,
+        whitening: np.ndarray | None = None,
+        likely: LikelyAccelerations | None = None,
+        steps: int = STEPS,
     ) -> Fit:
         def white(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             r, jacobian = residual(x, likely)
@@ -154,20 +157,20 @@ def identify_analytical(
         options: dict[str, Any] = {"longest": longest, "robust": robust}
         if likely is not None:  # its whitening holds the levels of noise, without forces of contacts
             one = np.ones(a.shape[1])
-            return weighted_least_squares(white, prior, start, bounds, known=one, evaluations=STEPS, **options)
+            return weighted_least_squares(white, prior, start, bounds, known=one, evaluations=steps, **options)
         return weighted_least_squares(white, prior, start, bounds, held=held, progress=progress, **options)
 
     def search_with_noise_in_both(x: np.ndarray) -> tuple[Fit, NoiseLevels]:
-        noise, least, number, evaluations = None, None, 0, 0
+        noise, least, number, evaluations, steps = None, None, 0, 0, STEPS
         while True:
             likely = recorded.likely(bodies.parameters(x[:split]), x[split:], a, regressor, noise, least)
             noise, least = likely.noise, likely.noise.scaled(LEAST) if least is None else least
-            fit = search(x, likely.whitening, likely)
-            moved, x = fit.x - x, fit.x
+            fit = search(x, likely.whitening, likely, steps)
             number, evaluations = number + 1, evaluations + fit.evaluations
+            steps, x = STEPS if (fit.x != x).any() else 2 * steps, fit.x
             if progress is not None:
                 progress(number, float(np.sqrt((fit.white**2).mean())))
-            settled = bool(moved @ (fit.information + fit.prior_information) @ moved <= UNMOVED)
+            settled = number > 1 and fit.expected <= REACHED * len(x)
             if settled or number == SEARCHES:
                 return replace(fit, evaluations=evaluations, settled=settled), noise
 

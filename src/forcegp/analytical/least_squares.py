@@ -126,7 +126,8 @@ class Fit:
 
     `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k) there, `noise` (nv,) in units of the residual, `weight`
     (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and the message of the search. `span`
-    (rows, nv, m) are orthonormal directions of whitened residuals that unknown forces have, None for none.
+    (rows, nv, m) are orthonormal directions of whitened residuals that unknown forces have, None for none. `expected`
+    is by how many nats the first step of the last round was to lower the objective.
     """
 
     x: Float[np.ndarray, " k"]
@@ -138,6 +139,7 @@ class Fit:
     evaluations: int
     settled: bool
     span: Float[np.ndarray, "rows nv m"] | None = None
+    expected: float = 0.0
 
     @property
     def white(self) -> Float[np.ndarray, "rows nv"]:
@@ -187,11 +189,12 @@ def weighted_least_squares(
     some = slice(None) if held is None else np.unique(np.linspace(0, len(r) - 1, min(ROWS, len(r))).astype(int))
     seen = None if held is None else held[some]
     span = _span(held, np.ones(r.shape[1]))
-    noise, total, settled, converged = _noise(r, robust, span) if known is None else known, 0, False, False
+    noise, total, settled = _noise(r, robust, span) if known is None else known, 0, False
+    converged, expected = False, 0.0
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
-        x, nfev, converged = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations)
+        x, nfev, converged, expected = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations)
         total += nfev
         r, jacobian = at(x)
         before = noise
@@ -206,7 +209,7 @@ def weighted_least_squares(
     span = _span(held, noise)
     weight = _weights(without(r / noise, span), robust)
     in_prior = prior(x)[1]
-    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, total, settled and converged, span)
+    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, total, settled and converged, span, expected)
 
 
 def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:
@@ -250,13 +253,13 @@ def _minimized(
     robust: bool,
     span: np.ndarray | None,
     most: int,
-) -> tuple[np.ndarray, int, bool]:
-    """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, and whether it converged.
+) -> tuple[np.ndarray, int, bool, float]:
+    """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
 
     Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
     """
     low, high = bounds
-    here, damping, idle = _point(at, prior, x, noise, robust, span), 1e-4, 0
+    here, damping, idle, first = _point(at, prior, x, noise, robust, span), 1e-4, 0, None
     for evaluation in range(1, most + 1):
         held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
         free = ~held
@@ -268,18 +271,19 @@ def _minimized(
         there = np.clip(here.x + step, low, high)
         moved = there - here.x
         expected = -float(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
+        first = expected if first is None else first
         if abs(expected) <= 1e-3 * CONTENT or idle == 2:
-            return here.x, evaluation, True
+            return here.x, evaluation, True, first
         trial = _point(at, prior, there, noise, robust, span)
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
             here = trial
         elif damping > 1e12:  # rounding hides any descent
-            return here.x, evaluation, True
+            return here.x, evaluation, True, first
         # Marquardt's rule: trust the quadratic model more where it was right, less where it was wrong
         damping = max(0.2 * damping, 1e-12) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
-    return here.x, most, False
+    return here.x, most, False, first or 0.0
 
 
 def _point(
