@@ -57,6 +57,8 @@ def test_what_noise_hides_stays_open():
     decided = np.isfinite(found.flags)
     assert (found.flags == flags)[decided].mean() > 0.998
     assert (flags[~decided] == 0.0).mean() > 0.8
+    with pytest.warns(DataWarning, match="stance open in [3-4].% of the rows"):
+        found.written(log)
 
 
 def test_without_forces_the_motion_decides():

@@ -11,6 +11,7 @@ clearly move show what friction, loads and noise make of zero; feet at rest show
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from warnings import warn
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 import forcegp.mechanics
 from forcegp.data.contact_residual import tensors
 from forcegp.data.dataset import Dataset
-from forcegp.errors import ContactError, DatasetError
+from forcegp.errors import ContactError, DatasetError, DataWarning
 
 WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
 """s: of the averages; of open rows that follow those around them; on either side of what is not sure."""
@@ -30,6 +31,8 @@ QUARTER = 0.3186
 FREE, LEAST, BEARS = 0.95, 0.02, 0.4
 """Quantile of the forces on feet that clearly move; shares of the median force at rest: nothing, and surely bearing."""
 FEW = 10
+MANY_OPEN = 0.25
+"""Share of open rows that more than changes of stance leave."""
 CHUNK = 4000
 
 
@@ -75,6 +78,14 @@ class Stance:
         decided = np.flatnonzero(np.isfinite(u).all(axis=1))
         if not len(decided):
             raise self._open(len(u))
+        if len(decided) < (1.0 - MANY_OPEN) * len(u):
+            warn(
+                f"motion and forces leave the stance open in {1.0 - len(decided) / len(u):.0%} of the rows, which are "
+                "left out: velocities are noisy (filter them: cutoff, --cutoff auto), feet slip, or touch at other "
+                "points than those given.",
+                DataWarning,
+                stacklevel=3,
+            )
         return replace(dataset, u=np.where(np.isfinite(u), u, 0.0)).rows(decided)
 
     def _open(self, rows: int) -> DatasetError:
