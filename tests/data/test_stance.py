@@ -8,7 +8,7 @@ import torch
 
 from forcegp import Preparation
 from forcegp.data import estimate_stance, motion_spectrum
-from forcegp.errors import ContactError, DatasetError, InvalidInput
+from forcegp.errors import ContactError, DatasetError, DataWarning, InvalidInput
 from forcegp.mechanics import fixed_frame
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
