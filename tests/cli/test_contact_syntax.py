@@ -48,6 +48,8 @@ def test_feet_and_wheels_read_as_written():
     left, right = fixed_point("FL", switch="FL_stands"), fixed_point("a@b", (0.0, 0.1, -0.02), "a@b_stands")
     assert parse_feet(("FL", "a@b@0,.1,-2e-2")) == (*left, *right)
     assert parse_feet(("l_sole:flat",)) == fixed_frame("l_sole", "l_sole_stands")
+    ball = rolling("FR", 0.02, None, (0.0, 0.0, 0.1), switch="FR_stands")
+    assert parse_feet(("FL", "FR@0,0,.1:ball=.02")) == (*left, *ball)
     assert parse_wheels(("left=0.1", "a=b=.2")) == (*rolling("left", 0.1), *rolling("a=b", 0.2))
     assert parse_feet(()) == parse_wheels(()) == ()
 
@@ -56,6 +58,7 @@ def test_feet_and_wheels_read_as_written():
     ("parse", "text"),
     [
         *((parse_feet, text) for text in ("", "@0,0,0", "FL@1,2", "FL@a,b,c", "FL@0,0,nan", ":flat", "FL@0,0,0:flat")),
+        *((parse_feet, text) for text in ("FL:ball=", ":ball=1", "FL:ball=0", "FL:ball=1:flat")),
         *((parse_wheels, text) for text in ("", "left", "=0.1", "left=", "left=wide", "left=-1", "left=inf")),
     ],
 )

@@ -15,8 +15,8 @@ SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
 FEET, WHEELS = "FRAME@x,y,z,...", "FRAME=RADIUS,..."
-FLAT = ":flat"
-"""Behind the frame of a foot that does not turn while it stands."""
+FLAT, BALL = ":flat", ":ball="
+"""Behind the frame of a foot that does not turn while it stands; of a ball that rolls, with its radius in m."""
 STANDS = "{}_stands"
 """The input that switches the contact of a foot."""
 
@@ -56,23 +56,32 @@ def _numbers(text: str, what: str, given: str, form: str) -> list[float]:
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """Points `FRAME@x,y,z` or flat feet `FRAME:flat`, each with a switch for the rows it stands in.
+    """Points `FRAME@x,y,z`, rolling balls `FRAME@x,y,z:ball=RADIUS` or flat feet `FRAME:flat`, each with a switch.
 
     Raises InvalidInput.
     """
     feet: dict[str, tuple[forcegp.Contact, ...]] = {}
     for text in texts:
         flat = text.endswith(FLAT)
-        frame, _, point = text.rpartition("@") if "@" in text else (text.removesuffix(FLAT), "", "0,0,0")
-        complaint = f"--feet {text!r} is not FRAME, FRAME@x,y,z (m) or FRAME{FLAT}; for example FL_foot@0,0,-0.02"
+        named, ball, radius = text.removesuffix(FLAT).partition(BALL)
+        frame, _, point = named.rpartition("@") if "@" in named else (named, "", "0,0,0")
+        complaint = (
+            f"--feet {text!r} is not FRAME, FRAME@x,y,z (m), FRAME{BALL}RADIUS (m) or FRAME{FLAT}; for example "
+            "FL_foot@0,0,-0.02"
+        )
         place = numbers_of(point, complaint)
-        if not frame or len(place) != 3:
+        if not frame or len(place) != 3 or (flat and (ball or "@" in named)):
             raise InvalidInput(complaint)
         if frame in feet:
             raise InvalidInput(f"--feet names {frame} twice; a frame has one foot.")
         switch, (x, y, z) = STANDS.format(frame), place
-        held = forcegp.mechanics.fixed_frame(frame, switch) if flat else None
-        feet[frame] = held or forcegp.mechanics.fixed_point(frame, (x, y, z), switch)
+        if flat:
+            feet[frame] = forcegp.mechanics.fixed_frame(frame, switch)
+        elif ball:
+            size = numbers_of(radius, complaint, one=True)[0]
+            feet[frame] = forcegp.mechanics.rolling(frame, size, None, (x, y, z), switch=switch)
+        else:
+            feet[frame] = forcegp.mechanics.fixed_point(frame, (x, y, z), switch)
     return tuple(contact for points in feet.values() for contact in points)
 
 

@@ -50,7 +50,7 @@ class Import(PreparationOptions, RobotOptions):
     feet: Annotated[tuple[str, ...], listed(FEET, "none", goes_on=NUMBERS)] = ()
     """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
     actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
-    FRAME:flat is a foot that does not turn while it stands."""
+    FRAME:flat is a foot that does not turn while it stands, FRAME:ball=RADIUS (m) a ball that rolls on level ground."""
     wheels: Annotated[tuple[str, ...], listed(WHEELS, "none")] = ()
     """Wheels that roll about the y axes of these frames without slipping, on level ground; radius in m."""
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
