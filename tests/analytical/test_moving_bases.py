@@ -228,6 +228,17 @@ def test_noise_of_accelerations_takes_no_mass_away(walker):
     assert found.total_mass[0] == pytest.approx(mass, rel=0.02)
 
 
+@pytest.mark.parametrize("likelihood", ["acceleration", "both"])
+def test_a_row_in_ten_may_be_wrong(walker, likelihood):
+    """Neither the masses nor the levels of noise are those of outliers."""
+    truth = replace(walker, known_forces=(*walker.known_forces, *FRICTION))
+    log, rng = recorded(truth, 400, noise=0.05), np.random.default_rng(0)
+    wrong = 100.0 * rng.normal(size=log.a.shape) * (rng.random((len(log), 1)) < 0.1)
+    found = identify_analytical(replace(log, a=log.a + wrong), walker, likelihood=likelihood, robust=True)
+    assert found.total_mass[0] == pytest.approx(standard_parameters(walker.robot)[::10].sum().item(), rel=0.005)
+    np.testing.assert_allclose(found.noise.acceleration[:6], 0.05, rtol=0.6)
+
+
 def test_free_inertias_explain_the_same_rows(walker):
     found = identify_analytical(recorded(walker, 300), walker, inertias="free", friction=(), rotors=None)
     assert np.abs(found.torque_residual(recorded(walker, 40, seed=5))).max() < 1e-5

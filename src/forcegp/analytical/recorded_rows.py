@@ -37,7 +37,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import NoiseLevels, orthonormal_columns, without
+from forcegp.analytical.least_squares import BEND, NoiseLevels, orthonormal_columns, without
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.mechanics import (
@@ -197,13 +197,15 @@ class RecordedRows:
         regressor: np.ndarray,
         near: NoiseLevels | None = None,
         least: NoiseLevels | None = None,
+        robust: bool = False,
     ) -> "LikelyAccelerations":
         """What was there where a and u are noisy, by these estimates. Levels are sought `near` others, above `least`.
 
+        With `robust`, rows beyond what these levels explain count less, by the Cauchy loss log(1 + (rms / BEND)^2).
         Noise of forces on coordinates without an actuator, those of a base, moves the robot: it belongs to a*.
         """
         predicted, M, H = self.acceleration(parameters, x)
-        noise = NoiseLevels.of(a - predicted, M, H, near)
+        noise = NoiseLevels.of(a - predicted, M, H, near, robust)
         if least is not None:
             noise = NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
         needed, in_z, _ = self._needed(parameters, x, a, regressor)
@@ -214,9 +216,14 @@ class RecordedRows:
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         held = orthonormal_columns((self.held * in_z[:, None]) @ whitening.swapaxes(1, 2))
         whitening = without(whitening, held)
-        weighted = whitening.swapaxes(1, 2) @ (whitening @ (needed - self.force)[..., None])
+        white = whitening @ (needed - self.force)[..., None]
+        weighted = whitening.swapaxes(1, 2) @ white
         there = a - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0]
         at_there = self.regressor(there)
+        if robust:  # of whole rows, since Y(a*) is the slope of their squares, not of single entries
+            equations = a.shape[1] - self.held.any(-1).sum(1)
+            mean_square = (white**2).sum((1, 2)) / np.maximum(equations, 1)
+            whitening = whitening / np.sqrt(1.0 + mean_square / BEND**2)[:, None, None]
         return LikelyAccelerations(
             there, at_there, needed - self._needed(parameters, x, there, at_there)[0], whitening, noise
         )
