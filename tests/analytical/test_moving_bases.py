@@ -183,7 +183,8 @@ def test_likely_accelerations_cost_least(walker):
     x = np.concatenate([np.zeros(split), terms.start()]) + np.random.default_rng(2).uniform(
         0.05, 0.2, split + terms.size
     )
-    likely = rows.likely(bodies.parameters(x[:split]), x[split:], a, regressor)
+    near = rows.likely(bodies.parameters(x[:split]), x[split:], a, regressor).noise
+    likely = rows.likely(bodies.parameters(x[:split]), x[split:], a, regressor, near)
     levels = likely.noise
     of_base, of_joints = np.split(levels.force**2, [6])
     _, _, H = rows.acceleration(bodies.parameters(x[:split]), x[split:])
@@ -226,6 +227,37 @@ def test_noise_of_accelerations_takes_no_mass_away(walker):
     found = identify_analytical(noisy)
     assert found.likelihood == "both"
     assert found.total_mass[0] == pytest.approx(mass, rel=0.02)
+
+
+LEG = """<joint name="{1}" type="revolute"><origin xyz="0 {3} 0"/><parent link="{0}"/><child link="{2}"/>
+<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="50" velocity="20"/></joint><link name="{2}"><inertial>
+<origin xyz="0 -0.1 0"/><mass value="{4}"/><inertia ixx=".004" iyy=".002" izz=".004" ixy="0" ixz="0" iyz="0"/>
+</inertial></link>"""
+HOPPER = """<robot name="hopper"><link name="trunk"><inertial><mass value="5"/>
+<inertia ixx="0.05" iyy="0.06" izz="0.04" ixy="0" ixz="0" iyz="0"/></inertial></link>{}{}</robot>""".format(
+    LEG.format("trunk", "hip", "thigh", 0.0, 0.8), LEG.format("thigh", "knee", "foot", -0.2, 0.5)
+)
+
+
+def test_a_start_that_is_far_too_heavy():
+    """Where gravity does not act: noise of forces on the base explained whatever mass the search began at."""
+    robot = Robot.from_urdf_text(HOPPER, base="planar")
+    system = MechanicalSystem(robot, fixed_point("foot", (0.0, -0.2, 0.0), "stands"))
+    heavier = system.with_robot(with_bodies(robot, np.array([1.8, 1.0, 1.0])[:, None, None]
+                                            * body_pseudo_inertias(robot).numpy()))  # fmt: skip
+    log = recorded(replace(system, known_forces=(*system.known_forces, *FRICTION)), 400, noise=0.01, switches=1)
+    assert identify_analytical(log, heavier).total_mass[0] == pytest.approx(6.3, abs=0.01)
+
+
+@pytest.mark.parametrize("likelihood", ["acceleration", "both"])
+def test_a_row_in_ten_may_be_wrong(walker, likelihood):
+    """Neither the masses nor the levels of noise are those of outliers."""
+    truth = replace(walker, known_forces=(*walker.known_forces, *FRICTION))
+    log, rng = recorded(truth, 400, noise=0.05), np.random.default_rng(0)
+    wrong = 100.0 * rng.normal(size=log.a.shape) * (rng.random((len(log), 1)) < 0.1)
+    found = identify_analytical(replace(log, a=log.a + wrong), walker, likelihood=likelihood, robust=True)
+    assert found.total_mass[0] == pytest.approx(standard_parameters(walker.robot)[::10].sum().item(), rel=0.005)
+    np.testing.assert_allclose(found.noise.acceleration[:6], 0.05, rtol=0.6)
 
 
 def test_free_inertias_explain_the_same_rows(walker):

@@ -70,7 +70,8 @@ def identify_analytical(
     prior_strength: weight w of a prior w/2 d^2 around the system that is given, with d the affine-invariant distance of
         bodies (one heavier throughout by a factor e costs 2 w; Lee, Wensing & Park 2020) and weak terms of friction. It
         decides what the data do not, and hardly what they do.
-    robust: count residuals beyond 1.5 standard deviations by their absolute value (soft L1).
+    robust: count residuals beyond 1.5 standard deviations by their absolute value (soft L1); with "both", whole
+        rows by their logarithm (Cauchy), begun where soft L1 of accelerations ends.
     rows: use so many at most, evenly spread. None: 5,000, and fewer beyond eight degrees of freedom.
     progress: called as progress(round, rms of the residual).
 
@@ -154,16 +155,16 @@ def identify_analytical(
             r, jacobian = residual(x, likely)
             return (r, jacobian) if whitening is None else ((whitening @ r[..., None])[..., 0], whitening @ jacobian)
 
-        options: dict[str, Any] = {"longest": longest, "robust": robust}
-        if likely is not None:  # its whitening holds the levels of noise, without forces of contacts
-            one = np.ones(a.shape[1])
-            return weighted_least_squares(white, prior, start, bounds, known=one, evaluations=steps, **options)
-        return weighted_least_squares(white, prior, start, bounds, held=held, progress=progress, **options)
+        if likely is not None:  # its whitening holds levels of noise and weights, without forces of contacts
+            options: dict[str, Any] = {"known": np.ones(a.shape[1]), "evaluations": steps}
+        else:
+            options = {"robust": robust, "held": held if likelihood == "torque" else None, "progress": progress}
+        return weighted_least_squares(white, prior, start, bounds, longest=longest, **options)
 
     def search_with_noise_in_both(x: np.ndarray) -> tuple[Fit, NoiseLevels]:
         noise, least, number, evaluations, steps = None, None, 0, 0, STEPS
         while True:
-            likely = recorded.likely(bodies.parameters(x[:split]), x[split:], a, regressor, noise, least)
+            likely = recorded.likely(bodies.parameters(x[:split]), x[split:], a, regressor, noise, least, robust)
             noise, least = likely.noise, likely.noise.scaled(LEAST) if least is None else least
             fit = search(x, likely.whitening, likely, steps)
             number, evaluations = number + 1, evaluations + fit.evaluations
@@ -176,12 +177,13 @@ def identify_analytical(
 
     start, noise = np.concatenate([np.zeros(split), terms.start()]), None
     if likelihood == "both":
-        fit, noise = search_with_noise_in_both(start)
+        # levels of noise about a poor start would hide outliers
+        fit, noise = search_with_noise_in_both(search(start).x if robust else start)
     else:
         fit = search(start)
     for _ in range(REWEIGHTINGS if likelihood == "acceleration" else 0):
         predicted, M, H = recorded.acceleration(bodies.parameters(fit.x[:split]), fit.x[split:])
-        noise = NoiseLevels.of(a - predicted, M, H)
+        noise = NoiseLevels.of(a - predicted, M, H, robust=robust)
         fit = search(fit.x, noise.whitening(H))
     found = AnalyticalIdentification(
         given=system,

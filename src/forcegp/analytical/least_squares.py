@@ -50,11 +50,16 @@ class NoiseLevels:
         M: Float[np.ndarray, "rows nv nv"],
         H: Float[np.ndarray, "rows nv nv"] | None = None,
         near: "NoiseLevels | None" = None,
+        robust: bool = False,
     ) -> "NoiseLevels":
         """Those of largest likelihood, by L-BFGS on their logarithms, each between `LEAST` and `MOST` times the whole.
 
         `H` is that of Gauss' principle under constraints; None is M^-1. The search begins `near` others, if given.
+        With `robust`, outliers are moved to `OUTLYING` standard deviations first.
         """
+        if robust:
+            most = OUTLYING * MAD * np.median(abs(residual), axis=0)
+            residual = residual.clip(-most, most)
         chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
         inverse = torch.as_tensor(np.linalg.inv(M[chosen]) if H is None else H[chosen])
         r = torch.as_tensor(residual[chosen])
@@ -113,6 +118,8 @@ SETTLED = 1e-3
 """Relative change of the noise level that ends them."""
 BEND = 1.5
 """Standard deviations beyond which a robust residual counts by its absolute value."""
+OUTLYING = 3.0
+"""Standard deviations beyond which a robust residual is an outlier where levels of noise are sought."""
 MAD = 1.4826
 """Median absolute deviation of a normal distribution -> its standard deviation."""
 

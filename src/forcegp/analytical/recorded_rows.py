@@ -37,7 +37,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.analytical.joint_terms import JointTerms
-from forcegp.analytical.least_squares import NoiseLevels, orthonormal_columns, without
+from forcegp.analytical.least_squares import BEND, NoiseLevels, orthonormal_columns, without
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.mechanics import (
@@ -95,6 +95,8 @@ def residual_scores(
     }
 
 
+FIRST = 1e-2
+"""Of the noise of forces that residuals at the start allow for, what the first search takes."""
 Positions = Float[np.ndarray, "rows nq"]
 Rows = Float[np.ndarray, "rows nv"]
 Inputs = Float[np.ndarray, "rows nu"]
@@ -197,26 +199,37 @@ class RecordedRows:
         regressor: np.ndarray,
         near: NoiseLevels | None = None,
         least: NoiseLevels | None = None,
+        robust: bool = False,
     ) -> "LikelyAccelerations":
         """What was there where a and u are noisy, by these estimates. Levels are sought `near` others, above `least`.
 
+        With `robust`, rows beyond what these levels explain count less, by the Cauchy loss log(1 + (rms / BEND)^2).
+        The first ones, `near` none, are taken for noise of accelerations, as starts of all searches are.
         Noise of forces on coordinates without an actuator, those of a base, moves the robot: it belongs to a*.
         """
         predicted, M, H = self.acceleration(parameters, x)
-        noise = NoiseLevels.of(a - predicted, M, H, near)
+        noise = NoiseLevels.of(a - predicted, M, H, near, robust)
         if least is not None:
             noise = NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
+        levels = noise
+        if near is None:  # else a base that is far too light or heavy moves by forces that nothing measures
+            levels = NoiseLevels(np.sqrt(((a - predicted) ** 2).mean(0)).clip(1e-12), FIRST * noise.force)
         needed, in_z, _ = self._needed(parameters, x, a, regressor)
         M = in_z[..., None] * M
         of_joints = np.isin(np.arange(M.shape[-1]), self.terms.rows)
-        e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
-        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
+        e_a = np.diag(levels.acceleration**2) + (H * np.where(of_joints, 0.0, levels.force**2)) @ H
+        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, levels.force**2, 0.0))
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         held = orthonormal_columns((self.held * in_z[:, None]) @ whitening.swapaxes(1, 2))
         whitening = without(whitening, held)
-        weighted = whitening.swapaxes(1, 2) @ (whitening @ (needed - self.force)[..., None])
+        white = whitening @ (needed - self.force)[..., None]
+        weighted = whitening.swapaxes(1, 2) @ white
         there = a - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0]
         at_there = self.regressor(there)
+        if robust:  # of whole rows, since Y(a*) is the slope of their squares, not of single entries
+            equations = a.shape[1] - self.held.any(-1).sum(1)
+            mean_square = (white**2).sum((1, 2)) / np.maximum(equations, 1)
+            whitening = whitening / np.sqrt(1.0 + mean_square / BEND**2)[:, None, None]
         return LikelyAccelerations(
             there, at_there, needed - self._needed(parameters, x, there, at_there)[0], whitening, noise
         )

@@ -77,7 +77,7 @@ class Fit(ModelOptions):
             assert isinstance(model, forcegp.StructuredGP)
             model = forcegp.evaluation.with_force_noise(model, dataset)
             given = {} if command.learning_points is None else {"learning_points": command.learning_points}
-            how |= forcegp.evaluation.all_rows_at_once(points) | given
+            how |= forcegp.evaluation.all_rows_at_once(points, system.robot.nv) | given
         posterior = fit_with_progress(terminal, model, dataset, points=points, **how)
         if all_rows:
             found = forcegp.evaluation.allowing_for_correlation(posterior, dataset, command.hyperprior)

@@ -86,14 +86,18 @@ def choose_prior(
     return chosen, f"{chosen} {where}; by {by} it is better than {names[0]}, by {gain:.3g} nats per row"
 
 
-def all_rows_at_once(count: int) -> dict[str, Any]:
-    """Arguments for the `fit` of functions of few inputs to so many rows: exact up to `MOST_POINTS_FOR_RESTARTS`.
+EQUATIONS = 2_800
+"""Of the rows that a search learns from at once, at most: 400 rows of an arm. Its time grows with their cube."""
+
+
+def all_rows_at_once(count: int, nv: int) -> dict[str, Any]:
+    """Arguments for the `fit` of functions of few inputs to so many rows of nv equations: exact up to a few hundred.
 
     Beyond, by inducing points that leave out less than what one number adds to the variance of a row, 1 / count: what
     all rows leave open of a function is small, and intervals of curves hold what is left out, too. Hyper-parameters are
     improved on all rows afterwards (`allowing_for_correlation`).
     """
-    most = MOST_POINTS_FOR_RESTARTS
+    most = min(MOST_POINTS_FOR_RESTARTS, EQUATIONS // nv)
     return {} if count <= most else {"engine": Inducing(tolerance=1.0 / count, refine=0), "learning_points": most}
 
 

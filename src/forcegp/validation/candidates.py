@@ -138,7 +138,7 @@ def _fit_forces(prior: str, mean: str, training: Training) -> Posterior:
         # held-out noise contains the misfit that the forces are to learn; so many rows show their own
         noise = replace(training.noise, learn=True)
         model = with_force_noise(StructuredGP(system, forces, "analytical", noise), training.all_rows)
-        how = all_rows_at_once(len(training.all_rows))
+        how = all_rows_at_once(len(training.all_rows), system.robot.nv)
         fitted = model.fit(training.all_rows, seed=training.seed, restarts=training.restarts, **how)
         return allowing_for_correlation(fitted, training.all_rows)[0]
     model = StructuredGP(system, forces, "analytical", training.noise)
