@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from PIL import Image
 
 from forcegp.atomic_files import atomic_file
@@ -103,9 +103,13 @@ def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, si
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
+    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long.
+
+    On a short one there are at most four, since `LogLocator` crowds them there.
+    """
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,)))
+    of_decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,))
+    axis.set_major_locator(MaxNLocator(3) if high < 5.0 * low else of_decades)
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
