@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from scipy.linalg import null_space
 from tests.mechanics.test_thrusters import DRONE
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
@@ -191,23 +192,26 @@ def test_likely_accelerations_cost_least(walker):
     e_a = np.diag(levels.acceleration**2) + H[:, :, :6] * of_base @ H[:, :6]
 
     def cost(x):
-        """By least squares with a* and lambda as unknowns."""
+        """By least squares with e_a and lambda as unknowns, where contacts hold and nothing drives the base."""
         parameters, total = bodies.parameters(x[:split]), 0.0
         r, _, _ = rows.in_torque(parameters, x[split:], a, regressor)
         _, M, _ = rows.acceleration(parameters, x[split:])
-        for row in range(len(a)):  # of e_a and lambda: e_a itself, and the forces of joints that are missing
-            ones, held = np.linalg.inv(np.linalg.cholesky(e_a[row])), rows.held[row].T
-            force = np.concatenate([-M[row], held], 1) / np.sqrt([*(1e-10 * of_base), *of_joints])[:, None]
-            matrix = np.concatenate([np.concatenate([ones, 0.0 * held], 1), force])
-            wanted = np.concatenate([0.0 * a[row], -r[row] / np.sqrt([*(1e-10 * of_base), *of_joints])])
-            found = np.linalg.lstsq(matrix, wanted, rcond=1e-13)[0]
-            total += ((matrix @ found - wanted) ** 2).sum()
+        for row in range(len(a)):
+            held = rows.held[row].T
+            missing = np.concatenate([-M[row], held], 1)  # of the forces; r is what is there already
+            fixed = np.concatenate([np.concatenate([held.T, np.zeros((held.shape[1],) * 2)], 1), missing[:6]])
+            wanted = np.concatenate([held.T @ a[row] - rows.right[row], -r[row, :6]])
+            found, free = np.linalg.lstsq(fixed, wanted, rcond=1e-12)[0], null_space(fixed, rcond=1e-12)
+            weights = np.linalg.inv(np.linalg.cholesky(e_a[row])), np.diag(of_joints**-0.5)
+            left = np.concatenate([weights[0] @ found[:9], weights[1] @ (missing[6:] @ found + r[row, 6:])])
+            change = np.concatenate([weights[0] @ free[:9], weights[1] @ missing[6:] @ free])
+            total += ((left - change @ np.linalg.lstsq(change, left, rcond=1e-12)[0]) ** 2).sum()
+            broken = held.T @ a[row] - rows.right[row]  # what contacts cost does not depend on x
+            total -= broken @ np.linalg.pinv(held.T @ e_a[row] @ held, rcond=1e-12) @ broken
         return total
 
     r, in_parameters, in_terms = rows.in_torque(bodies.parameters(x[:split]), x[split:], likely.a, likely.regressor)
-    np.testing.assert_allclose(
-        r + likely.offset, rows.in_torque(bodies.parameters(x[:split]), x[split:], a, regressor)[0], atol=1e-9
-    )
+    np.testing.assert_allclose((rows.held @ likely.a[..., None])[..., 0], rows.right, atol=1e-8)
     white = (likely.whitening @ (r + likely.offset)[..., None])[..., 0]
     np.testing.assert_allclose((white**2).sum(), cost(x), rtol=1e-7)
     in_bodies = np.einsum("nibp,bpk->nibk", in_parameters, bodies.derivatives(x[:split])).reshape(*r.shape, -1)

@@ -162,18 +162,21 @@ def identify_analytical(
         return weighted_least_squares(white, prior, start, bounds, longest=longest, **options)
 
     def search_with_noise_in_both(x: np.ndarray) -> tuple[Fit, NoiseLevels]:
-        noise, least, number, evaluations, steps = None, None, 0, 0, STEPS
+        noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, not robust
         while True:
-            likely = recorded.likely(bodies.parameters(x[:split]), x[split:], a, regressor, noise, least, robust)
-            noise, least = likely.noise, likely.noise.scaled(LEAST) if least is None else least
+            parameters, number = bodies.parameters(x[:split]), number + 1
+            likely = recorded.likely(parameters, x[split:], a, regressor, noise, least, robust, rough)
+            if not rough:
+                noise, least = likely.noise, likely.noise.scaled(LEAST) if least is None else least
             fit = search(x, likely.whitening, likely, steps)
-            number, evaluations = number + 1, evaluations + fit.evaluations
+            evaluations += fit.evaluations
             steps, x = STEPS if (fit.x != x).any() else 2 * steps, fit.x
             if progress is not None:
                 progress(number, float(np.sqrt((fit.white**2).mean())))
-            settled = number > 1 and fit.expected <= REACHED * len(x)
-            if settled or number == SEARCHES:
-                return replace(fit, evaluations=evaluations, settled=settled), noise
+            reached = number > 1 and fit.expected <= REACHED * len(x)
+            if noise is not None and (reached or number == SEARCHES):
+                return replace(fit, evaluations=evaluations, settled=reached), noise
+            rough = rough and fit.expected > len(x) and number < SEARCHES // 2
 
     start, noise = np.concatenate([np.zeros(split), terms.start()]), None
     if likelihood == "both":

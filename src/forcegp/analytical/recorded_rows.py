@@ -26,7 +26,8 @@ is least at
 
 (errors in variables: Fuller, "Measurement Error Models", 1987, section 3.2). As S changes with pi, its derivative in pi
 is 2 Y(q, v, a*)^T S^-1 r. Least squares of torque take Y(q, v, a) there, whose noise draws inertias to zero: without a
-bound where rows are homogeneous in them, as those of a base without actuators are.
+bound where rows are homogeneous in them, as those of a base without actuators are. Where contacts hold, A a* = b: a and
+its covariance are those under that condition.
 """
 
 from collections.abc import Sequence
@@ -96,7 +97,7 @@ def residual_scores(
 
 
 FIRST = 1e-2
-"""Of the noise of forces that residuals at the start allow for, what the first search takes."""
+"""Of the root mean square of the residual forces, what rough searches take for noise of forces."""
 Positions = Float[np.ndarray, "rows nq"]
 Rows = Float[np.ndarray, "rows nv"]
 Inputs = Float[np.ndarray, "rows nu"]
@@ -200,38 +201,50 @@ class RecordedRows:
         near: NoiseLevels | None = None,
         least: NoiseLevels | None = None,
         robust: bool = False,
+        rough: bool = False,
     ) -> "LikelyAccelerations":
         """What was there where a and u are noisy, by these estimates. Levels are sought `near` others, above `least`.
 
         With `robust`, rows beyond what these levels explain count less, by the Cauchy loss log(1 + (rms / BEND)^2).
-        The first ones, `near` none, are taken for noise of accelerations, as starts of all searches are.
-        Noise of forces on coordinates without an actuator, those of a base, moves the robot: it belongs to a*.
+        With `rough`, all residuals are noise of accelerations, as starts of all searches are: forces that nothing
+        measures would explain any mass of a base there. Else these forces belong to a*, since they move the robot.
         """
         predicted, M, H = self.acceleration(parameters, x)
-        noise = NoiseLevels.of(a - predicted, M, H, near, robust)
+        if rough:
+            residual = a - predicted
+            force = FIRST * np.sqrt(((M @ residual[..., None]) ** 2).mean((0, 2))).clip(1e-12)
+            noise = NoiseLevels(np.sqrt((residual**2).mean(0)).clip(1e-12), force)
+        else:
+            noise = NoiseLevels.of(a - predicted, M, H, near, robust)
         if least is not None:
             noise = NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
-        levels = noise
-        if near is None:  # else a base that is far too light or heavy moves by forces that nothing measures
-            levels = NoiseLevels(np.sqrt(((a - predicted) ** 2).mean(0)).clip(1e-12), FIRST * noise.force)
         needed, in_z, _ = self._needed(parameters, x, a, regressor)
         M = in_z[..., None] * M
         of_joints = np.isin(np.arange(M.shape[-1]), self.terms.rows)
-        e_a = np.diag(levels.acceleration**2) + (H * np.where(of_joints, 0.0, levels.force**2)) @ H
-        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, levels.force**2, 0.0))
+        e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
+        A, idle = self.held, np.logical_not(self.held.any(axis=-1))
+        at_contacts = A @ e_a
+        among = at_contacts @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
+        gain = np.linalg.solve(among, at_contacts).swapaxes(1, 2)
+        moved = (gain @ (self.right[..., None] - A @ a[..., None]))[..., 0]
+        e_a = e_a - gain @ at_contacts
+        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
+        along = (A * in_z[:, None]).swapaxes(1, 2)
+        S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * along @ along.swapaxes(1, 2)
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         held = orthonormal_columns((self.held * in_z[:, None]) @ whitening.swapaxes(1, 2))
         whitening = without(whitening, held)
-        white = whitening @ (needed - self.force)[..., None]
+        at_contact = needed + (M @ moved[..., None])[..., 0]
+        white = whitening @ (at_contact - self.force)[..., None]
         weighted = whitening.swapaxes(1, 2) @ white
-        there = a - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0]
+        there = a + moved - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0]
         at_there = self.regressor(there)
         if robust:  # of whole rows, since Y(a*) is the slope of their squares, not of single entries
             equations = a.shape[1] - self.held.any(-1).sum(1)
             mean_square = (white**2).sum((1, 2)) / np.maximum(equations, 1)
             whitening = whitening / np.sqrt(1.0 + mean_square / BEND**2)[:, None, None]
         return LikelyAccelerations(
-            there, at_there, needed - self._needed(parameters, x, there, at_there)[0], whitening, noise
+            there, at_there, at_contact - self._needed(parameters, x, there, at_there)[0], whitening, noise
         )
 
 
