@@ -118,7 +118,10 @@ def test_feet_whose_stance_no_column_states(folder, forcegp):
         (f"{DOG} --feet front_left_foot --identified drone.json", "brings its contacts along; leave --feet out"),
         (f"{DOG} --wheels a=0.1 --identified drone.json", "brings its contacts along; leave --wheels out"),
         (f"{DOG} --robot dog.urdf --base floating --feet paw", "paw"),
-        (f"{DOG} --robot dog.urdf --base floating --feet paw@1,2", "is not FRAME, FRAME@x,y,z (m) or FRAME:flat"),
+        (
+            f"{DOG} --robot dog.urdf --base floating --feet paw@1,2",
+            "is not FRAME, FRAME@x,y,z (m), FRAME:ball=RADIUS (m) or FRAME:flat",
+        ),
         (f"{DOG} --robot dog.urdf --feet front_left_foot", "base='floating'"),
         ("auto flight.csv --out x", "give --robot ARM.urdf, or --identified"),
         ("compare walk.h5", "give two or more, as in a,b"),

@@ -147,7 +147,8 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
             subject="base force",
             seen=f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the system explains, "
             f"no foot that stands and no thruster {weighs}.",
-            remedy=f"Let --feet name what stands, and compare {', '.join(sorted(map(str, feet)))} with heights."
+            remedy="Let forcegp import --feet name what stands, and compare "
+            f"{', '.join(sorted(map(str, feet)))} with heights."
             if feet
             else "Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
             "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",

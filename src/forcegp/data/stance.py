@@ -81,7 +81,7 @@ class Stance:
         if len(decided) < (1.0 - MANY_OPEN) * len(u):
             warn(
                 f"motion and forces leave the stance open in {1.0 - len(decided) / len(u):.0%} of the rows, which are "
-                "left out: velocities are noisy (filter them: cutoff, --cutoff auto), feet slip, or touch at other "
+                "left out: velocities are noisy (filter them: `cutoff='auto'`), feet slip, or touch at other "
                 "points than those given.",
                 DataWarning,
                 stacklevel=3,

@@ -175,7 +175,7 @@ def lay_out(
         raise RobotModelError(
             f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics; "
             f"use a URDF with at least one joint of type {', '.join(MOVABLE)} that is not locked, or "
-            "base='floating' (--base floating) for a body that moves freely."
+            "`base='floating'` for a body that moves freely."
         )
     if len(bodies) > MOST_BODIES:
         raise RobotModelError(
