@@ -82,7 +82,7 @@ class Worker:
         self.process = subprocess.Popen(call, env=environment, text=True, stdin=pipe, stdout=pipe)
 
     def answer(self, name: str | None = None) -> Any:
-        """CPU seconds of that job; without a name what the process says once it is prepared."""
+        """CPU seconds of that job; without a name what the process prints once it is prepared."""
         assert self.process.stdin is not None, "a pipe"
         assert self.process.stdout is not None, "a pipe"
         if name is not None:

@@ -339,7 +339,7 @@ def standing(system, count, seed=0):
     return replace(log, v=v.numpy(), u=u, a=a.numpy())
 
 
-def test_feet_that_are_said_to_swing_are_named_by_the_mass(walker):
+def test_feet_that_carry_and_are_flagged_as_swinging_are_named(walker):
     log = standing(walker, 200)
     identify_analytical(log)  # without a warning
     lifted = log.u.copy()
