@@ -229,11 +229,10 @@ class RecordedRows:
         moved = (gain @ (self.right[..., None] - A @ a[..., None]))[..., 0]
         e_a = e_a - gain @ at_contacts
         S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
-        along = (A * in_z[:, None]).swapaxes(1, 2)
-        S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * along @ along.swapaxes(1, 2)
+        pushed = A * in_z[:, None]  # directions of contact forces; without them S is singular where contacts hold
+        S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * pushed.swapaxes(1, 2) @ pushed
         whitening = np.linalg.inv(np.linalg.cholesky(S))
-        held = orthonormal_columns((self.held * in_z[:, None]) @ whitening.swapaxes(1, 2))
-        whitening = without(whitening, held)
+        whitening = without(whitening, orthonormal_columns(pushed @ whitening.swapaxes(1, 2)))
         at_contact = needed + (M @ moved[..., None])[..., 0]
         white = whitening @ (at_contact - self.force)[..., None]
         weighted = whitening.swapaxes(1, 2) @ white
@@ -250,8 +249,9 @@ class RecordedRows:
 
 @dataclass(frozen=True, eq=False)
 class LikelyAccelerations:
-    """Accelerations a* where a and u are noisy, and Y there; ``needed(a) - needed(a*)`` (rows, nv).
+    """Accelerations a* where a and u are noisy, and Y there.
 
+    `offset` (rows, nv) are the forces that the measured a needs, once it obeys the contacts, less those of a*.
     `whitening` (rows, nv, nv) are L^-1 with S = L L^T, without the directions of contact forces.
     """
 
