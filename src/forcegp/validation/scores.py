@@ -30,6 +30,7 @@ STRETCHES = 20
 """Parts of the held-out time in which models are compared by themselves."""
 
 ROWS_PER_BLOCK = 4096
+CONSTANT = 1e-6  # of the largest standard deviation: less is rounding
 
 
 def mass_matrices(dataset: Dataset, system: MechanicalSystem) -> Float[np.ndarray, "_ nv nv"]:
@@ -47,9 +48,13 @@ def normalized_error(predicted: Rows, target: Rows) -> Float[np.ndarray, " nv"]:
 
     1 is what predicting the mean of the held-out rows would give.
     """
-    spread = target.std(axis=0)
-    error = metrics.root_mean_square_error(predicted, target)
-    return np.where(spread > 0.0, error / np.where(spread > 0.0, spread, 1.0), np.nan)
+    return metrics.root_mean_square_error(predicted, target) / _spread(target)
+
+
+def _spread(a: Rows) -> Float[np.ndarray, " nv"]:
+    """Standard deviations of the acceleration; NaN where rounding is all there is, as of a cart across its wheels."""
+    spread = a.std(axis=0)
+    return np.where(spread > CONSTANT * spread.max(initial=0.0), spread, np.nan)
 
 
 def force_errors(predicted: Rows, target: Rows, mass: Matrices) -> Rows:
@@ -107,8 +112,8 @@ def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[s
     """
     lasting = sum(float(np.ptp(test.time[test.episode == episode])) for episode in test.episodes)
     seconds = lasting / STRETCHES if lasting > 0.0 else 1.0
-    spread = test.a.std(axis=0)
-    relative = ((predicted.mean - test.a)[:, spread > 0.0] / spread[spread > 0.0]) ** 2
+    spread = _spread(test.a)
+    relative = (((predicted.mean - test.a) / spread) ** 2)[:, np.isfinite(spread)]
     blocks = [list(block) for block in time_blocks(test.time, test.episode, seconds)]
     return {
         "seconds": seconds,
@@ -138,11 +143,11 @@ def _postures(dataset: Dataset) -> np.ndarray:
 
 def _apart(predicted: PredictedRows, test: Dataset, outside: Bool[np.ndarray, " rows"]) -> dict[str, Any]:
     """Rows, normalised error and coverage over all joints, `inside` and `outside` of the training range."""
-    spread, found = test.a.std(axis=0), {}
+    spread, found = _spread(test.a), {}
     for name, rows in (("inside", ~outside), ("outside", outside)):
         if rows.any():
             mean, variance, a = predicted.mean[rows], predicted.measurement_variance[rows], test.a[rows]
-            error = metrics.root_mean_square_error(mean, a)[spread > 0.0] / spread[spread > 0.0]
+            error = (metrics.root_mean_square_error(mean, a) / spread)[np.isfinite(spread)]
             covered = metrics.interval_coverage(mean, variance, a, 0.95)
             found[name] = {"rows": int(rows.sum()), "nrmse": float(error.mean()), "coverage_95": float(covered.mean())}
     return found
