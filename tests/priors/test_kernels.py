@@ -57,6 +57,11 @@ class TestDeep(KernelConformance):
     expression = "deep"
 
 
+class TestDeviation(KernelConformance):
+    expression = "deviation"
+    variance_at_the_start = False  # 1e-4 of it
+
+
 class TestSum(KernelConformance):
     expression = "linear + squared-exponential + constant"
 
@@ -230,6 +235,7 @@ def test_a_kernel_of_ones_own(monkeypatch):
         ("periodic", "base_kernel.raw_period_length", math.log(2.0 * math.pi), 0.5),
         ("linear", "raw_variance", math.log(0.6 / 2), 2.0),
         ("constant", "raw_constant", math.log(0.6), 2.0),
+        ("deviation", "raw_outputscale", math.log(0.6e-4), 2.0),
     ],
 )
 def test_hyperpriors_are_normal_in_the_logarithm(expression, part, center, spread):

@@ -17,8 +17,8 @@ from forcegp.priors.tool_forces import ToolPoint, finite_numbers, require_moving
 from forcegp.robots import Robot
 
 AXES = "xyz"
-BASE_INPUTS = ("velocity", "drag", "angular-velocity", "thrust", "actuation", "height", "attitude")
-FROM_ZERO = ("velocity", "drag", "angular-velocity", "thrust", "actuation")  # quantities that are scaled, never shifted
+BASE_INPUTS = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation", "height", "attitude")
+FROM_ZERO = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation")  # quantities that are scaled, never shifted
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class BaseWrench(ExpressedKernels):
     ----------
     frame: the link; None stands for the first that moves freely, the trunk or body of the robot.
     inputs: what the six functions depend on: "velocity" (linear, in the link's axes), "drag" (|velocity| velocity),
-        "angular-velocity", "actuation" (force and torque of all actuators on the free base) or "thrust" (those along z
+        "rotor-drag" (the root of the thrust, as the speed of rotors, times velocity), "angular-velocity", "actuation" (force and torque of all actuators on the free base) or "thrust" (those along z
         and about all axes), "height" of the link over z = 0, and "attitude" (the world's axes in those of the link, in
         which a constant force of the world is linear).
     kernel: an expression of `forcegp.priors.kernel_of`.
@@ -91,6 +91,7 @@ class BaseWrench(ExpressedKernels):
         columns: dict[str, Callable[[], Tensor]] = {
             "velocity": lambda: linear,
             "drag": lambda: (linear.square().sum(-1, keepdim=True) + 1e-12).sqrt() * linear,
+            "rotor-drag": lambda: _root_of_thrust(state) * linear,
             "angular-velocity": lambda: angular,
             "thrust": lambda: state.delivered[..., _base_rows(state.robot)][..., _thrust(state.robot)],
             "actuation": lambda: state.delivered[..., _base_rows(state.robot)],
@@ -122,6 +123,7 @@ class BaseWrench(ExpressedKernels):
         return {
             "velocity": [f"velocity of {link} along its {axis} [m/s]" for axis in AXES],
             "drag": [f"speed times velocity of {link} along its {axis} [m^2/s^2]" for axis in AXES],
+            "rotor-drag": [f"root of thrust times velocity of {link} along its {axis} [N^1/2 m/s]" for axis in AXES],
             "angular-velocity": [f"angular velocity of {link} about its {axis} [rad/s]" for axis in AXES],
             "thrust": pushes[_thrust(robot)],
             "actuation": pushes,
@@ -137,9 +139,9 @@ class BaseWrench(ExpressedKernels):
 class AerodynamicForce(BaseWrench):
     """What air does to a body that flies: drag, changes of thrust with the flow and near the ground, and wind.
 
-    The six functions of `BaseWrench` depend on velocity, speed times velocity, rates, attitude, height and what the
-    actuators deliver, so that a linear kernel holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018) and
-    a thrust that differs from the data sheet. Velocities are those against the air: the fit finds the wind of its rows
+    The six functions of `BaseWrench` depend on velocity, by itself and times speed and rotor speed, rates, attitude,
+    height and what the actuators deliver. So a linear kernel holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE
+    RA-L 2018) and a thrust that differs from the data sheet; "deviation" beside it is what they leave. Velocities are those against the air: the fit finds the wind of its rows
     (`forcegp.data.find_wind`), and where u has no columns of an `ObservedWind`, the air moves with `wind` [m/s, world],
     which the fit sets to the mean of its rows. `forcegp evaluate` and `forcegp rollout` observe the wind of a
     recording, and the force that stays unexplained, from the rows before each (`forcegp.models.observing`). `observe`
@@ -147,7 +149,8 @@ class AerodynamicForce(BaseWrench):
     nothing, neither here nor in the fit.
     """
 
-    inputs: tuple[str, ...] = ("velocity", "drag", "angular-velocity", "thrust", "height", "attitude")
+    inputs: tuple[str, ...] = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "height", "attitude")
+    kernel: str = "linear + deviation"
     observe: float | None = None
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -180,6 +183,11 @@ def _halves(six: Tensor) -> tuple[Tensor, Tensor]:
 
 def _base_rows(robot: Robot) -> slice:
     return robot.layout.groups[0].rows if robot.layout.groups else slice(0, robot.nv)
+
+
+def _root_of_thrust(state: State) -> Float[Tensor, "*batch 1"]:
+    push = state.delivered[..., _base_rows(state.robot)][..., 2:3]
+    return (push.square() + 1e-4).sqrt().sqrt()  # smooth where rotors stand
 
 
 def _thrust(robot: Robot) -> slice:

@@ -75,6 +75,20 @@ def deep(dimension: int, variance: float | Tensor) -> ScaleKernel:
     return kernel
 
 
+DEVIATION = 1e-4
+
+
+def deviation(dimension: int, variance: float | Tensor) -> ScaleKernel:
+    """The squared exponential where it starts, and is expected, with `DEVIATION` of the variance.
+
+    For what a linear law beside it leaves. With an equal part of the variance the squared exponential takes over what
+    the law describes, and gives it up beyond the data: a drone in new wind was off by 8-21 % more after .5 s.
+    """
+    kernel = squared_exponential(dimension, DEVIATION * float64(variance))
+    register_log_normal_prior(kernel, "outputscale", DEVIATION * float64(variance), LOG_VARIANCE_SPREAD)
+    return kernel
+
+
 class NetworkKernel(Kernel):
     """k = exp(-1/2 |e(z) - e(z')|^2) with e(z) = [z / l, h(z)] and units h_k = a_k tanh(4 (w_k . z + b_k)).
 
@@ -253,6 +267,7 @@ KERNELS: dict[str, KernelFactory] = {
     "linear": linear,
     "friction": friction,
     "deep": deep,
+    "deviation": deviation,
 }
 """Kernels that an expression can name: name -> factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`;
 a name may hold anything but white space, parentheses, "+" and "*"."""

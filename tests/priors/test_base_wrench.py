@@ -1,0 +1,34 @@
+"""What the functions of air depend on, written out in NumPy."""
+
+import numpy as np
+import torch
+from tests.data.test_wind import flight
+
+from forcegp import AerodynamicForce
+from forcegp.data import with_wind
+
+
+def test_features_are_those_of_the_formulas():
+    rows = flight([(3.0, -2.0, 0.0)], rows=40)
+    wind = np.array([3.0, -2.0, 0.0])
+    seen = with_wind(rows, np.broadcast_to(wind, (40, 3)))
+    dynamics = seen.system.dynamics(*map(torch.tensor, (seen.q, seen.v, seen.u)))
+    rotation = dynamics.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
+    air = rows.v[:, :3] - np.einsum("nji,nj->ni", rotation, np.broadcast_to(wind, (40, 3)))
+    thrust = rows.u.sum(1, keepdims=True)
+    sides = np.stack([rows.u @ [-0.1, 0.1, 0.1, -0.1], -rows.u @ [0.1, -0.1, 0.1, -0.1]], axis=1)
+    yaw = 0.02 * rows.u @ [1.0, 1.0, -1.0, -1.0]
+    expected = {
+        "velocity": air,
+        "drag": np.linalg.norm(air, axis=1, keepdims=True) * air,
+        "rotor-drag": np.sqrt(thrust) * air,
+        "angular-velocity": rows.v[:, 3:],
+        "thrust": np.concatenate([thrust, sides, yaw[:, None]], axis=1),
+        "height": rows.q[:, 2:3],
+        "attitude": rotation.reshape(-1, 9),
+    }
+    prior = AerodynamicForce()
+    assert prior.inputs == tuple(expected)
+    features = prior.features(dynamics)
+    assert len(features) == 6
+    np.testing.assert_allclose(features[0], np.concatenate(list(expected.values()), axis=1), rtol=1e-5, atol=1e-9)
