@@ -59,7 +59,7 @@ class TestDeep(KernelConformance):
 
 class TestDeviation(KernelConformance):
     expression = "deviation"
-    variance_at_the_start = False  # 1e-4 of it
+    share_at_the_start = 1e-4
 
 
 class TestSum(KernelConformance):
@@ -201,7 +201,7 @@ def test_a_product_has_one_variance():
         ("()", "'\\)' stands where a name is expected"),
         ("liner", "no kernel 'liner' in the registry; did you mean 'linear'"),
         ("constant + perodic", "no kernel 'perodic' in 'constant \\+ perodic'; did you mean 'periodic'"),
-        ("matern", "Valid kernels: constant, deep, friction, linear, matern-1/2"),
+        ("matern", "Valid kernels: constant, deep, deviation, friction, linear, matern-1/2"),
     ],
 )
 def test_wrong_expressions_say_what_is_allowed(expression, message):

@@ -18,7 +18,7 @@ from forcegp.robots import Robot
 
 AXES = "xyz"
 BASE_INPUTS = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation", "height", "attitude")
-FROM_ZERO = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation")  # quantities that are scaled, never shifted
+FROM_ZERO = tuple(name for name in BASE_INPUTS if name not in ("height", "attitude"))  # scaled, never shifted
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,10 @@ class BaseWrench(ExpressedKernels):
     ----------
     frame: the link; None stands for the first that moves freely, the trunk or body of the robot.
     inputs: what the six functions depend on: "velocity" (linear, in the link's axes), "drag" (|velocity| velocity),
-        "rotor-drag" (the root of the thrust, as the speed of rotors, times velocity), "angular-velocity", "actuation" (force and torque of all actuators on the free base) or "thrust" (those along z
-        and about all axes), "height" of the link over z = 0, and "attitude" (the world's axes in those of the link, in
-        which a constant force of the world is linear).
+        "rotor-drag" (the root of the thrust, as the speed of rotors, times velocity), "angular-velocity", "actuation"
+        (force and torque of all actuators on the free base) or "thrust" (those along z and about all axes), "height" of
+        the link over z = 0, and "attitude" (the world's axes in those of the link, in which a constant force of the
+        world is linear).
     kernel: an expression of `forcegp.priors.kernel_of`.
     """
 
@@ -141,12 +142,12 @@ class AerodynamicForce(BaseWrench):
 
     The six functions of `BaseWrench` depend on velocity, by itself and times speed and rotor speed, rates, attitude,
     height and what the actuators deliver. So a linear kernel holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE
-    RA-L 2018) and a thrust that differs from the data sheet; "deviation" beside it is what they leave. Velocities are those against the air: the fit finds the wind of its rows
-    (`forcegp.data.find_wind`), and where u has no columns of an `ObservedWind`, the air moves with `wind` [m/s, world],
-    which the fit sets to the mean of its rows. `forcegp evaluate` and `forcegp rollout` observe the wind of a
-    recording, and the force that stays unexplained, from the rows before each (`forcegp.models.observing`). `observe`
-    is the time in s that the observer of this force looks back; with None it follows the recording, and 0 observes
-    nothing, neither here nor in the fit.
+    RA-L 2018) and a thrust that differs from the data sheet; "deviation" beside it is what they leave. Velocities are
+    those against the air: the fit finds the wind of its rows (`forcegp.data.find_wind`), and where u has no columns of
+    an `ObservedWind`, the air moves with `wind` [m/s, world], which the fit sets to the mean of its rows. `forcegp
+    evaluate` and `forcegp rollout` observe the wind of a recording, and the force that stays unexplained, from the rows
+    before each (`forcegp.models.observing`). `observe` is the time in s that the observer of this force looks back;
+    with None it follows the recording, and 0 observes nothing, neither here nor in the fit.
     """
 
     inputs: tuple[str, ...] = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "height", "attitude")
