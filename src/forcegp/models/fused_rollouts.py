@@ -17,9 +17,10 @@ from torch import Tensor
 from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import ROWS
 from forcegp.codegen.library import in_threads
-from forcegp.errors import NumericalWarning
-from forcegp.integration.integrators import Integrator
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.integration.integrators import Integrator, check_time_step, integrator_named
 from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate, warn_of_divergence
+from forcegp.mechanics import MechanicalSystem
 from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS = sections(__name__, "rollout_steps.c")
@@ -38,6 +39,17 @@ def steps_of(space: ConfigurationSpace) -> dict[str, str]:
     """The steps in C, by integrator, of a robot with these positions."""
     apart = {name: text for name, text in STEPS.items() if name.endswith(ON_A_MANIFOLD) != space.is_vector_space}
     return {name.removesuffix(ON_A_MANIFOLD): text for name, text in apart.items()}
+
+
+def require_step(seconds: object, integrator: str, system: MechanicalSystem) -> None:
+    """Raise InvalidInput for anything but a positive number of seconds, and an integrator that has no step in C."""
+    check_time_step(seconds)
+    integrator_named(integrator, system)
+    there = steps_of(system.robot.space)
+    if integrator not in there:
+        raise InvalidInput(
+            f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, there))} as `integrator`."
+        )
 
 
 def loop_source(method: str, function: str, space: ConfigurationSpace, sizes: tuple[int, int, int]) -> str:
