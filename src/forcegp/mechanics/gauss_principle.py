@@ -50,8 +50,8 @@ def placed(
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
     """In the world: the axes of a link frame, and the position of a point [m] fixed in it."""
     pose = kinematics.frame_pose(frame)
-    axes = pose[..., :3, :3]
-    return axes, axes @ pose.new_tensor(point) + pose[..., :3, 3]
+    axes, local = pose[..., :3, :3], torch.tensor(point, dtype=pose.dtype, device=pose.device)
+    return axes, axes @ local + pose[..., :3, 3]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ be stored with a dataset or a model it also needs an entry in `SURFACES` and pla
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
@@ -73,7 +73,7 @@ class _Flat(Surface):
 
     @override
     def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        return p.new_tensor(self.normal).expand(p.shape)
+        return _tensor(self.normal, p).expand(p.shape)
 
     @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -94,7 +94,7 @@ class Plane(_Flat):
 
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return p @ p.new_tensor(self.normal) - self.offset
+        return p @ _tensor(self.normal, p) - self.offset
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Sphere(_Round):
 
     @override
     def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        return p - p.new_tensor(self.center), torch.eye(3, dtype=p.dtype, device=p.device)
+        return p - _tensor(self.center, p), torch.eye(3, dtype=p.dtype, device=p.device)
 
 
 @dataclass(frozen=True)
@@ -171,9 +171,9 @@ class Cylinder(_Round):
 
     @override
     def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        axis = p.new_tensor(self.axis)
+        axis = _tensor(self.axis, p)
         projector = torch.eye(3, dtype=p.dtype, device=p.device) - torch.outer(axis, axis)
-        return (p - p.new_tensor(self.point)) @ projector, projector
+        return (p - _tensor(self.point, p)) @ projector, projector
 
 
 @dataclass(frozen=True)
@@ -215,6 +215,10 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
             f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
         )
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
+
+
+def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
 def _number(name: str, value: object) -> float:
