@@ -111,7 +111,7 @@ def test_the_bound_is_the_likelihood_with_all_points_and_above_it_with_few(shape
 
 @pytest.mark.parametrize("chunk", [1, 10**9], ids=["a row at a time", "all at once"])
 def test_the_bound_has_the_gradients_of_its_values(chunk, monkeypatch):
-    monkeypatch.setattr("forcegp.inference.inducing.CHUNK_BYTES", chunk)
+    monkeypatch.setattr("forcegp.inference.inducing.BLOCK_BYTES", chunk)
     given = problem(count=4, outputs=3, constraints=1, dimension=2)
     points = [z[:2].clone() for z in given.features]
     names = list(given.kernels.initial_parameters())

@@ -42,9 +42,8 @@ def jacobian(
     graph: Graph, outputs: Sequence[int], inputs: Sequence[int], seeds: Sequence[Sequence[int]] | None = None
 ) -> list[list[int]]:
     """d outputs_i / d inputs_j, (outputs, inputs); with `seeds` (inputs, directions) that matrix times this one."""
-    seeds = (
-        [[ONE if i == j else ZERO for j in range(len(inputs))] for i in range(len(inputs))] if seeds is None else seeds
-    )
+    if seeds is None:
+        seeds = [[ONE if i == j else ZERO for j in range(len(inputs))] for i in range(len(inputs))]
     directions = range(len(seeds[0]) if seeds else 0)
     tangents: dict[int, dict[int, int]] = {
         node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in zip(inputs, seeds, strict=True)

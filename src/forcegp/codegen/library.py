@@ -164,12 +164,10 @@ def load_library(
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     path = own_folder(folder, purpose) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
     if not path.exists():
-        source = write(unit)
+        source, compiled = write(unit), (*OPTIONS, *unit.options, *options)
         try:
             with atomic_file(path) as library:  # whoever else compiles the same meanwhile
-                compile_library(
-                    source, (*OPTIONS, *unit.options, *options), library, "evaluate", purpose
-                )  # tried before it is kept
+                compile_library(source, compiled, library, "evaluate", purpose)  # tried before it is kept
                 library.chmod(0o700)
         except OSError as error:
             raise CompilerError(

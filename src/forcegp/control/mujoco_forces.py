@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from forcegp.codegen.c_text import filled
 from forcegp.codegen.library import Purpose, aligned, default_folder, load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.models.predictor import Predictor
@@ -25,8 +26,8 @@ CALLBACK = """
 static const double *const *tables;
 static int failed;
 void passive(const mjModel *m, mjData *d) {
-  enum {N = JOINTS};
-  static const int position[N] = {POSITIONS}, velocity[N] = {VELOCITIES};
+  enum {N = @JOINTS@};
+  static const int position[N] = {@POSITIONS@}, velocity[N] = {@VELOCITIES@};
   double x[3 * N], y[N];
   (void)m;
   for (int j = 0; j < N; j++) {
@@ -89,10 +90,9 @@ class MujocoForces(Summary):
         codes = code.drawn(predictor.latent, draw, whole_number("seed", seed, 0))
         if codes is None:
             raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
-        text = CALLBACK.replace("JOINTS", str(code.nv))
-        for name, numbers in zip(("POSITIONS", "VELOCITIES"), zip(*places, strict=True), strict=True):
-            text = text.replace(name, ", ".join(map(str, numbers)))
-        source = codes[0].c_source("passive", 1, text)
+        positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
+        words = {"JOINTS": code.nv, "POSITIONS": positions, "VELOCITIES": velocities}
+        source = codes[0].c_source("passive", 1, filled(CALLBACK, words))
         include = f"-I{Path(mujoco.__file__).parent / 'include'}"
         key = json.dumps([source, mujoco.mj_versionString()])
         self._library = load_library("mujoco", key, lambda _: source, default_folder(), PURPOSE, (include,))[0]

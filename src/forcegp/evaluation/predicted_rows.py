@@ -1,21 +1,19 @@
 """Predictions for every row of a Dataset as numpy arrays, made in blocks so that memory stays bounded."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.evaluation.metrics import negative_log_density
 from forcegp.models.prediction import Prediction
 from forcegp.models.protocol import Posterior
-from forcegp.models.search import SMALL_COVARIANCE
+from forcegp.models.search import blas_threads
 
 ROWS_PER_BLOCK = 1024
 Block = TypeVar("Block")
@@ -76,10 +74,8 @@ def in_blocks(
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Block]:
     """What `predict` returns for all rows, some at a time so that memory stays bounded, without gradients."""
-    small = posterior.training.q.numel() <= SMALL_COVARIANCE
     blocks = []
-    # On small matrices threads wait for each other: measured 8 times slower with 2 busy cores.
-    with torch.no_grad(), threadpool_limits(1) if small else nullcontext():
+    with torch.no_grad(), blas_threads(posterior.training.q.numel()):
         for start in range(0, len(dataset), ROWS_PER_BLOCK):
             block = slice(start, min(start + ROWS_PER_BLOCK, len(dataset)))
             blocks.append(predict(block))

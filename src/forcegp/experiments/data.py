@@ -6,23 +6,11 @@ from typing import Any
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
-from forcegp.jobs import Job, JobStore
+from forcegp.jobs import JobStore
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
-SIMULATION_COST = 0.1  # CPU seconds per simulated second, about
 TEST_SEED = 1000  # the test trajectory of seed k has seed k + 1000: other way-points, another noise
-
-
-def data_job(seed: int, *, train_seconds: float, rows: int, test_seconds: float, every: int) -> Job:
-    """`rows` training rows of one trajectory, in the order of farthest-point sampling, and a test trajectory.
-
-    A model that is trained on N points takes the first N rows, as in the paper. The test trajectory is kept whole (for
-    roll-outs); `every` sets which of its rows are scored.
-    """
-    spec = {"seed": seed, "train_seconds": train_seconds, "rows": rows, "test_seconds": test_seconds, "every": every}
-    cost = SIMULATION_COST * (train_seconds + test_seconds) + 2e-5 * rows * train_seconds
-    return Job(f"data/seed{seed}", "forcegp.experiments.data:simulate", spec, cost=cost)
 
 
 def simulated(seed: int, seconds: float, **scenario: Any) -> Dataset:

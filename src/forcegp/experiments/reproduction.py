@@ -4,7 +4,7 @@ import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -184,7 +184,7 @@ def reproduce(
             "forcegp_version": __version__,
             "preset": preset,
             "command": command,
-            "config": experiment.config(),
+            "config": asdict(experiment),
             "figures": list(figures),
             "machines": sorted({job["machine"] for job in stored.values()}),
             "cpu_seconds": {name: job["cpu_seconds"] for name, job in stored.items()},

@@ -131,8 +131,10 @@ class Inducing(Engine):
     refine: int = 20
 
     def __post_init__(self) -> None:
-        _require_whole(self, 1, "points")
-        _require_whole(self, 0, "refine")
+        for name, least in (("points", 1), ("refine", 0)):
+            given = getattr(self, name)
+            if isinstance(given, bool) or not isinstance(given, int) or given < least:
+                raise InvalidInput(f"Inducing {name} is {given!r}; it must be a whole number >= {least}")
         tolerance = self.tolerance
         if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance >= 0.0:
             raise InvalidInput(f"Inducing tolerance is {tolerance!r}; it must be at least 0")
@@ -238,10 +240,3 @@ def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = T
     many = Inducing(points=MANY_POINTS, refine=0)  # on all rows an iteration would take half a minute
     many.require_memory(size, device)
     return Choice(many, f"inducing: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")
-
-
-def _require_whole(engine: Engine, least: int, *names: str) -> None:
-    for name in names:
-        given = getattr(engine, name)
-        if isinstance(given, bool) or not isinstance(given, int) or given < least:
-            raise InvalidInput(f"{type(engine).__name__} {name} is {given!r}; it must be a whole number >= {least}")

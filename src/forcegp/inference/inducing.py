@@ -33,7 +33,7 @@ from forcegp.errors import NumericalError
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
 from forcegp.inference.likelihood import Terms, whiten
-from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 
 ROUNDING = 1e-13
 """Remainders below this fraction of the largest k(z, z) are rounding."""
@@ -69,10 +69,6 @@ def pivoted_cholesky(
             remainder[pivot] = 0.0
             indices.append(pivot)
         return torch.tensor(indices, dtype=torch.long, device=z.device)
-
-
-BLOCK_BYTES = 64 * 2**20
-"""Working memory of one block of points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,9 +190,6 @@ def with_left_out(C: Float[Tensor, "N r C"], left_out: Float[Tensor, "N C"]) -> 
     D = (C * left_out[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
     return torch.cholesky_inverse(torch.linalg.cholesky(D))
 
-
-CHUNK_BYTES = 64 * 2**20
-"""Working memory of one block of rows."""
 
 CANDIDATES = 20_000
 """Rows among which inducing points are sought."""
@@ -321,7 +314,7 @@ def collapsed_bound(
     W_white, y_white, log_noise = whiten(W, residual, noise)
     lowers = [_lower(K) for K in kernels.crosses(parameters, points, points)]
     total = sum(len(lower) for lower in lowers)
-    height = max(1, CHUNK_BYTES // (8 * max(1, total) * 4))
+    height = max(1, BLOCK_BYTES // (8 * max(1, total) * 4))
     products = W.new_zeros(total, total)
     right, left_out, prior = W.new_zeros(total), W.new_zeros(()), W.new_zeros(())
     for start in range(0, count, height):

@@ -8,7 +8,7 @@ read from the one small pseudo-inverse A~^+, which also covers redundant constra
 H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -45,6 +45,15 @@ class Row(NamedTuple):
     drift: Tensor | None
 
 
+def placed(
+    kinematics: Kinematics, frame: str, point: Sequence[float]
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """In the world: the axes of a link frame, and the position of a point [m] fixed in it."""
+    pose = kinematics.frame_pose(frame)
+    axes, local = pose[..., :3, :3], torch.tensor(point, dtype=pose.dtype, device=pose.device)
+    return axes, axes @ local + pose[..., :3, 3]
+
+
 @dataclass(frozen=True)
 class Contact:
     """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
@@ -77,9 +86,7 @@ class Contact:
 
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:
         """World position p(q) of the contact point (..., 3) in m."""
-        pose = kinematics.frame_pose(self.frame)
-        local = torch.tensor(self.point, dtype=pose.dtype, device=pose.device)
-        return pose[..., :3, :3] @ local + pose[..., :3, 3]
+        return placed(kinematics, self.frame, self.point)[1]
 
     def distance(self, kinematics: Kinematics) -> Float[Tensor, "*batch"]:
         """c(q) = s(p(q)): 0 where the constraint holds."""

@@ -22,6 +22,14 @@ from forcegp.robots.arguments import by_joint
 PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
 
 
+def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:
+    """A tensor in float64 on the robot's device. Raises InvalidInput, with what to give, for what has no numbers."""
+    try:
+        return torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(f"{name} is {given!r}; give {remedy}.") from None
+
+
 class KnownForce(ABC):
     """A joint force that the model takes as given."""
 
@@ -55,12 +63,7 @@ class KnownForce(ABC):
     def _bound(self, name: str, robot: Robot) -> Tensor:
         what = f"{type(self).__name__} {name}"
         given = by_joint(getattr(self, name), robot.joint_names, robot.name)
-        try:
-            values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
-        except (TypeError, ValueError, RuntimeError):
-            raise InvalidInput(
-                f"{what} is {given!r}; give a number, one per joint, or a mapping from joint names."
-            ) from None
+        values = as_numbers(what, given, robot, "a number, one per joint, or a mapping from joint names")
         if values.dim() == 0:  # one number for every joint, but not for bases that move
             driven = [joint in robot.single_joint_names or name in self.positive for joint in robot.joint_names]
             values = values * torch.tensor(driven, dtype=values.dtype, device=values.device)
@@ -101,10 +104,7 @@ class Actuation(KnownForce):
             driven = [row for row in range(robot.nv) if row not in free]
             matrix = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)[:, driven]
             return Actuation(matrix, tuple(robot.joint_names[row] for row in driven))
-        try:
-            matrix = torch.as_tensor(self.matrix, dtype=torch.float64, device=robot.device)
-        except (TypeError, ValueError, RuntimeError):
-            raise InvalidInput(f"Actuation matrix is {self.matrix!r}; give {robot.nv} rows of numbers.") from None
+        matrix = as_numbers("Actuation matrix", self.matrix, robot, f"{robot.nv} rows of numbers")
         names = tuple(self.names) or tuple(f"actuator_{k + 1}" for k in range(matrix.shape[-1] if matrix.dim() else 0))
         if matrix.dim() != 2 or len(matrix) != robot.nv or not bool(torch.isfinite(matrix).all()):
             raise InvalidInput(
@@ -281,10 +281,7 @@ class RotorInertia(KnownForce):
     @override
     def bound_to(self, robot: Robot) -> KnownForce:
         given = torch.eye(robot.nv).tolist() if self.transmission is None else self.transmission
-        try:
-            matrix = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
-        except (TypeError, ValueError, RuntimeError):
-            raise InvalidInput(f"RotorInertia transmission is {given!r}; give {robot.nv} rows of numbers.") from None
+        matrix = as_numbers("RotorInertia transmission", given, robot, f"{robot.nv} rows of numbers")
         if matrix.shape != (robot.nv, robot.nv) or not bool(torch.isfinite(matrix).all()):
             raise InvalidInput(
                 f"RotorInertia transmission has shape {tuple(matrix.shape)}; {robot.name} needs a finite matrix "

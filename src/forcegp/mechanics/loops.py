@@ -19,7 +19,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.mechanics.gauss_principle import AXES, Contact, Row
+from forcegp.mechanics.gauss_principle import AXES, Contact, Row, placed
 from forcegp.mechanics.surfaces import Held
 from forcegp.robots import Kinematics
 from forcegp.robots.arguments import finite_vector
@@ -57,10 +57,14 @@ class LoopClosure(Contact):
     def more(self) -> dict[str, object]:
         return dict(zip(SECOND, (self.second_frame, list(self.second_point), self.turning), strict=True))
 
+    @property
+    def _ends(self) -> tuple[tuple[str, Point], tuple[str, Point]]:
+        return (self.frame, self.point), (self.second_frame, self.second_point)
+
     @override
     def distance(self, kinematics: Kinematics) -> Float[Tensor, "*batch"]:
         """n^T (p_a - p_b) in m, or the error of the orientation about n: 0 where the loop is closed."""
-        (R_a, p_a), (R_b, p_b) = self._poses(kinematics)
+        (R_a, p_a), (R_b, p_b) = (placed(kinematics, *end) for end in self._ends)
         if not self.turning:
             return self._along(p_a - p_b)
         turn = R_a @ R_b.mT
@@ -70,26 +74,17 @@ class LoopClosure(Contact):
     @override
     def row(self, kinematics: Kinematics, v: Float[Tensor, "*batch nv"] | None = None) -> Row:
         rows = slice(3, 6) if self.turning else slice(0, 3)
-        ends = (self.frame, self.point), (self.second_frame, self.second_point)
-        J_a, J_b = (kinematics.frame_jacobian(*end)[..., rows, :] for end in ends)
+        J_a, J_b = (kinematics.frame_jacobian(*end)[..., rows, :] for end in self._ends)
         normal = self.surface.gradient(self.position(kinematics))
         A = (normal[..., None, :] @ (J_a - J_b))[..., 0, :]
         drift = None
         if v is not None:
-            a, b = (kinematics.frame_bias_acceleration(*end)[..., rows] for end in ends)
+            a, b = (kinematics.frame_bias_acceleration(*end)[..., rows] for end in self._ends)
             drift = self._along(a - b)
         return Row(self.distance(kinematics), A, normal, drift)
 
     def _along(self, vector: Tensor) -> Tensor:
         return (vector * self.surface.gradient(vector)).sum(-1)
-
-    def _poses(self, kinematics: Kinematics) -> list[tuple[Tensor, Tensor]]:
-        found = []
-        for frame, point in ((self.frame, self.point), (self.second_frame, self.second_point)):
-            pose = kinematics.frame_pose(frame)
-            local = torch.tensor(point, dtype=pose.dtype, device=pose.device)
-            found.append((pose[..., :3, :3], pose[..., :3, :3] @ local + pose[..., :3, 3]))
-        return found
 
 
 def loop_point(

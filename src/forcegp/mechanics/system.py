@@ -14,13 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
-from forcegp.mechanics.known_forces import (
-    KNOWN_FORCES,
-    Actuation,
-    KnownForce,
-    RigidBodyBias,
-    known_force_to_dict,
-)
+from forcegp.mechanics.known_forces import KNOWN_FORCES, Actuation, KnownForce, RigidBodyBias, known_force_to_dict
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import OBSERVED, Thrusters
@@ -260,9 +254,8 @@ class MechanicalSystem(Summary):
             )
         violation, relative = self._contradiction(self.dynamics(q, v, u))
         doubtful = torch.nonzero(~(relative <= CONSISTENCY_TOLERANCE).all(-1))[:, 0]
-        if len(
-            doubtful
-        ):  # measured velocities leave centripetal accelerations where two points of one link stand still
+        if len(doubtful):
+            # measured velocities leave centripetal accelerations where two points of one link stand still
             dynamics = self.dynamics(q[doubtful], v[doubtful], u[doubtful])
             moving = dynamics.pseudo_inverse @ (dynamics.A @ v[doubtful][..., None])
             allowed = v[doubtful] - (dynamics.inverse_lower.mT @ moving)[..., 0]

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.mechanics.gauss_principle import State
-from forcegp.mechanics.known_forces import KNOWN_FORCES, KnownForce
+from forcegp.mechanics.known_forces import KNOWN_FORCES, KnownForce, as_numbers
 from forcegp.robots import Robot
 
 
@@ -143,10 +143,7 @@ KNOWN_FORCES["observed-wind"] = ObservedWind
 
 
 def _numbers(name: str, given: object, robot: Robot) -> Tensor:
-    try:
-        values = torch.as_tensor(given, dtype=torch.float64, device=robot.device)
-    except (TypeError, ValueError, RuntimeError):
-        raise InvalidInput(f"Thrusters {name} is {given!r}; give numbers.") from None
+    values = as_numbers(f"Thrusters {name}", given, robot, "numbers")
     if not bool(torch.isfinite(values).all()):
         raise InvalidInput(f"Thrusters {name} is {given!r}; give finite numbers.")
     return values

@@ -22,9 +22,8 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.c_files import CFiles, Check, identifier
-from forcegp.models.fused_rollouts import steps_of
+from forcegp.models.fused_rollouts import require_step
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -94,14 +93,7 @@ def export_c(
         )
     posterior = posterior.to("cpu") if posterior.training.q.device.type != "cpu" else posterior
     if steps is not None:
-        check_time_step(steps)
-        integrator_named(integrator, posterior.system)
-        space = posterior.system.robot.space
-        if integrator not in steps_of(space):
-            raise InvalidInput(
-                f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, steps_of(space)))} as "
-                "`integrator`."
-            )
+        require_step(steps, integrator, posterior.system)
         if jacobian and len({*posterior.system.sizes}) > 1:
             raise InvalidInput(
                 "derivatives of exported steps need a base that is fixed and one input per joint; export `jacobian` "

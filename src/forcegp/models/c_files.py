@@ -75,25 +75,21 @@ class CFiles:
         space = self.code.space
         given = self.integrator, self._stepped, space, self.code.sizes
         stepped = "" if self.dt is None else step_source(*given)
-        words: dict[str, object] = {
-            "NAME": self.name,
-            "NV": nv,
-            "NQ": nq,
-            "NU": nu,
-            "DT": self.dt,
-            "TITLE": self._title,
-        }
+        words: dict[str, object] = {"NAME": self.name, "NV": nv, "NQ": nq, "NU": nu, "DT": self.dt}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
         words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
         words |= {"COMMENT": self._comment(said), "GIVEN": 0, "IMPLICIT": int(self.integrator == "implicit-midpoint")}
         words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
-        words |= self._sizes(sections(__name__, "exported_c/sizes.c"))
+        moving = not space.is_vector_space
+        words |= {"ALL": nq + nv + nu, "X": nq + nv, "COLUMNS": 2 * nv + nu, "TITLE": self._title}
+        words["STATE"] = "step from q, v, u" if moving else "q, v, u"
+        words["ADVANCE"] = sections(__name__, "exported_c/advance.c")["turned" if moving else "added"]
         if "covariance" in self.kinds:
             words["GIVEN"] = len(self.code.program("covariance").nodes)
         words = {word: filled(str(value), words) for word, value in words.items()}
-        moves = () if space.is_vector_space else ("integrate",)
-        functions = filled("".join(program[kind] for kind in (*moves, *self.kinds)), words)
+        kinds = (*(("integrate",) if moving else ()), *self.kinds)
+        functions = filled("".join(program[kind] for kind in kinds), words)
         prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
         words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
         parts = [filled(program["head"], words), *self._program(), filled(program["calls"], words), functions]
@@ -103,10 +99,8 @@ class CFiles:
         }
         for form in ("external", "acados") if self.dt is not None else ("external",):
             found = sections(__name__, f"exported_c/{form}.c")
-            kinds = (
-                self.kinds if nq == nv == nu else [kind for kind in self.kinds if kind != "linearize"]
-            )  # of one size
-            chosen = "".join(found[kind] for kind in ("head", *kinds) if kind in found)
+            usable = [kind for kind in self.kinds if kind != "linearize" or nq == nv == nu]  # of one size
+            chosen = "".join(found[kind] for kind in ("head", *usable) if kind in found)
             files[f"{self.name}_{form}.c"] = filled(chosen, words)
         files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
         for file, content in files.items():
@@ -115,41 +109,6 @@ class CFiles:
     def split(self, rows: np.ndarray) -> list[np.ndarray]:
         """q, v and u (..., size) of rows."""
         return np.split(rows, np.cumsum(self.code.sizes)[:2], axis=-1)
-
-    def _sizes(self, texts: dict[str, str]) -> dict[str, object]:
-        """Sizes of arrays as the templates write them: by the number of joints, where all are that."""
-        nq, nv, nu = self.code.sizes
-        n, columns, moving = f"{nv}", 2 * nv + nu, not self.code.space.is_vector_space
-        words: dict[str, object] = {"ADVANCE": texts["turned" if moving else "added"], "STATE": "q, v, u", "NAMED": ""}
-        if nq == nv == nu:
-            words |= {"ALL": f"3 * {n}", "AT_U": f"2 * {n}", "X": f"2 * {n}", "SLOPES_SIZE": f"3 * {n} * {n}"}
-            more = {
-                "COLUMNS": "3 NV",
-                "POSITIONS": "",
-                "ROWS": "3 * N",
-                "Q": "N",
-                "U": "N",
-                "X_SIZE": "2 * N",
-                "Y": "3 * N * N",
-            }
-            return words | more | {"MORE": "", "ZEROS": "2 * N"}
-        words |= {
-            "ALL": nq + nv + nu,
-            "AT_U": nq + nv,
-            "X": nq + nv,
-            "SLOPES_SIZE": f"{nv} * {columns}",
-            "ROWS": "NQ + N + NU",
-        }
-        words |= {"COLUMNS": columns, "POSITIONS": f"NQ = {nq}, NU = {nu}, ", "MORE": f", NQ = {nq}, NU = {nu}"}
-        words |= {
-            "Q": "NQ",
-            "U": "NU",
-            "X_SIZE": "NQ + N",
-            "ZEROS": "NQ + N + NU",
-            "Y": f"N * {columns}",
-            "NAMED": texts["named"],
-        }
-        return words | ({"STATE": "step from q, v, u"} if moving else {})
 
     @property
     def _stepped(self) -> str:

@@ -21,10 +21,9 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
-from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.models.c_export import exported_code
 from forcegp.models.c_files import identifier
-from forcegp.models.fused_rollouts import steps_of
+from forcegp.models.fused_rollouts import require_step
 from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Posterior
 from forcegp.models.structured.posterior import StructuredPosterior
@@ -64,19 +63,15 @@ def casadi_function(
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
-    results, names, space = [_physics(casadi, code)(*x, f)], ["a"], code.space
+    given = *code.sizes, sum(len(part.latents) for part in code.sums)
+    results, names, space = [_function(casadi, "physics", code.physics, code.a, given)(*x, f)], ["a"], code.space
     acceleration = casadi.Function(name, x, results, ["q", "v", "u"], names)
     if steps is None:
         if space.is_vector_space:
             return acceleration
         moved = _of_space(casadi, lambda q, v: (space.tangent(q) @ v[..., None])[..., 0], code.sizes[:2])
         return casadi.Function(name, x, [*results, moved(*x[:2])], ["q", "v", "u"], [*names, "q_dot"])
-    check_time_step(steps)
-    integrator_named(integrator, posterior.system)
-    if integrator not in steps_of(space):
-        raise InvalidInput(
-            f"a step in CasADi is not {integrator!r}; give one of {', '.join(map(repr, steps_of(space)))}."
-        )
+    require_step(steps, integrator, posterior.system)
     there = _stepped(casadi, code, acceleration, x, float(steps), integrator)
     return casadi.Function(name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
 
@@ -139,9 +134,7 @@ def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: 
     """A function of two vectors that torch computes, such as positions and a step, as one of scalars."""
     examples = [torch.zeros(size, dtype=torch.float64) for size in sizes]
     graph, (found,) = trace(lambda x, y: [function(x, y)], examples)
-    vectors = [casadi.SX.sym(symbol, size) for symbol, size in zip("xy", sizes, strict=True)]
-    scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
-    return casadi.Function("moved", vectors, [casadi.vertcat(*expressed(casadi, graph, found.tolist(), scalars))])
+    return _function(casadi, "moved", graph, found.tolist(), sizes)
 
 
 def _stepped(
@@ -170,26 +163,21 @@ def _stepped(
     return [q + dt * middle, 2.0 * middle - v]
 
 
-def _physics(casadi: Any, code: PredictorCode) -> Any:
-    """(q, v, u, f) -> a by scalars."""
-    graph = code.physics
-    vectors = [casadi.SX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
-    vectors.append(casadi.SX.sym("f", sum(len(part.latents) for part in code.sums)))
+def _function(casadi: Any, name: str, graph: Graph, nodes: Sequence[int], sizes: Sequence[int]) -> Any:
+    """Nodes of a graph as a function, by scalars, of vectors of these sizes, which together are its inputs."""
+    vectors = [casadi.SX.sym(f"x{number}", size) for number, size in enumerate(sizes)]
     scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
-    return casadi.Function("physics", vectors, [casadi.vertcat(*expressed(casadi, graph, code.a, scalars))])
+    return casadi.Function(name, vectors, [casadi.vertcat(*expressed(casadi, graph, nodes, scalars))])
 
 
 def _latents(casadi: Any, code: PredictorCode, x: Sequence[Any]) -> list[Any]:
     """E f of every process in the order of their numbers."""
     graph, found = Graph(sum(code.sizes)), {}
     copied = Copier(graph, code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
-    vectors = [casadi.SX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
-    scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
     for part in code.sums:
         summed = part.summed if isinstance(part, OneInputCall) else part
         given = summed.given(graph, copied(code.features[summed.latents[0]]))
-        operands = expressed(casadi, graph, given, scalars)
-        z = casadi.Function("operands", vectors, [casadi.vertcat(*operands)])(*x)
+        z = _function(casadi, "operands", graph, given, code.sizes)(*x)
         found |= dict(zip(summed.latents, _sum(casadi, summed, casadi.vertsplit(z)), strict=True))
     return [found[c] for c in sorted(found)]
 

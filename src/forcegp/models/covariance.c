@@ -1,10 +1,10 @@
 
 static APART void covariance(const double *const *t, const double *y, double *out) {
-  enum {N = JOINTS, C = LATENTS, K = RANK};
+  enum {N = @JOINTS@, C = @LATENTS@, K = @RANK@};
   const double *W = y, *d = y + N * C;
   double P[C * K], Q[N * K];
   memset(P, 0, sizeof P);
-  ROOTS
+  @ROOTS@
   memset(Q, 0, sizeof Q);
   for (int a = 0; a < N; a++) for (int c = 0; c < C; c++) for (int r = 0; r < K; r += LANES)
     STORE(Q + a * K + r, LOAD(Q + a * K + r) + W[a * C + c] * LOAD(P + c * K + r));
@@ -22,7 +22,7 @@ static APART void covariance(const double *const *t, const double *y, double *ou
     for (; r < K; r += LANES) s += LOAD(x + r) * LOAD(z + r);
     s = (s + s1) + (s2 + s3);
     for (int c = 0; c < C; c++) prior += W[a * C + c] * d[c] * W[b * C + c];
-    prior = WIDENED * (prior - TOTAL(s));
+    prior = @WIDENED@ * (prior - TOTAL(s));
     out[a * N + b] = prior; out[b * N + a] = prior; /* the same place with one joint */
   }
 }

@@ -14,12 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.codegen.c_text import c_text, sections
+from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import ROWS
 from forcegp.codegen.library import in_threads
-from forcegp.errors import NumericalWarning
-from forcegp.integration.integrators import Integrator
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.integration.integrators import Integrator, check_time_step, integrator_named
 from forcegp.integration.trajectory import SPEED_LIMIT, Trajectory, check_start, integrate, warn_of_divergence
+from forcegp.mechanics import MechanicalSystem
 from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS = sections(__name__, "rollout_steps.c")
@@ -31,8 +32,7 @@ ON_A_MANIFOLD = "-on-a-manifold"
 
 def step_source(method: str, function: str, space: ConfigurationSpace, sizes: tuple[int, int, int]) -> str:
     """The text of a step that calls `function`, whose slopes are those in a step from q, v and u."""
-    columns = "3 * N" if len({*sizes}) == 1 else f"{2 * sizes[1] + sizes[2]}"
-    return steps_of(space)[method].replace("PROGRAM", function).replace("COLUMNS", columns)
+    return filled(steps_of(space)[method], {"PROGRAM": function, "COLUMNS": 2 * sizes[1] + sizes[2]})
 
 
 def steps_of(space: ConfigurationSpace) -> dict[str, str]:
@@ -41,16 +41,24 @@ def steps_of(space: ConfigurationSpace) -> dict[str, str]:
     return {name.removesuffix(ON_A_MANIFOLD): text for name, text in apart.items()}
 
 
+def require_step(seconds: object, integrator: str, system: MechanicalSystem) -> None:
+    """Raise InvalidInput for anything but a positive number of seconds, and an integrator that has no step in C."""
+    check_time_step(seconds)
+    integrator_named(integrator, system)
+    there = steps_of(system.robot.space)
+    if integrator not in there:
+        raise InvalidInput(
+            f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, there))} as `integrator`."
+        )
+
+
 def loop_source(method: str, function: str, space: ConfigurationSpace, sizes: tuple[int, int, int]) -> str:
     """The C function `evaluate` of a loop whose steps call `function`, which for implicit ones gives slopes, too."""
     nq, nv, nu = sizes
     outputs = nv + nv * (2 * nv + nu) if method == "implicit-midpoint" else nv
-    step = step_source(method, function, space, sizes)
-    text = ROWS + c_text(__name__, "rollout_loop.c").replace("STEP", step, 1)
-    numbers = {"JOINTS": nv, "POSITIONS": nq, "GIVEN": nu, "OUTPUTS": outputs, "LIMIT": repr(SPEED_LIMIT)}
-    for name, value in numbers.items():
-        text = text.replace(name, str(value))
-    return text
+    words = {"JOINTS": nv, "POSITIONS": nq, "GIVEN": nu, "OUTPUTS": outputs, "LIMIT": SPEED_LIMIT}
+    words |= {"STEP": step_source(method, function, space, sizes)}
+    return ROWS + filled(c_text(__name__, "rollout_loop.c"), words)
 
 
 def fused(

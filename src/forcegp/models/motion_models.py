@@ -17,7 +17,7 @@ class MotionModel(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """What kind of model it is, in a few words."""
+        """What kind of model it is, in a few words, for titles and tables."""
 
     def refined_on_motions(
         self: AnyModel,

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.codegen.c_text import c_text
+from forcegp.codegen.c_text import c_text, filled
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph
@@ -196,11 +196,8 @@ class PredictorCode:
         for k, part in enumerate(self.sums):
             calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
             first, place = first + len(part.latents), place + len(part.operands)
-        sizes = {"JOINTS": self.nv, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
-        text = c_text(__name__, "covariance.c").replace("  ROOTS", "  " + "\n  ".join(calls))
-        for name, value in sizes.items():
-            text = text.replace(name, str(value))
-        return text
+        words = {"JOINTS": self.nv, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
+        return filled(c_text(__name__, "covariance.c"), words | {"ROOTS": "\n  ".join(calls)})
 
     @property
     def rank(self) -> int:

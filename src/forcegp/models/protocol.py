@@ -69,11 +69,6 @@ class Posterior(MotionModel, Summary, ABC):
     def noise_std(self) -> Float[Tensor, "nv"]:
         """Standard deviation of the acceleration noise per joint, given, learned or estimated."""
 
-    @property
-    @abstractmethod
-    def description(self) -> str:
-        """The model in a few words, for titles and tables."""
-
     @cached_property
     @abstractmethod
     def negative_log_likelihood(self) -> float:

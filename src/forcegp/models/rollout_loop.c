@@ -1,8 +1,8 @@
 
 int evaluate(long first, long last, const double *const *t, long steps, double dt, const double *start_q,
              const double *start_v, const double *u, double *Q, double *V, double *A, long long *ended) {
-  enum {N = JOINTS, NQ = POSITIONS, NU = GIVEN, ROUNDS = 60};
-  real x[NQ + N + NU], y[OUTPUTS], q1[NQ], v1[N], a[N], q0[NQ], v0[N], m[N], d[N];
+  enum {N = @JOINTS@, NQ = @POSITIONS@, NU = @GIVEN@, ROUNDS = 60};
+  real x[NQ + N + NU], y[@OUTPUTS@], q1[NQ], v1[N], a[N], q0[NQ], v0[N], m[N], d[N];
   (void)q0; (void)v0; (void)m; (void)d;
   for (long i = first; i < last; i += LANES) {
     const long live = last - i < LANES ? last - i : LANES;
@@ -26,12 +26,12 @@ int evaluate(long first, long last, const double *const *t, long steps, double d
       real qs[NQ], vs[N];
       for (int j = 0; j < NQ; j++) qs[j] = x[j];
       for (int j = 0; j < N; j++) vs[j] = x[NQ + j];
-      { STEP }
+      { @STEP@ }
       real fast = R(0.0), none = R(0.0);
       for (int j = 0; j < N; j++) fast += v1[j] * v1[j];
       for (int j = 0; j < NQ; j++) none += q1[j] - q1[j];
       int usual = going == (1 << live) - 1;
-      for (int k = 0; k < live; k++) usual &= AT(fast, k) <= LIMIT * LIMIT && AT(none, k) == 0.0;
+      for (int k = 0; k < live; k++) usual &= AT(fast, k) <= @LIMIT@ * @LIMIT@ && AT(none, k) == 0.0;
       if (usual) {
         for (int j = 0; j < NQ; j++) x[j] = q1[j];
         for (int j = 0; j < N; j++) x[NQ + j] = v1[j];
@@ -47,7 +47,7 @@ int evaluate(long first, long last, const double *const *t, long steps, double d
         for (int j = 0; j < NQ; j++) finite &= AT(q1[j], k) - AT(q1[j], k) == 0.0;
         for (int j = 0; j < N; j++) {
           finite &= AT(v1[j], k) - AT(v1[j], k) == 0.0;
-          slow &= fabs(AT(v1[j], k)) <= LIMIT;
+          slow &= fabs(AT(v1[j], k)) <= @LIMIT@;
           A[((i + k) * steps + s) * N + j] = before ? AT(a[j], k) : NAN;
         }
         if (before && !(finite && slow)) { going &= ~(1 << k); ended[i + k] = finite ? s + 1 : -2 - (s + 1); }

@@ -1,11 +1,11 @@
 //// symplectic-euler
 
-      PROGRAM(t, live, x, y);
+      @PROGRAM@(t, live, x, y);
       for (int j = 0; j < N; j++) { a[j] = y[j]; v1[j] = x[N + j] + dt * y[j]; q1[j] = x[j] + dt * v1[j]; }
 //// symplectic-euler-on-a-manifold
 
       real z[NQ + N];
-      PROGRAM(t, live, x, y);
+      @PROGRAM@(t, live, x, y);
       for (int j = 0; j < NQ; j++) z[j] = x[j];
       for (int j = 0; j < N; j++) { a[j] = y[j]; v1[j] = x[NQ + j] + dt * y[j]; z[NQ + j] = dt * v1[j]; }
       moved(t, live, z, q1);
@@ -18,7 +18,7 @@
       for (int s = 0; s < 4; s++) {
         for (int j = 0; j < N; j++) { p[j] = z[NQ + j] = c[s] * r[j]; p[N + j] = x[NQ + j] = v0[j] + c[s] * y[j]; }
         if (s) { moved(t, live, z, x); step_rate(t, live, p, r); }
-        PROGRAM(t, live, x, y);
+        @PROGRAM@(t, live, x, y);
         for (int j = 0; j < N; j++) {
           if (!s) a[j] = y[j];
           sum[j] += b[s] * r[j]; v1[j] += b[s] * y[j];
@@ -32,7 +32,7 @@
       for (int j = 0; j < N; j++) { q0[j] = q1[j] = x[j]; v0[j] = v1[j] = x[N + j]; y[j] = R(0.0); }
       for (int s = 0; s < 4; s++) {
         for (int j = 0; j < N; j++) { x[j] = q0[j] + c[s] * x[N + j]; x[N + j] = v0[j] + c[s] * y[j]; }
-        PROGRAM(t, live, x, y);
+        @PROGRAM@(t, live, x, y);
         for (int j = 0; j < N; j++) {
           if (!s) a[j] = y[j];
           q1[j] += b[s] * x[N + j]; v1[j] += b[s] * y[j];
@@ -44,11 +44,11 @@
       double length[LANES]; int done[LANES];
       for (int j = 0; j < N; j++) { q0[j] = x[j]; v0[j] = m[j] = x[N + j]; d[j] = R(0.0); }
       for (int k = 0; k < LANES; k++) { length[k] = 1.0; done[k] = 0; }
-      PROGRAM(t, live, x, y);
+      @PROGRAM@(t, live, x, y);
       for (int j = 0; j < N; j++) a[j] = y[j];
       for (int round = 0; round < ROUNDS; round++) {
         for (int j = 0; j < N; j++) { x[j] = q0[j] + h * m[j]; x[N + j] = m[j]; }
-        PROGRAM(t, live, x, y);
+        @PROGRAM@(t, live, x, y);
         int left = 0;
         for (int k = 0; k < live; k++) {
           double J[N][N], r[N], turned = 0.0, size = 0.0, step = 0.0, all = 0.0;
@@ -56,7 +56,7 @@
           for (int i = 0; i < N; i++) {
             r[i] = -(AT(m[i], k) - AT(v0[i], k) - h * AT(y[i], k));
             for (int j = 0; j < N; j++)
-              J[i][j] = (i == j) - h * (AT(y[N + COLUMNS * i + N + j], k) + h * AT(y[N + COLUMNS * i + j], k));
+              J[i][j] = (i == j) - h * (AT(y[N + @COLUMNS@ * i + N + j], k) + h * AT(y[N + @COLUMNS@ * i + j], k));
           }
           for (int p = 0; p < N; p++) {
             int best = p;

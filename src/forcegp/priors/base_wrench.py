@@ -85,7 +85,7 @@ class BaseWrench(ExpressedKernels):
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         state, where = dynamics.state, self._point(dynamics)
-        moving, turning = _halves(where.velocity(state.v))
+        moving, turning = where.velocity(state.v).split(3, dim=-1)
         linear, angular = (
             (where.orientation.mT @ part[..., None])[..., 0] for part in (moving - self._flow(state), turning)
         )
@@ -176,10 +176,6 @@ class AerodynamicForce(BaseWrench):
     def _flow(self, state: State) -> Tensor | float:
         wind = ObservedWind.at(state)
         return state.v.new_tensor(self.wind) if wind is None else wind
-
-
-def _halves(six: Tensor) -> tuple[Tensor, Tensor]:
-    return six[..., :3], six[..., 3:]
 
 
 def _base_rows(robot: Robot) -> slice:

@@ -171,54 +171,44 @@ ELSEWHERE = {
 _TOKEN = re.compile(r"[()+*]|[^()+*\s]+")
 
 
-class KernelExpression:
-    """An expression, read once. Raises InvalidInput for unknown names or a wrong form, with what is allowed."""
+def kernel_factory(expression: str) -> KernelFactory:
+    """The kernel of an expression. Raises InvalidInput for unknown names or a wrong form, with what is allowed."""
+    tokens = _TOKEN.findall(expression)
 
-    def __init__(self, expression: str) -> None:
-        self.expression = expression
-        self._tokens = _TOKEN.findall(expression)
-        self.build = self._sum()
-        if self._tokens:
-            raise self._wrong(f"{self._tokens[0]!r} is not expected there")
+    def wrong(what: str) -> InvalidInput:
+        return InvalidInput(
+            f"the kernel {expression!r} cannot be read: {what}; write names joined by '+' and '*', with "
+            f"parentheses where needed. Names: {', '.join(sorted(KERNELS))}"
+        )
 
-    def _sum(self) -> KernelFactory:
-        terms = [self._product()]
-        while self._accept("+"):
-            terms.append(self._product())
-        return terms[0] if len(terms) == 1 else lambda d, variance: _sum_of(terms, d, variance)
+    def joined(separator: str, read: Callable[[], KernelFactory], join: Callable[..., Kernel]) -> KernelFactory:
+        parts = [read()]
+        while tokens[:1] == [separator]:
+            tokens.pop(0)
+            parts.append(read())
+        return parts[0] if len(parts) == 1 else partial(join, parts)
 
-    def _product(self) -> KernelFactory:
-        factors = [self._factor()]
-        while self._accept("*"):
-            factors.append(self._factor())
-        return factors[0] if len(factors) == 1 else lambda d, variance: _product_of(factors, d, variance)
-
-    def _factor(self) -> KernelFactory:
-        if self._accept("("):
-            inner = self._sum()
-            if not self._accept(")"):
-                raise self._wrong("a parenthesis is not closed")
+    def factor() -> KernelFactory:
+        if not tokens:
+            raise wrong("it ends where a name is expected")
+        name = tokens.pop(0)
+        if name == "(":
+            inner = joined("+", term, _sum_of)
+            if tokens[:1] != [")"]:
+                raise wrong("a parenthesis is not closed")
+            tokens.pop(0)
             return inner
-        if not self._tokens:
-            raise self._wrong("it ends where a name is expected")
-        name = self._tokens.pop(0)
         if name in "()+*":
-            raise self._wrong(f"{name!r} stands where a name is expected")
-        where = "the registry" if name == self.expression.strip() else repr(self.expression)
+            raise wrong(f"{name!r} stands where a name is expected")
+        where = "the registry" if name == expression.strip() else repr(expression)
         require_known("kernel", name, where, KERNELS, synonyms=ELSEWHERE)
         return KERNELS[name]
 
-    def _accept(self, token: str) -> bool:
-        if self._tokens[:1] == [token]:
-            self._tokens.pop(0)
-            return True
-        return False
-
-    def _wrong(self, what: str) -> InvalidInput:
-        return InvalidInput(
-            f"the kernel {self.expression!r} cannot be read: {what}; write names joined by '+' and '*', with "
-            f"parentheses where needed. Names: {', '.join(sorted(KERNELS))}"
-        )
+    term = partial(joined, "*", factor, _product_of)
+    found = joined("+", term, _sum_of)
+    if tokens:
+        raise wrong(f"{tokens[0]!r} is not expected there")
+    return found
 
 
 def _sum_of(terms: list[KernelFactory], dimension: int, variance: Tensor | float) -> Kernel:
@@ -284,11 +274,11 @@ def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kern
     ------
     InvalidInput: an unknown name, an expression that cannot be read, or a kernel that cannot have so many features.
     """
-    return KernelExpression(expression).build(dimension, variance)
+    return kernel_factory(expression)(dimension, variance)
 
 
 def check_kernel(expression: object) -> None:
     """Raise InvalidInput if `expression` is no text, cannot be read or has an unknown name; for constructors."""
     if not isinstance(expression, str):
         raise InvalidInput(f"the kernel is {expression!r}; give an expression such as 'linear + squared-exponential'.")
-    KernelExpression(expression)
+    kernel_factory(expression)

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics import ConstrainedDynamics, LoopClosure, MechanicalSystem, RollingContact, surface_axes
+from forcegp.mechanics.gauss_principle import placed
 from forcegp.priors.force_prior import ExpressedKernels, Scaling
 from forcegp.priors.joint_forces import chosen_inputs, driven, state_labels
 from forcegp.priors.kernels import check_kernel
@@ -31,10 +32,8 @@ class ToolPoint:
     def of(cls, dynamics: ConstrainedDynamics, frame: str, point: Sequence[float]) -> "ToolPoint":
         """At every state of the dynamics. Raises UnknownFrame."""
         kinematics = dynamics.state.kinematics
-        pose = kinematics.frame_pose(frame)
-        local = torch.tensor(point, dtype=pose.dtype, device=pose.device)
-        position = pose[..., :3, :3] @ local + pose[..., :3, 3]
-        return cls(position, kinematics.frame_jacobian(frame, tuple(point)), pose[..., :3, :3])
+        axes, position = placed(kinematics, frame, point)
+        return cls(position, kinematics.frame_jacobian(frame, tuple(point)), axes)
 
     @classmethod
     def of_contact(cls, dynamics: ConstrainedDynamics, contact: int) -> "ToolPoint":

@@ -77,9 +77,7 @@ class Training:
         if self.levels is None:
             measured = self.measured_torque and self.force_noise is not None
             return Noise(None, self.force_noise, learn=True, measured_torque=measured)
-        acceleration, force = (
-            tuple(float(std) for std in stds) for stds in (self.levels.acceleration, self.levels.force)
-        )
+        acceleration, force = tuple(self.levels.acceleration), tuple(self.levels.force)
         return Noise(acceleration, force, measured_torque=self.measured_torque)
 
     def system(self, mean: str) -> MechanicalSystem:

@@ -200,6 +200,11 @@ class Comparison:
             training_subset(train, self.points, 0)
             self.motions(split)
 
+    @property
+    def search(self) -> tuple[int | None, int | None, float | None, bool]:
+        """What `Training` takes of the search and the noise of forces, in its order."""
+        return self.restarts, self.iterations, self.force_noise, self.measured_torque
+
     def motions(self, split: Split) -> HeldOutMotions:
         """The motions to predict in what this split holds out."""
         return held_out_motions(self.recording, split.test_rows(self.recording), self.horizons, self.starts)

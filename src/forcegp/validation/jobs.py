@@ -139,20 +139,8 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
     before, noise = 0.0, None
     if work.identification is not None:
         identified[work.identification], before, noise = identified_system(store, spec["mean"])
-    training = Training(
-        rows,
-        comparison.system,
-        identified,
-        spec["seed"],
-        comparison.restarts,
-        comparison.iterations,
-        comparison.force_noise,
-        comparison.measured_torque,
-        noise,
-        train,
-        split.apply(comparison.recording)[0],
-        max(motions.horizons, default=1.0),
-    )
+    whole = train, split.apply(comparison.recording)[0], max(motions.horizons, default=1.0)
+    training = Training(rows, comparison.system, identified, spec["seed"], *comparison.search, noise, *whole)
     start = time.process_time()
     posterior = work.fit(training)
     seconds = before + time.process_time() - start

@@ -32,7 +32,6 @@ def fitted_on_all_rows(comparison: Comparison, name: str, seed: int = 0) -> Post
         given = rows if method.all_rows else training_subset(rows, comparison.points, seed)
         identified[work.identification] = method.identify(comparison.system, given, comparison.friction)
         levels = None if method.noise is None else method.noise(comparison.system, given, comparison.friction)
-    search = comparison.restarts, comparison.iterations, comparison.force_noise, comparison.measured_torque
     subset = training_subset(rows, comparison.points, seed)
     whole = rows, comparison.recording, max(comparison.horizons, default=1.0)
-    return work.fit(Training(subset, comparison.system, identified, seed, *search, levels, *whole))
+    return work.fit(Training(subset, comparison.system, identified, seed, *comparison.search, levels, *whole))

@@ -74,14 +74,11 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
     widths = [z.shape[-1] for z in posterior.likelihood.standardization.shift]
     panels = []
     for component, term, which in term_slices(posterior.model.prior, robot):
-        for index, place in enumerate(range(which.start, which.stop)):
-            along = _velocity_along(term, term.latent_names(robot)[index], index) if widths[place] > 1 else None
+        for index, latent in enumerate(term.latent_names(robot)):
+            place = which.start + index
+            along = _velocity_along(term, latent, index) if widths[place] > 1 else None
             if widths[place] == 1:
-                joint = (
-                    robot.joint_names.index(term.latent_names(robot)[index])
-                    if isinstance(term, JointFriction)
-                    else None
-                )
+                joint = robot.joint_names.index(latent) if isinstance(term, JointFriction) else None
                 panels.append(CurvePanel(names[place], component, term, index, 0, 1.0, joint))
             elif along is not None:
                 panels.append(CurvePanel(names[place], component, term, index, along, -1.0))

@@ -8,14 +8,7 @@ from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
-from forcegp.data import (
-    Dataset,
-    Preparation,
-    episodes_in_order,
-    low_pass_gain,
-    motion_spectrum,
-    power_density,
-)
+from forcegp.data import Dataset, Preparation, episodes_in_order, low_pass_gain, motion_spectrum, power_density
 from forcegp.evaluation.plots import style
 
 DECADES = 12.0

@@ -18,11 +18,11 @@ typedef long long int number;
   } \
   int function(const double **arg, double **res, number *integers, double *doubles, int memory)
 #define IGNORED (void)integers; (void)doubles; (void)memory
-enum {N = @NV@@MORE@};
-static const double zeros[@ZEROS@] = {0.0};
+enum {N = @NV@, NQ = @NQ@, NU = @NU@};
+static const double zeros[NQ + N + NU] = {0.0};
 
 //// mean
-static const number of_state[][4] = {{@Q@, 1, 1, 0}, {N, 1, 1, 0}, {@U@, 1, 1, 0}}, one[][4] = {{N, 1, 1, 0}};
+static const number of_state[][4] = {{NQ, 1, 1, 0}, {N, 1, 1, 0}, {NU, 1, 1, 0}}, one[][4] = {{N, 1, 1, 0}};
 EXTERNAL(@NAME@_acceleration, of_state, one) {
   double a[N];
   IGNORED;
@@ -32,7 +32,7 @@ EXTERNAL(@NAME@_acceleration, of_state, one) {
 }
 
 //// linearize
-static const number of_state_a[][4] = {{@Q@, 1, 1, 0}, {N, 1, 1, 0}, {@U@, 1, 1, 0}, {N, 1, 0, 0}};
+static const number of_state_a[][4] = {{NQ, 1, 1, 0}, {N, 1, 1, 0}, {NU, 1, 1, 0}, {N, 1, 0, 0}};
 static const number three[][4] = {{N, N, 1, 0}, {N, N, 1, 0}, {N, N, 1, 0}};
 EXTERNAL(jac_@NAME@_acceleration, of_state_a, three) {
   double a[N], J[3 * N * N];
@@ -43,12 +43,12 @@ EXTERNAL(jac_@NAME@_acceleration, of_state_a, three) {
 }
 
 //// step
-static const number of_x_u[][4] = {{@X_SIZE@, 1, 1, 0}, {@U@, 1, 1, 0}}, next[][4] = {{@X_SIZE@, 1, 1, 0}};
+static const number of_x_u[][4] = {{NQ + N, 1, 1, 0}, {NU, 1, 1, 0}}, next[][4] = {{NQ + N, 1, 1, 0}};
 EXTERNAL(@NAME@_next, of_x_u, next) {
-  double x[@X_SIZE@];
+  double x[NQ + N];
   IGNORED;
-  if (@NAME@_step(IN(0), IN(0) + @Q@, IN(1), x, x + @Q@)) return 1;
-  PUT(0, @X_SIZE@, 1, x[i]);
+  if (@NAME@_step(IN(0), IN(0) + NQ, IN(1), x, x + NQ)) return 1;
+  PUT(0, NQ + N, 1, x[i]);
   return 0;
 }
 

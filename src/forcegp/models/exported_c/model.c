@@ -16,7 +16,7 @@ static int stored(const double *from, double *to, int count) {
 }
 /* x = [q, v, u]; what is not finite is refused here, and the `count` results become NaN */
 static int refused(const double *q, const double *v, const double *u, double *x, double *result, int count) {
-  int found = stored(q, x, @NQ@) | stored(v, x + @NQ@, @NV@) | stored(u, x + @AT_U@, @NU@);
+  int found = stored(q, x, @NQ@) | stored(v, x + @NQ@, @NV@) | stored(u, x + @X@, @NU@);
   for (int k = 0; found && k < count; k++) result[k] = NAN;
   return found ? @NAME@_INPUT_NOT_FINITE : @NAME@_OK;
 }
@@ -53,26 +53,26 @@ int @NAME@_mean_covariance(const double q[@NQ@], const double v[@NV@], const dou
 //// linearize
 /* the same and its derivatives: jacobian[@COLUMNS@ i + k] = d a_i / d [@STATE@]_k */
 int @NAME@_linearize(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double a[@NV@],
-                   double jacobian[@SLOPES_SIZE@]) {
-  double x[@ALL@], y[@NV@ + @SLOPES_SIZE@];
-  if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, jacobian, @SLOPES_SIZE@)) return @NAME@_INPUT_NOT_FINITE;
+                   double jacobian[@NV@ * @COLUMNS@]) {
+  double x[@ALL@], y[@NV@ + @NV@ * @COLUMNS@];
+  if (refused(q, v, u, x, a, @NV@) | refused(q, v, u, x, jacobian, @NV@ * @COLUMNS@)) return @NAME@_INPUT_NOT_FINITE;
   slopes(tables, 1, x, y);
-  return stored(y, a, @NV@) | stored(y + @NV@, jacobian, @SLOPES_SIZE@);
+  return stored(y, a, @NV@) | stored(y + @NV@, jacobian, @NV@ * @COLUMNS@);
 }
 
 //// step
 /* the state one step later */
 int @NAME@_step(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double q_next[@NQ@],
               double v_next[@NV@]) {
-  enum {N = @NV@, @POSITIONS@ROUNDS = 60};
+  enum {N = @NV@, NQ = @NQ@, NU = @NU@, ROUNDS = 60};
   const double *const *t = tables;
   const double dt = @DT@;
   const long live = 1;
-  double x[@ROWS@], y[N + @Y@], q1[@Q@], v1[N], a[N], q0[@Q@], v0[N], m[N], d[N];
+  double x[NQ + N + NU], y[N + N * @COLUMNS@], q1[NQ], v1[N], a[N], q0[NQ], v0[N], m[N], d[N];
   (void)ROUNDS; (void)a; (void)q0; (void)v0; (void)m; (void)d;
-  if (refused(q, v, u, x, q_next, @Q@) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
+  if (refused(q, v, u, x, q_next, NQ) | refused(q, v, u, x, v_next, N)) return @NAME@_INPUT_NOT_FINITE;
   { @STEP@ }
-  if (!(stored(q1, q_next, @Q@) | stored(v1, v_next, N))) return @NAME@_OK;
+  if (!(stored(q1, q_next, NQ) | stored(v1, v_next, N))) return @NAME@_OK;
   return @IMPLICIT@ && !stored(y, a, N) ? @NAME@_STEP_NOT_FOUND : @NAME@_RESULT_NOT_FINITE;
 }
 

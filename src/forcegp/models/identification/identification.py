@@ -25,9 +25,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import NumericalError, NumericalWarning
-from forcegp.inference import OptimizationResult
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
+from forcegp.models.motion_intervals import DEVIATIONS
 from forcegp.models.search import Objective, blas_threads
 from forcegp.summary import Summary, listed
 
@@ -151,8 +151,6 @@ WEAK = 0.3
 NAMED_SHARE = 0.1
 """Smallest share of a direction with which a parameter is named in it."""
 
-NORMAL_95 = 1.959963984540054
-
 
 @dataclass(frozen=True)
 class WeakDirection:
@@ -176,7 +174,8 @@ class WeakDirection:
 class Identification(Summary):
     """Physical parameters before and after a fit, in SI units, centres of mass in link frames.
 
-    `history` holds their values at the start and after every iteration of the search that won. Standard errors, their
+    `history` holds their values at the start and after every iteration of the search that won, whose objective
+    factorised `covariance_rows`. Standard errors, their
     covariance and the weak directions are computed when first asked for, which takes one evaluation of the
     objective for each free parameter and two for each physical one; `progress(done, of)` is called after every one.
     Parameters in `confounded` have infinite ones, since an unknown force of the prior takes their place.
@@ -189,19 +188,6 @@ class Identification(Summary):
     covariance_rows: int
     confounded: tuple[str, ...] = ()
     progress: Report | None = None
-
-    @classmethod
-    def of(
-        cls,
-        physical: PhysicalParameters,
-        objective: Objective,
-        result: OptimizationResult,
-        covariance_rows: int,
-        confounded: tuple[str, ...] = (),
-    ) -> "Identification":
-        """From the result of a search that kept its iterates; `covariance_rows` is the size of what it factorised."""
-        history = tuple(physical.named(point[PHYSICAL]) for point in result.iterates)
-        return cls(physical, objective, result.parameters, history, covariance_rows, confounded)
 
     @override
     def facts(self) -> dict[str, object]:
@@ -298,7 +284,7 @@ class Identification(Summary):
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % intervals by name: estimate -+ 1.96 standard errors."""
         values, errors = self.values, self.standard_errors
-        return {n: (values[n] - NORMAL_95 * errors[n], values[n] + NORMAL_95 * errors[n]) for n in values}
+        return {n: (values[n] - DEVIATIONS * errors[n], values[n] + DEVIATIONS * errors[n]) for n in values}
 
     @cached_property
     def weak_directions(self) -> tuple[WeakDirection, ...]:

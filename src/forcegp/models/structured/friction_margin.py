@@ -74,7 +74,8 @@ def friction_margins(
         dynamics = posterior.dynamics(*(x.reshape(*batch, x.shape[-1]) for x in states))
         forces = _forces(posterior, dynamics, feet.values(), torch.tensor(Held(normal).normal))
         moments = [margin_moments(force, coefficient) for force in forces]
-        stands = torch.stack([_acts(dynamics, rows[0]) for rows in feet.values()], dim=-1)
+        # a contact that does not act, or that a plane base holds, has a row of zeros
+        stands = dynamics.A[..., [rows[0] for rows in feet.values()], :].abs().amax(-1) > 1e-9
         mean, std, slip = (torch.stack(part, -1).masked_fill(~stands, torch.nan) for part in zip(*moments, strict=True))
     names = tuple(frame for frame, _ in feet)
     return FrictionMargins(names, mean, std, slip, dict(zip(names, forces, strict=True)))
@@ -115,8 +116,3 @@ def _forces(
         known = (turn @ offset[..., rows, :].sum(-2)[..., None])[..., 0]
         forces.append(latents.through(turn @ effect[..., rows, :, :].sum(-3), known))
     return forces
-
-
-def _acts(dynamics: ConstrainedDynamics, contact: int) -> Tensor:
-    """Whether a contact acts at every state: one that does not, or that a plane base holds, has a row of zeros."""
-    return dynamics.A[..., contact, :].abs().amax(-1) > 1e-9

@@ -28,7 +28,7 @@ from forcegp.models.search import (
     with_steps_before,
 )
 from forcegp.models.structured.marginal_likelihood import StructuredModel
-from forcegp.models.structured.physical_start import PhysicalStart
+from forcegp.models.structured.physical_start import physical_start
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts, warn_of_thrust
 from forcegp.models.structured.refinement import (
@@ -317,19 +317,21 @@ class StructuredGP(StructuredModel):
             return fitted.condition(training, result.parameters | fixed, result, {**described, **of_search})
         confounded = tuple(f"{link}.mass" for link in warn_of_thrust(self.prior, search.learn))
         strength = search.prior_strength
-        begin = PhysicalStart.of(search.learn, likelihood, learned_noise | fixed, strength)
-        kernels = with_variance_priors(begin.kernels) if search.hyperprior else begin.kernels
-        objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior, begin.physical, strength)
-        result, of_search = search.best(objective, begin.path[-1] | learned_noise, keep_iterates=True)
+        physical, kernels, path = physical_start(search.learn, likelihood, learned_noise | fixed, strength)
+        kernels = with_variance_priors(kernels) if search.hyperprior else kernels
+        objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior, physical, strength)
+        result, of_search = search.best(objective, path[-1] | learned_noise, keep_iterates=True)
         # the steps before the search are its first iterations
-        result = with_steps_before(result, objective, [point | learned_noise for point in begin.path[:-1]])
+        result = with_steps_before(result, objective, [point | learned_noise for point in path[:-1]])
         settings = described | {
             **of_search,
-            "learned": learn_to_list(begin.physical),
+            "learned": learn_to_list(physical),
             "prior_strength": strength,
             "log_variance_spread": LOG_VARIANCE_SPREAD if search.hyperprior else None,
         }
-        identification = Identification.of(begin.physical, objective, result, training.q.numel(), confounded)
+        history = tuple(physical.named(point[PHYSICAL]) for point in result.iterates)
+        found = physical, objective, result.parameters, history
+        identification = Identification(*found, training.q.numel(), confounded)
         parameters = {name: value for name, value in result.parameters.items() if name != PHYSICAL}
         result = replace(result, parameters=parameters)
         fitted = replace(fitted, system=identification.system)

@@ -259,17 +259,11 @@ class MotionFit:
         return sigma, sigma * time.clamp_min(1.0).sqrt()
 
 
+@torch.no_grad()
 def refine_on_motions(
     posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None = None
 ) -> Structured:
     """What `StructuredPosterior.refined_on_motions` documents."""
-    with torch.no_grad():
-        return _refine(posterior, dataset, seconds, inertias, report)
-
-
-def _refine(
-    posterior: Structured, dataset: Dataset, seconds: float, inertias: bool, report: Report | None
-) -> Structured:
     require_type("dataset", dataset, Dataset)
     require_unobserved(posterior, "refinements on motions")
     if isinstance(seconds, bool) or not (isinstance(seconds, int | float) and 0.0 < seconds < math.inf):

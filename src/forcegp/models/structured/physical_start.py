@@ -46,43 +46,31 @@ SMALL_STEP = 0.1
 """Gauss-Newton ends with a step below this many standard deviations."""
 
 
-@dataclass(frozen=True, eq=False)
-class PhysicalStart:
+def physical_start(
+    learn: Learned | Iterable[Learned],
+    likelihood: MarginalLikelihood,
+    noise: Mapping[str, Tensor],
+    prior_strength: float = 0.0,
+) -> tuple[PhysicalParameters, LatentKernels, list[dict[str, Tensor]]]:
     """Whitened parameters, and the parameters of the search at the values of the system and after every step.
 
-    The last entry of `path` is where the search begins, with mean "zero" the only one; `kernels` belong to it.
+    The last of these is where the search begins, with mean "zero" the only one; the kernels belong to it. `noise` holds
+    the noise parameters at their start.
+    Raises as `PhysicalParameters.of`, and FitError where the likelihood cannot be evaluated at the start values.
     """
-
-    physical: PhysicalParameters
-    kernels: LatentKernels
-    path: tuple[dict[str, Tensor], ...]
-
-    @classmethod
-    def of(
-        cls,
-        learn: Learned | Iterable[Learned],
-        likelihood: MarginalLikelihood,
-        noise: Mapping[str, Tensor],
-        prior_strength: float = 0.0,
-    ) -> "PhysicalStart":
-        """From the values that the system of `likelihood` has.
-
-        `noise` holds the noise parameters at their start.
-        Raises as `PhysicalParameters.of`, and FitError where the likelihood cannot be evaluated at the start values.
-        """
-        physical = PhysicalParameters.of(likelihood.system, learn)
-        rows = _Rows(physical, likelihood, noise, _ridge(physical, prior_strength))
-        try:
-            with torch.no_grad():
-                scaled = _gauss_newton(rows) if likelihood.mean == "analytical" else [physical.zero]
-                lower = torch.linalg.cholesky(_information(rows, scaled[-1]))
-        except (NumericalError, torch.linalg.LinAlgError) as error:
-            raise FitError(f"the dynamics cannot be evaluated at the start values of `learn`: {error}") from None
-        identity = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
-        each = [rows.kernels(s) for s in scaled]
-        path = tuple(k.initial_parameters() | {PHYSICAL: lower.mT @ s} for k, s in zip(each, scaled, strict=True))
-        whitened = replace(physical, transform=torch.linalg.solve_triangular(lower.mT, identity, upper=True))
-        return cls(whitened, each[-1], path)
+    physical = PhysicalParameters.of(likelihood.system, learn)
+    rows = _Rows(physical, likelihood, noise, _ridge(physical, prior_strength))
+    try:
+        with torch.no_grad():
+            scaled = _gauss_newton(rows) if likelihood.mean == "analytical" else [physical.zero]
+            lower = torch.linalg.cholesky(_information(rows, scaled[-1]))
+    except (NumericalError, torch.linalg.LinAlgError) as error:
+        raise FitError(f"the dynamics cannot be evaluated at the start values of `learn`: {error}") from None
+    identity = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
+    each = [rows.kernels(s) for s in scaled]
+    path = [k.initial_parameters() | {PHYSICAL: lower.mT @ s} for k, s in zip(each, scaled, strict=True)]
+    whitened = replace(physical, transform=torch.linalg.solve_triangular(lower.mT, identity, upper=True))
+    return whitened, each[-1], path
 
 
 @dataclass(frozen=True, eq=False)

@@ -281,12 +281,9 @@ class StructuredPosterior(Posterior):
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, system=posterior.system)"
         require_rows("rows", rows, self.system.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, rows)
-        more = (
-            learn_more_rows(own, rows, budget, keep)
-            if horizon is None
-            else learn_and_forget(own, rows, budget, horizon)
-        )
-        return replace(more, target=self.target)
+        if horizon is None:
+            return replace(learn_more_rows(own, rows, budget, keep), target=self.target)
+        return replace(learn_and_forget(own, rows, budget, horizon), target=self.target)
 
     @override
     def refined_on_motions(

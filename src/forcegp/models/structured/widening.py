@@ -23,15 +23,13 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 from forcegp.inference import LatentPosterior
+from forcegp.models.motion_intervals import DEVIATIONS
 from forcegp.models.search import MOST_POINTS_FOR_RESTARTS, blas_threads
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.search import FitObjective
 
 CONTENT, CONFIDENCE = 0.9, 0.995
 """Share of the states that lie inside their 95 % intervals, in this share of the functions that the data leave open."""
-
-TWO_SIDED = 1.959963984540054
-"""Standard deviations of a normal distribution that hold 95 % of it."""
 
 STATES = 24
 """Training states at which functions and variances are compared."""
@@ -84,7 +82,7 @@ class _States:
         normal = torch.randn(len(values), DRAWS, generator=generator, dtype=std.dtype, device=std.device)
         drawn = (vectors * values.clamp_min(0.0).sqrt()) @ normal
         inside = torch.quantile((drawn[open_ones] / std[open_ones, None]).abs(), CONTENT, dim=0)
-        return max(1.0, float(torch.quantile(inside, CONFIDENCE)) / TWO_SIDED)
+        return max(1.0, float(torch.quantile(inside, CONFIDENCE)) / DEVIATIONS)
 
     def mixture_factor(self, posterior: StructuredPosterior, hyperprior: bool) -> float:
         """Standard deviations with the hyper-parameters unknown, over those with them known; at least 1."""

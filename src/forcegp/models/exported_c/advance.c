@@ -11,6 +11,3 @@
       step[j] = dt * v[j];
     }
     @NAME@_integrate(from, step, q);
-//// named
-  @NAME@_NQ = @NQ@,
-  @NAME@_NU = @NU@,
