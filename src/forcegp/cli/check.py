@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, unless_given
+from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import DatasetError
@@ -21,7 +21,7 @@ COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(CutoffOptions, RobotOptions):
+class Check(CutoffOptions, RobotOptions, Overwriting):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
     Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
@@ -39,8 +39,6 @@ class Check(CutoffOptions, RobotOptions):
     """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""

@@ -250,6 +250,14 @@ class BackendOptions(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Overwriting(Command):
+    """A command that may replace what an earlier one wrote."""
+
+    overwrite: bool = False
+    """Replace what is there, if forcegp wrote it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Resuming(Command):
     """A command that keeps every finished piece of work in its folder."""
 

@@ -14,7 +14,7 @@ import forcegp.evaluation
 import forcegp.models
 import forcegp.report
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Command, listed, require_free_file, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, listed, require_free_file, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import SystemChoice, carried_over, with_observed_wind
 from forcegp.cli.terminal import (
@@ -32,7 +32,7 @@ from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Command):
+class Evaluate(Overwriting):
     """Score a fitted model on a dataset that it has not seen: errors, likelihood, coverage, constraint error.
 
     For example:
@@ -60,8 +60,6 @@ class Evaluate(Command):
     """Also write a report in one file: the robot in motion with its forces, figures and errors."""
     shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
     """A URDF with visual elements for the links in the report, its meshes beside it."""
-    overwrite: bool = False
-    """Replace the folder of plots and the report if forcegp wrote them."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Evaluate, draw if asked to, and show."""

@@ -12,7 +12,17 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, listed, numbers_of, require_free_file, unless_given
+from forcegp.cli.command import (
+    DATASET,
+    MODEL,
+    NUMBERS,
+    URDF,
+    Overwriting,
+    listed,
+    numbers_of,
+    require_free_file,
+    unless_given,
+)
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import RobotOptions
 from forcegp.cli.terminal import Terminal, columns, number
@@ -20,7 +30,7 @@ from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Excite(RobotOptions):
+class Excite(RobotOptions, Overwriting):
     """Choose the motion within limits, from rest to rest, that reduces the uncertainty of learned forces most.
 
     With --robot instead of a model, one that identifies base parameters and friction.
@@ -54,8 +64,6 @@ class Excite(RobotOptions):
     """How many motions to look at."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the motions that are looked at."""
-    overwrite: bool = False
-    """Replace the files if forcegp wrote them."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Choose, write, draw and show."""

@@ -14,7 +14,7 @@ import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, listed, require_free_file, unless_given
+from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, require_free_file, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -29,7 +29,7 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(PreparationOptions, RobotOptions):
+class Import(PreparationOptions, RobotOptions, Overwriting):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
@@ -120,8 +120,6 @@ class Import(PreparationOptions, RobotOptions):
     """Accept positions beyond the limits of the URDF."""
     max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
     """Refuse a log with more rows."""
-    overwrite: bool = False
-    """Replace the files if they exist."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, check and write."""

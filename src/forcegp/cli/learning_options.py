@@ -18,7 +18,7 @@ import forcegp.data
 import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
-from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, listed, numbers_of, unless_given
+from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -113,7 +113,7 @@ KNOWN = ("actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-join
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningOptions(BackendOptions, RobotOptions):
+class LearningOptions(BackendOptions, RobotOptions, Overwriting):
     """What every command asks that learns from a dataset."""
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
@@ -145,8 +145,6 @@ class LearningOptions(BackendOptions, RobotOptions):
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     checks: Annotated[bool, arg(help_behavior_hint="")] = True
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def _check(
         self, terminal: Terminal, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, accelerations: bool = True

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.report
-from forcegp.cli.command import URDF, require_free_file, unless_given
+from forcegp.cli.command import URDF, Overwriting, require_free_file, unless_given
 from forcegp.cli.input_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import RobotFileWarning
@@ -24,7 +24,7 @@ NONE = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Robot(RobotFileOptions):
+class Robot(RobotFileOptions, Overwriting):
     """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
     Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, MJCF where
@@ -48,8 +48,6 @@ class Robot(RobotFileOptions):
     """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
     browser: bool = False
     """Show the robot in the browser, until Ctrl-C."""
-    overwrite: bool = False
-    """Replace that file."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""

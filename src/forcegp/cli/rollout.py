@@ -14,7 +14,7 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, listed, numbers_of, unless_given
+from forcegp.cli.command import DATASET, MODEL, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.input_options import SystemChoice, carried_over, require_same_joints, with_observed_wind
 from forcegp.cli.terminal import Terminal, columns, facts, number, percent, shown
 from forcegp.errors import InvalidInput
@@ -27,7 +27,7 @@ ENOUGH_SAMPLES = 20  # fewer span less by chance
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rollout(Command):
+class Rollout(Overwriting):
     """Predict whole motions under recorded torques with a fitted model, and compare them with the recording.
 
     The motions begin at rows of the dataset.
@@ -59,8 +59,6 @@ class Rollout(Command):
     """Also roll out N functions drawn from the model, for intervals. Time grows with N."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the functions."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Roll out, compare, draw and show."""

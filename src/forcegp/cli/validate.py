@@ -82,8 +82,6 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     measured_torque: bool = False
     """u comes from noisy sensors; predictions account for this noise. It applies to models with physics and a force
     noise."""
-    jobs: Annotated[int | None, unless_given("J", "1", int)] = None
-    """Pieces of work at once, each on one core."""
     overwrite: bool = False
     """Compute everything anew where the folder holds results."""
 
