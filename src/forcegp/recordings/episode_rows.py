@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError, MistakenUnit
 from forcegp.recordings.moving_base import Layout
-from forcegp.recordings.reading import RawRecording, Spool
+from forcegp.recordings.reading import ROWS_AT_A_TIME, RawRecording, Spool
 
 REPEATED = 0.05
 """Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
@@ -166,8 +166,6 @@ def _first_of_each(time: np.ndarray, begins: np.ndarray, least: float) -> np.nda
             last_dropped = row
     return kept
 
-
-ROWS_AT_A_TIME = 16384
 
 SPLINE_HALO = 64
 """Rows on either side that a piece of a spline is fitted with: the rest moves it by less than 0.27^64 of itself."""

@@ -33,15 +33,9 @@ class LogUnit:
         return values / self.denominator if self.denominator != 1.0 else values
 
 
-def _units(si: str, **factors: Fraction | int | float) -> dict[str, LogUnit]:
-    made = {}
-    for name, factor in factors.items():
-        name = name.replace("_per_", "/").replace("squared", "^2")
-        if isinstance(factor, Fraction):
-            made[name] = LogUnit(name, si, float(factor.numerator), float(factor.denominator))
-        else:
-            made[name] = LogUnit(name, si, float(factor))
-    return made
+def _units(si: str, factors: Mapping[str, Fraction | float]) -> dict[str, LogUnit]:
+    parts = {name: (x, 1) if isinstance(x, float) else (x.numerator, x.denominator) for name, x in factors.items()}
+    return {name: LogUnit(name, si, float(above), float(below)) for name, (above, below) in parts.items()}
 
 
 _MILLI, _MICRO, _NANO = Fraction(1, 1000), Fraction(1, 10**6), Fraction(1, 10**9)
@@ -51,18 +45,17 @@ ONE = LogUnit("1", "1")
 """Of parts of a quaternion, of shares of a thrust and of switches."""
 
 UNITS: dict[str, dict[str, LogUnit]] = {
-    "time": _units("s", s=1, ms=_MILLI, us=_MICRO, ns=_NANO, min=60),
-    "q": _units("rad", rad=1, mrad=_MILLI, deg=_DEGREE, rev=_TURN)
-    | _units("m", m=1, cm=Fraction(1, 100), mm=_MILLI, um=_MICRO)
+    "time": _units("s", {"s": 1, "ms": _MILLI, "us": _MICRO, "ns": _NANO, "min": 60}),
+    "q": _units("rad", {"rad": 1, "mrad": _MILLI, "deg": _DEGREE, "rev": _TURN})
+    | _units("m", {"m": 1, "cm": Fraction(1, 100), "mm": _MILLI, "um": _MICRO})
     | {"1": ONE},
-    "v": _units("rad/s", rad_per_s=1, mrad_per_s=_MILLI, deg_per_s=_DEGREE, rev_per_s=_TURN, rpm=_TURN / 60.0)
-    | _units("m/s", m_per_s=1, cm_per_s=Fraction(1, 100), mm_per_s=_MILLI),
-    "u": _units("Nm", Nm=1, mNm=_MILLI, uNm=_MICRO, kNm=1000, Ncm=Fraction(1, 100))
-    | _units("N", N=1, mN=_MILLI, kN=1000)
+    "v": _units("rad/s", {"rad/s": 1, "mrad/s": _MILLI, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0})
+    | _units("m/s", {"m/s": 1, "cm/s": Fraction(1, 100), "mm/s": _MILLI}),
+    "u": _units("Nm", {"Nm": 1, "mNm": _MILLI, "uNm": _MICRO, "kNm": 1000, "Ncm": Fraction(1, 100)})
+    | _units("N", {"N": 1, "mN": _MILLI, "kN": 1000})
     | {"1": ONE}
-    | _units("rad/s", rad_per_s=1, rev_per_s=_TURN, rpm=_TURN / 60.0),
-    "a": _units("rad/s^2", rad_per_ssquared=1, deg_per_ssquared=_DEGREE)
-    | _units("m/s^2", m_per_ssquared=1, mm_per_ssquared=_MILLI),
+    | _units("rad/s", {"rad/s": 1, "rev/s": _TURN, "rpm": _TURN / 60.0}),
+    "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREE}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": _MILLI}),
 }
 """By quantity and name: what `ColumnMapping.unit` accepts."""
 
