@@ -14,10 +14,8 @@ import forcegp.evaluation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
-from forcegp.cli.terminal import Terminal, columns, shown
+from forcegp.cli.terminal import Terminal, columns, findings_table, shown
 from forcegp.errors import DatasetError
-
-COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,21 +66,12 @@ class Check(CutoffOptions, RobotOptions, Overwriting):
 
 def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
     """One paragraph per finding, worst first, and the numbers of every joint."""
-    from rich.table import Table
     from rich.text import Text
 
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
-    findings = Table.grid(padding=(0, 1))
-    findings.add_column(no_wrap=True)
-    findings.add_column(overflow="fold")
-    for finding in report.findings:
-        text = Text(f"{finding.subject}: ", style="bold")
-        text.append(terminal.worded(finding.seen), style="not bold")
-        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
-        if finding.remedy:
-            findings.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
+    findings = findings_table(report.findings, terminal.worded)
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
     return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
 

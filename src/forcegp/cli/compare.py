@@ -56,8 +56,6 @@ class Compare(LearningOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, compare, write if asked to, and show."""
-        if self.seed < 0:
-            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         if len(self.priors) < 2:
             given = f"only {self.priors[0]}" if self.priors else "none"
             raise InvalidInput(f"--priors lists the candidates, and there is {given}; give two or more, as in a,b.")
@@ -119,7 +117,7 @@ class Compare(LearningOptions):
                 priors,
                 points=points,
                 system=system,
-                noise=resolved_noise(self.noise, dataset, self.force_noise),
+                noise=resolved_noise(self.noise, self.force_noise),
                 restarts=restarts,
                 backend=self._backend(),
                 options=options,

@@ -15,6 +15,7 @@ from tyro.conf import arg
 import forcegp
 import forcegp.analytical
 import forcegp.inference
+import forcegp.mechanics
 import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
@@ -209,15 +210,6 @@ def _report_of_regression(
     return [*tables, *lines]
 
 
-COEFFICIENT_NAMES = (
-    "viscous-joint-friction.",
-    "coulomb-joint-friction.",
-    "load-joint-friction.",
-    "armature.",
-    "rotor-inertia.",
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Identify(IdentifyOptions):
     """Estimate physical parameters of the robot along with the unknown forces, and report their standard errors.
@@ -235,8 +227,6 @@ class Identify(IdentifyOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Identify and save."""
-        if self.seed < 0:
-            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         if self.model == "analytical" and self.mean == "zero":
             raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
         if self.model in INERTIAS:
@@ -260,7 +250,7 @@ class Identify(IdentifyOptions):
             system,
             forcegp.priors.named_prior(prior, system),
             self.mean,
-            resolved_noise(self.noise, dataset, self.force_noise),
+            resolved_noise(self.noise, self.force_noise),
         )
         posterior = fit_with_progress(
             terminal,
@@ -318,8 +308,8 @@ def _report(command: Identify, found: forcegp.models.Identification, summary: Ma
 
 def _owner_and_part(name: str) -> tuple[str, str]:
     """Link or force, and part or joint."""
-    if name.startswith(COEFFICIENT_NAMES):
-        owner, _, part = name.partition(".")
+    owner, _, part = name.partition(".")
+    if owner in forcegp.mechanics.KNOWN_FORCES:
         return owner, part
     pieces = name.rsplit(".", 1 if name.endswith(".mass") else 2)
     return pieces[0], ".".join(pieces[1:])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -183,9 +183,7 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
         return stored.changed_by(self._flags())
 
     def _flags(self) -> forcegp.ColumnMapping:
-        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes", "orientation")
-        given: dict[str, Any] = {name: getattr(self, name) for name in names}
-        given |= {"side_by_side": self.side_by_side, "ned": self.ned}
+        given: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(forcegp.ColumnMapping)}
         if self.delimiter is not None:
             given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
@@ -193,13 +191,9 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
             given["headerless"] = [int(word) for word in words]
-        for name in ("unit", "axes"):
-            if (text := getattr(self, name)) is not None:
-                given[name] = forcegp.recordings.by_quantity(name, text)
-        for name in ("sign", "scale", "offset"):
-            text = getattr(self, name)
-            if text is not None:
-                given[name] = forcegp.recordings.factors_of(name, text)
+        readers = dict.fromkeys(("unit", "axes"), forcegp.recordings.by_quantity)
+        readers |= dict.fromkeys(("sign", "scale", "offset"), forcegp.recordings.factors_of)
+        given |= {name: read(name, given[name]) for name, read in readers.items() if given[name] is not None}
         return forcegp.recordings.mapping_of(given)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
 import warnings
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import forcegp.data
 import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
+from forcegp.atomic_files import file_digest
 from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
@@ -209,5 +209,5 @@ class LearningOptions(BackendOptions, RobotOptions, Overwriting):
             for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
             if name not in ("json", "debug", "overwrite")
         }
-        data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
+        data = {"path": str(self.data), "sha256": file_digest(self.data)}
         return {"options": options, "data": data}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.validation
+from forcegp.atomic_files import file_digest
 from forcegp.cli.command import DATASET, BackendOptions, Resuming, listed, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import MODEL_PARTS, friction_laws
@@ -21,6 +21,8 @@ from forcegp.cli.terminal import NONE, Terminal, columns, number
 
 SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")
 """Options that have the names of fields of `forcegp.Comparison`."""
+BRIEF = ("models", "winners", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
+"""What --json prints of the document."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,18 +113,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
             terminal.note(f"{best}, learned from all rows: {self.out / 'model'}")
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
         terminal.show(*self._report(validation.document))
-        brief = (
-            "models",
-            "winners",
-            "verdicts",
-            "against_baseline",
-            "splits",
-            "preparation",
-            "mass_matrix",
-            "seeds",
-            "points",
-        )
-        return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
+        return {"out": str(self.out), **{name: validation.document[name] for name in BRIEF}}
 
     def _comparison(self, terminal: Terminal) -> forcegp.Comparison:
         raw = forcegp.Dataset.load(self.data)
@@ -160,7 +151,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
             )
 
     def _source(self) -> dict[str, Any]:
-        digest = hashlib.sha256(self.data.read_bytes()).hexdigest()
+        digest = file_digest(self.data)
         robot = [f"robot from {self.robot}"] if self.robot is not None else []
         return {"title": str(self.data), "data": [f"{self.data} (SHA-256 {digest[:16]}…)", *robot], "sha256": digest}
 

@@ -1,6 +1,5 @@
 """`import_recordings`: from log files to one dataset file, whatever their format and size."""
 
-import hashlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 import forcegp.mechanics
+from forcegp.atomic_files import file_digest
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
@@ -224,7 +224,7 @@ def _what_was_done(
     made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
     lacking = {name for name, entries in plan.layout.derived.items() if entries}
     return {
-        "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
+        "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": file_digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
         "columns": {
@@ -256,8 +256,3 @@ def _what_was_done(
         "end": options.end,
         "episodes": [],
     }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
