@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.data.configurations import actuators, continuous, rates, space_of, through
 from forcegp.data.dataset import Dataset
+from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.manifold import ConfigurationSpace
 
@@ -212,15 +213,14 @@ def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.
 
 def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
-    space, units = space_of(rows), rows.units["q"]
+    space = space_of(rows)
     continuous(space, rows.q)
-    grouped = {row for group in space.groups for row in range(*group.rows.indices(rows.nv))}
-    single = [k for k in range(rows.nv) if k not in grouped]
-    angular = [(units if isinstance(units, str) else units[k]) == "rad" for k in single]
+    units = unit_of_each("q", rows.units["q"], rows.nv)
+    angular = [units[k] == "rad" for k in space.single_rows]
     jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi
     if jumps.any():
         row, column = np.argwhere(jumps)[0]
-        joint = rows.joint_names[np.asarray(single)[angular][column]]
+        joint = rows.joint_names[np.asarray(space.single_rows)[angular][column]]
         raise DatasetError(
             f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
             "Unwrap it first (np.unwrap(q, axis=0))."

@@ -183,7 +183,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
                 reasons["cutoff"] += f"; of held-out torques stay unexplained {shares}"
                 cutoff = best
         chosen = replace(given, cutoff=cutoff)
-        reasons["cutoff_per_joint"] = _plain(each)
+        reasons["cutoff_per_joint"] = plain(each)
     for name in LATE:
         how = getattr(given, name)
         if how not in AUTOMATIC:
@@ -198,8 +198,8 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
         chosen = replace(chosen, **{name: found.significant if how == "auto" else tuple(found.each)})
         reasons[name] = found.reason if how == "auto" else "that of each joint where it is sure"
-        reasons[f"{name}_common"], reasons[f"{name}_common_std"] = _plain(np.array([found.common, found.common_std]))
-        reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = _plain(found.seconds), _plain(found.std)
+        reasons[f"{name}_common"], reasons[f"{name}_common_std"] = plain(np.array([found.common, found.common_std]))
+        reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = plain(found.seconds), plain(found.std)
     return chosen, reasons
 
 
@@ -315,7 +315,7 @@ def _report(
         spectrum = motion_spectrum(raw, chosen.differentiate)
         before = spectrum.acceleration_noise()
         after = spectrum.acceleration_noise(lambda f: low_pass_gain(f, rate, float(chosen.cutoff or 0.0), chosen.order))
-    report["acceleration_noise"] = {"before": _plain(before), "after": _plain(after)}
+    report["acceleration_noise"] = {"before": plain(before), "after": plain(after)}
     unshifted = _filtered(replace(chosen, delay=0.0, lag=0.0), raw) if any(map(any, per_joint.values())) else filtered
     report["power_removed"] = {name: _power_removed(raw, unshifted, name) for name in ("q", "v", "a", "u")}
     return report
@@ -328,10 +328,11 @@ def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | N
     if name == "q" and not space.is_vector_space:
         old, change = as_vectors(before), space.difference(*(torch.tensor(x) for x in (new, old))).numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
+        return plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
 
 
-def _plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:
+def plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:
+    """Numbers for JSON, which has no NaN."""
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

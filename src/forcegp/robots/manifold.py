@@ -105,6 +105,12 @@ class ConfigurationSpace:
         return self.nv + sum(group.extra for group in self.groups)
 
     @property
+    def single_rows(self) -> list[int]:
+        """Entries of v of the joints of one degree of freedom."""
+        grouped = {row for group in self.groups for row in range(*group.rows.indices(self.nv))}
+        return [row for row in range(self.nv) if row not in grouped]
+
+    @property
     def is_vector_space(self) -> bool:
         """Whether positions add up: q has the size of v, and q' = v."""
         return not self.groups
