@@ -283,8 +283,8 @@ BROKEN = {
     "time stands still": Broken(csv(constant_time), "all rows have the same time stamp"),
     "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
     "s given as ns": Broken(GOOD, "no rate of a robot's log", f"{FLAGS} --unit time=ns"),
-    "unknown unit": Broken(GOOD, "q has no unit 'degrees'; did you mean", f"{FLAGS} --unit q=degrees"),
-    "unit of another": Broken(GOOD, "u has no unit 'deg'", f"{FLAGS} --unit u=deg"),
+    "unknown unit": Broken(GOOD, "no unit 'degrees' in the units of q; did you mean", f"{FLAGS} --unit q=degrees"),
+    "unit of another": Broken(GOOD, "no unit 'deg' in the units of u", f"{FLAGS} --unit u=deg"),
     "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
     "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in degrees"),
     "degrees beyond limits": Broken(

@@ -1,6 +1,5 @@
 """`ColumnMapping`: which columns are what, in which units; its YAML files, and the short forms of the command line."""
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -12,7 +11,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from forcegp.errors import FileFormatError, InvalidInput, usable_arguments
+from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
 from forcegp.recordings.column_names import listed
 from forcegp.recordings.source import reading
 
@@ -62,14 +61,11 @@ UNITS: dict[str, dict[str, LogUnit]] = {
 
 def log_unit(quantity: str, name: str) -> LogUnit:
     """The unit of that name. Raises InvalidInput listing those of the quantity."""
-    units = UNITS[quantity]
     spelled = name.strip().replace("**", "^").replace("²", "^2").replace("µ", "u").replace("·", "").replace("°", "deg")
-    if spelled in units:
-        return units[spelled]
-    lower = {known.lower(): known for known in units}
-    close = lower.get(spelled.lower()) or next(iter(difflib.get_close_matches(spelled, units, n=1)), None)
-    hint = f"; did you mean {close}?" if close else "."
-    raise InvalidInput(f"{quantity} has no unit {name!r}{hint} Known: {', '.join(units)}.")
+    units = UNITS[quantity]
+    meant = {known.lower(): known for known in units}
+    require_known("unit", spelled, f"the units of {quantity}", units, synonyms=meant)
+    return units[spelled]
 
 
 SIGNALS = ("q", "v", "u", "a")
@@ -301,8 +297,7 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
     known = [item.name for item in fields(ColumnMapping)]
     values: dict[str, Any] = {}
     for key, value in content.items():
-        if key not in known:
-            raise InvalidInput(f"key {key!r} is not known; there are {', '.join(known)}.")
+        require_known("key", key, "a mapping of columns", known)
         if value is None:
             continue
         if key in SIGNALS or key == "joints":
