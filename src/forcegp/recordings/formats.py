@@ -5,16 +5,16 @@ from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 
-import h5py
 from typing_extensions import override
 
+from forcegp.data import is_dataset
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings.array_file import ArrayFile, NumpyArchive
 from forcegp.recordings.delimited_text import DelimitedText
 from forcegp.recordings.hdf5_and_matlab import HDF5Arrays, matlab_file
 from forcegp.recordings.parquet import INFO, LeRobotFolder, ParquetFile
 from forcegp.recordings.ros_bag import RosBag
-from forcegp.recordings.source import Columns, Source, exact, reading
+from forcegp.recordings.source import Columns, Source, exact
 
 
 class SideBySide(Source):
@@ -114,10 +114,8 @@ def open_source(
     if kind in TEXT:
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:
-        if kind != ".npz" and h5py.is_hdf5(path):
-            with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
-                if file.attrs.get("format") == "forcegp-dataset":
-                    raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
+        if kind != ".npz" and is_dataset(path):
+            raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
         return ARRAYS[kind](path, within=within)
     return LeRobotFolder(path) if kind == "lerobot" else RosBag(path) if kind == "ros2" else TABLES[kind](path)
 

@@ -13,7 +13,7 @@ from forcegp.atomic_files import file_digest
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import EpisodeRows, Stamps, Stretch, read_stamps
+from forcegp.recordings.episode_rows import Stamps, Stretch, episode_rows, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
@@ -128,22 +128,22 @@ def import_recordings(
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
         step = _even_step(stamps, options)
         episodes = [
-            EpisodeRows(stretch, own.kept, each.layout, step)
+            (stretch, own.kept, each.layout)
             for each, own in zip(plans, stamps, strict=True)
             for stretch in own.stretches
         ]
-        for stretch in (rows.stretch for rows in episodes):
+        for stretch, *_ in episodes:
             _require_no_jumps(stretch)
         done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
         with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
-            for number, rows in enumerate(episodes):
+            for number, (stretch, kept, layout) in enumerate(episodes):
                 report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
                 before = writer.rows
-                for piece in rows.pieces(spool):
+                for piece in episode_rows(spool, stretch, kept, layout, step):
                     writer.append(**piece, episode=number)
-                recording, begin = rows.stretch.recording, rows.stretch.start
+                recording, begin = stretch.recording, stretch.start
                 stamp = recording.begin + float(recording.time[begin])
-                own = {"recording": recording.label, "number": rows.stretch.number, "row": begin, "begin": stamp}
+                own = {"recording": recording.label, "number": stretch.number, "row": begin, "begin": stamp}
                 done["episodes"].append({**own, "rows": writer.rows - before})
             done["rows"] = writer.rows
             writer.finish({"import": done})
