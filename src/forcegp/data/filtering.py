@@ -13,6 +13,7 @@ from forcegp.data.configurations import actuators, continuous, rates, space_of, 
 from forcegp.data.dataset import Dataset
 from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 JITTER = 0.01
@@ -39,8 +40,7 @@ def zero_phase_low_pass(
         raise InvalidInput(
             f"cutoff is {cutoff} Hz; it must be > 0 and below {sample_rate / 2} Hz, half the sample rate."
         )
-    if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= 12:
-        raise InvalidInput(f"order is {order!r}; it must be an integer from 1 to 12.")
+    whole_number("order", order, 1, 12)
     from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
     sections = butter(order, cutoff, fs=sample_rate, output="sos")

@@ -19,6 +19,7 @@ from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
+from forcegp.robots.arguments import whole_number
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 AUTOMATIC = "auto", "each"
@@ -61,8 +62,7 @@ class Preparation:
     def __post_init__(self) -> None:
         if self.cutoff not in (None, "auto") and not (_finite(self.cutoff) and self.cutoff > 0):
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
-        if isinstance(self.order, bool) or not isinstance(self.order, int) or not 1 <= self.order <= 12:
-            raise InvalidInput(f"order is {self.order!r}; it must be an integer from 1 to 12.")
+        whole_number("order", self.order, 1, 12)
         for name in LATE:
             given = getattr(self, name)
             if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
@@ -74,8 +74,7 @@ class Preparation:
                 raise InvalidInput(f"lag is {given!r}; an actuator acts after its command: at least 0 s.")
         if self.delay in AUTOMATIC and self.lag in AUTOMATIC:
             raise InvalidInput("delay and lag are both to be estimated, and look alike; give one of them in s.")
-        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
-            raise InvalidInput(f"every is {self.every!r}; it must be an integer of at least 1.")
+        whole_number("every", self.every, 1)
         if not _finite(self.trim) or self.trim < 0:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
         if self.differentiate not in ("q", "v"):
