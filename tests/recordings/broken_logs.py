@@ -301,7 +301,7 @@ BROKEN = {
     "not linear": Broken(GOOD, "is not linear", FLAGS.replace("--q q_{joints}", "--q q_shoulder*q_elbow,q_elbow")),
     "too many rows": Broken(GOOD, "more than 100 rows", f"{FLAGS} --max-rows 100"),
     "nothing between": Broken(GOOD, "no row lies between", f"{FLAGS} --start 5"),
-    "unknown key": Broken(with_mapping("qq: a\n"), "log.yaml: no key 'qq' in a mapping of columns; did you mean 'q'", ""),
+    "unknown key": Broken(with_mapping("qq: a\n"), "log.yaml: no key 'qq' in a mapping of columns", ""),
     "key twice": Broken(with_mapping("q: a\nq: b\n"), "'q' stands twice", ""),
     "code in YAML": Broken(with_mapping("q: !!python/object/apply:os.getcwd []\n"), "cannot be read as YAML", ""),
     "cut npz": Broken(cut(archive), "log.npz cannot be read as a NumPy archive", ARRAYS),
