@@ -166,7 +166,7 @@ def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, ki
     likelihood = likelihoods[0]
     return Delay(
         common=float(common[0]),
-        common_std=float(jackknife(common[1:])),
+        common_std=float(jackknife(common[None, 1:])[0]),
         seconds=seconds[:, 0],
         std=jackknife(seconds[:, 1:]),
         residual=residual,
@@ -190,7 +190,7 @@ def least_squares(
     return np.stack([_unexplained(*sums), *without])
 
 
-def jackknife(each: Float[np.ndarray, "*estimates blocks"]) -> np.ndarray:
+def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
     """Standard deviation of an estimate from its values without each block; NaN where one of them is."""
     return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
 

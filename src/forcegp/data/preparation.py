@@ -330,7 +330,7 @@ def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | N
         return plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
 
 
-def plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:
+def plain(values: np.ndarray) -> list[float | None]:
     """Numbers for JSON, which has no NaN."""
     return [float(value) if np.isfinite(value) else None for value in values]
 

@@ -48,7 +48,7 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     lags = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])
     if not np.isfinite(lags).all():
         raise DatasetError("the recording shows no lag of the thrusters between 0 and .3 s; give the lag in s, or 0.")
-    return float(lags[0]), float(jackknife(lags[1:]))
+    return float(lags[0]), float(jackknife(lags[None, 1:])[0])
 
 
 def thruster_columns(system: forcegp.mechanics.MechanicalSystem | None) -> dict[int, int]:
