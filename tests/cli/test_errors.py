@@ -138,7 +138,7 @@ def test_a_run_of_another_robot_is_refused(folder, capfd):
     dataclasses.replace(Dataset.load("no_robot.h5"), joint_names=names).save("other.h5")
     capfd.readouterr()
     assert main(["evaluate", "run", "other.h5"]) == 2
-    assert "dataset are pan, lift, wrist, those of the model pan, lift, bend" in capfd.readouterr().err
+    assert "other.h5 has joints pan, lift, wrist; the model was trained on pan, lift, bend" in capfd.readouterr().err
 
 
 def test_robot_and_contact_replace_those_of_the_dataset(folder):

@@ -14,9 +14,9 @@ import forcegp.evaluation
 import forcegp.models
 import forcegp.report
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, listed, require_free_file, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, listed, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
-from forcegp.cli.input_options import SystemChoice, carried_over, with_observed_wind
+from forcegp.cli.input_options import SystemChoice, model_and_data
 from forcegp.cli.terminal import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,
@@ -66,13 +66,9 @@ class Evaluate(Overwriting):
         if self.every < 1:
             raise InvalidInput(f"--every is {self.every}; it must be at least 1.")
         self.require_free(self.plots)
-        if self.report is not None:
-            require_free_file(self.report, overwrite=self.overwrite, own=forcegp.report.is_page, what="a report")
+        self.require_free_file(self.report, forcegp.report.is_page, "a report")
 
-        posterior = forcegp.load_posterior(self.run_folder)
-        dataset = forcegp.Dataset.load(self.data)
-        posterior = carried_over(terminal, posterior, dataset, self.system)
-        posterior, dataset = with_observed_wind(terminal, posterior, dataset)
+        posterior, dataset = model_and_data(terminal, self.run_folder, self.data, self.system)
         dataset = dataset.rows(slice(None, None, self.every))
         if self.contact:
             posterior = posterior.with_system(
@@ -120,7 +116,11 @@ class Evaluate(Overwriting):
         scores: Mapping[str, Any],
     ) -> None:
         assert self.report is not None
-        unit = acceleration_unit(dataset)
+        unit, mu, pictures = acceleration_unit(dataset), self.friction_coefficient, []
+        if mu is not None:
+            figure = forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
+            caption = "How much more force along the ground every foot could bear."
+            pictures.append(forcegp.report.Picture(caption, figure))
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
                 posterior,
@@ -129,20 +129,13 @@ class Evaluate(Overwriting):
                 best=forcegp.report.evaluation_sentence(evaluation, unit),
                 findings=[forcegp.report.Finding("warning", each) for each in scores["warnings"]],
                 tables=[forcegp.report.evaluation_table(evaluation)],
-                pictures=self._pictures(posterior, dataset),
+                pictures=pictures,
                 details={**scores, "forcegp": forcegp.__version__},
                 shapes=self.shapes,
                 progress=progress,
             )
             forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
         terminal.note(f"report: {self.report}")
-
-    def _pictures(self, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[forcegp.report.Picture]:
-        mu = self.friction_coefficient
-        if mu is None:
-            return []
-        figure = forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
-        return [forcegp.report.Picture("How much more force along the ground every foot could bear.", figure)]
 
 
 def evaluate_with_progress(

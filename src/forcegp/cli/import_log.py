@@ -10,11 +10,10 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, require_free_file, unless_given
+from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -125,9 +124,8 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
         """Read, check and write."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
-        if self.write_mapping is not None:
-            require_free_file(self.write_mapping, overwrite=self.overwrite, own=_is_mapping, what="a mapping")
+        self.require_free_file(self.out)
+        self.require_free_file(self.write_mapping, _is_mapping, "a mapping")
         mapping = self._mapping(terminal)
         options = self._options()
         system, preparation = self._system(), self._preparation()
@@ -152,19 +150,15 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
     def _system(self) -> forcegp.MechanicalSystem | None:
         """The robot of the options, with the known forces and contacts of --identified, or with feet and wheels."""
         touching = [*parse_feet(self.feet), *parse_wheels(self.wheels)]
+        system = self.chosen()
+        if not touching:
+            return system
         option = "--feet" if self.feet else "--wheels"
-        found = self._identified_system()
-        if found is not None:
-            if touching:
-                raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
-            return found
-        robot = self.chosen_robot()
-        if robot is None:
-            if touching:
-                raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
-            return None
-        system = self.with_loops(robot)
-        return system.with_contacts((*touching, *system.loops)) if touching else system
+        if self.identified is not None:
+            raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
+        if system is None:
+            raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
+        return system.with_contacts((*touching, *system.loops))
 
     def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""

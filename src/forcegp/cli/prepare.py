@@ -13,7 +13,7 @@ import forcegp
 import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import DATASET, Overwriting, require_free_file, unless_given
+from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.import_log import stance_text
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, facts, shown
@@ -45,7 +45,7 @@ class Prepare(PreparationOptions, RobotOptions, Overwriting):
         """Prepare, save, draw if asked to, and show."""
         if not self.words("cutoff", "delay", "lag", "stance", "every", "trim"):
             raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --stance, --every or --trim.")
-        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
+        self.require_free_file(self.out)
         self.require_free(self.plots)
 
         preparation = replace(self._preparation(), stance=self.stance)

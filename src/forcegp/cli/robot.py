@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.report
-from forcegp.cli.command import URDF, Overwriting, require_free_file, unless_given
+from forcegp.cli.command import URDF, Overwriting, unless_given
 from forcegp.cli.input_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import RobotFileWarning
@@ -51,8 +51,7 @@ class Robot(RobotFileOptions, Overwriting):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
-        if self.out is not None:
-            require_free_file(self.out, overwrite=self.overwrite, own=_own, what="a PNG or a robot file")
+        self.require_free_file(self.out, _own, "a PNG or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
             options = {"inertias": self.inertias, "strict": self.strict, **self._changes()}

@@ -13,10 +13,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.data
 import forcegp.simulation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import Overwriting, require_free_file, unless_given
+from forcegp.cli.command import Overwriting, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -77,7 +76,7 @@ class Simulate(Overwriting):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Simulate and save."""
-        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
+        self.require_free_file(self.out)
         start = time.monotonic()
         dataset = simulate_with_progress(terminal, self.scenario, **self._config())
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:

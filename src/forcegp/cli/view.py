@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.report
-from forcegp.cli.command import URDF, InputPath, Overwriting, require_free_file, unless_given
+from forcegp.cli.command import URDF, InputPath, Overwriting, begins, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -54,11 +54,8 @@ class View(Overwriting):
             raise InvalidInput(f"{len(self.shown)} paths were given; give a dataset, or a model and a dataset.")
         *runs, data = self.shown
         run = runs[0] if runs else None
-        if self.html is not None:
-            require_free_file(self.html, overwrite=self.overwrite, own=forcegp.report.is_page, what="a report")
-        if self.rerun is not None:
-            own = lambda path: path.read_bytes().startswith(b"RRF")  # noqa: E731
-            require_free_file(self.rerun, overwrite=self.overwrite, own=own, what="a log of rerun")
+        self.require_free_file(self.html, forcegp.report.is_page, "a report")
+        self.require_free_file(self.rerun, begins(b"RRF"), "a log of rerun")
         posterior = None if run is None else forcegp.load_posterior(run)
         recorded = forcegp.report.recorded_scene(
             forcegp.Dataset.load(data), posterior, start=self.start, seconds=self.seconds, shapes=self.shapes
