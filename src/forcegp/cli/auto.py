@@ -10,8 +10,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from rich.table import Table
-from rich.text import Text
 from typing_extensions import override
 from tyro.conf import arg
 
@@ -19,8 +17,6 @@ import forcegp
 import forcegp.analytical
 import forcegp.checks
 import forcegp.data
-import forcegp.evaluation
-import forcegp.recordings
 import forcegp.report
 import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
@@ -30,7 +26,7 @@ from forcegp.cli.fit import calibrated_with_progress
 from forcegp.cli.import_log import Import
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import MODEL_PARTS
-from forcegp.cli.terminal import Terminal, findings_table
+from forcegp.cli.terminal import Terminal, facts, findings_table
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
@@ -138,12 +134,7 @@ class Auto(Resuming, Import):
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
         identified.system.robot.to_urdf(self.out / "identified.urdf")
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
-        table = Table.grid(padding=(0, 2))
-        table.add_column(style="bold", no_wrap=True)
-        table.add_column(overflow="fold")
-        for line in answer:
-            table.add_row(*map(Text, line))
-        terminal.show(table, Text(best))
+        terminal.show(facts("", dict(answer)), best)
         return content
 
     def _require_own_folder(self) -> None:

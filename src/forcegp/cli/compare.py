@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from tyro.conf import arg
 
 import forcegp
 import forcegp.evaluation
-import forcegp.inference
 import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
@@ -138,11 +138,8 @@ class Compare(LearningOptions):
         if self.out is not None:
             following = f"Next: forcegp evaluate {self.out / folders[preferred]} TEST.h5"
         else:
-            chosen = "".join(f" {_quoted(word)}" for word in self.words(*SAME))
-            following = (
-                f"Next: forcegp fit {self.data}{chosen} --prior {_quoted(preferred)} --points {comparison.points} "
-                "--out run"
-            )
+            words = [str(self.data), *self.words(*SAME), "--prior", preferred, "--points", str(comparison.points)]
+            following = f"Next: forcegp fit {shlex.join(words)} --out run"
         table = columns(title, header, rows, long_names=True)
         return [table, comparison.verdict, following]
 
@@ -171,7 +168,3 @@ def _folders(comparison: forcegp.PriorComparison) -> dict[str, str]:
     return {
         name: text if taken.count(text) == 1 else f"{text}-{place}" for place, (name, text) in enumerate(plain.items())
     }
-
-
-def _quoted(name: str) -> str:
-    return name if re.fullmatch(r"[\w.:=,/@-]+", name) else f'"{name}"'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Mapping
@@ -80,7 +79,13 @@ INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 
 def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
-    _refuse_what_does_nothing(command)
+    # the silent neglect of options of the other models would be a surprise
+    if given := command.words("learn", "prior", "mean", "points", "learning_points", "noise"):
+        option = given[0].partition("=")[0]
+        raise InvalidInput(
+            f"{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
+            "rows; leave it out, or use --model structured."
+        )
     if command.motions is not None and command.model != "consistent":
         raise InvalidInput("--motions refines a robot, which least-squares need not find; use --model consistent.")
     friction = friction_laws(command.friction)
@@ -133,16 +138,6 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*tables, *_report_of_regression(command, found, content, identified))
     return {"run": str(command.out), "data": str(command.data), **content}
-
-
-def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
-    """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
-    if given := command.words("learn", "prior", "mean", "points", "learning_points", "noise"):
-        option = given[0].partition("=")[0]
-        raise InvalidInput(
-            f"{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
-            "rows; leave it out, or use --model structured."
-        )
 
 
 def _report_of_regression(
@@ -272,8 +267,7 @@ class Identify(IdentifyOptions):
             found = replace(posterior.identification, progress=report)
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
-        identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
-        self._write(posterior, {"identification.json": identification}, posterior.system.robot)
+        self._write(posterior, content)
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:

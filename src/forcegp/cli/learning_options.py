@@ -78,8 +78,6 @@ def friction_laws(given: Sequence[str]) -> tuple[str, ...]:
     return tuple(law for law in given if law != "none")
 
 
-RowsChoice = Literal["auto", "in-contact", "all"]
-
 NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
 HARDLY_ANY = 0.2
@@ -118,8 +116,6 @@ class LearningOptions(BackendOptions, RobotOptions, Overwriting):
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
-    out: Annotated[Path | None, unless_given("FOLDER", "none")] = None
-    """The folder to write."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
     where it does not)."""
@@ -140,7 +136,7 @@ class LearningOptions(BackendOptions, RobotOptions, Overwriting):
     known_force: Annotated[tuple[str, ...], listed("NAME,...", "the dataset's")] = ()
     """The complete list of known forces, instead of the dataset's: actuation, rigid-body-bias,
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
-    rows: RowsChoice = "auto"
+    rows: Literal["auto", "in-contact", "all"] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     checks: Annotated[bool, arg(help_behavior_hint="")] = True

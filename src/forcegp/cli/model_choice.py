@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -13,6 +13,7 @@ import forcegp
 import forcegp.data
 import forcegp.models
 import forcegp.priors
+from forcegp.atomic_files import write_json
 from forcegp.cli.command import FIELDS, listed, numbers_of, unless_given
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.errors import InvalidInput
@@ -35,23 +36,17 @@ ITERATIONS_HINT = f"{ITERATIONS}; networks 5000, ensembles 3000"
 class FitOptions(LearningOptions):
     """What every command asks that writes one fitted model."""
 
-    out: Annotated[Path, arg(metavar="FOLDER")] = field()
+    out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
 
-    def _write(
-        self,
-        posterior: forcegp.models.Posterior,
-        more: Mapping[str, str] | None = None,
-        identified: forcegp.Robot | None = None,
-    ) -> None:
-        """The model, `more` files by name with their text, the URDF of a robot, and how it was made."""
+    def _write(self, posterior: forcegp.models.Posterior, identification: Mapping[str, Any] | None = None) -> None:
+        """The model and how it was made; of an identification also its numbers and the URDF of its robot."""
         content = {**self._given(), "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
-            for name, text in (more or {}).items():
-                (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
-            if identified is not None:
-                identified.to_urdf(folder / "identified.urdf")
+            if identification is not None:
+                write_json(folder / "identification.json", identification)
+                posterior.system.robot.to_urdf(folder / "identified.urdf")
 
 
 @dataclass(frozen=True, kw_only=True)

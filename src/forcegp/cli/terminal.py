@@ -243,8 +243,8 @@ def facts(title: str, values: Mapping[str, str]) -> Table:
     from rich.text import Text
 
     table = Table(title=title, box=None, show_header=False, **PLAIN)
-    table.add_column(style="dim")
-    table.add_column()
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
     for name, value in values.items():
         table.add_row(name, Text(value))
     return table

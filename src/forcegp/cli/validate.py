@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +17,7 @@ from forcegp.atomic_files import file_digest
 from forcegp.cli.command import DATASET, BackendOptions, Resuming, listed, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import MODEL_PARTS, friction_laws
-from forcegp.cli.terminal import NONE, Terminal, columns, number
+from forcegp.cli.terminal import NONE, Terminal, columns, number, percent
 
 SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")
 """Options that have the names of fields of `forcegp.Comparison`."""
@@ -156,8 +156,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
         return {"title": str(self.data), "data": [f"{self.data} (SHA-256 {digest[:16]}…)", *robot], "sha256": digest}
 
     def _report(self, document: Mapping[str, Any]) -> list[Any]:
-        def median(value: Mapping[str, Any] | None) -> str:
-            return number(None if value is None else value["median"])
+        def median(value: Mapping[str, Any] | None, show: Callable[[float | None], str] = number) -> str:
+            return show(None if value is None else value["median"])
 
         rows = []
         for name, model in document["models"].items():
@@ -166,15 +166,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
                 continue
             motions = model["motions"]
             last = None if motions is None or not motions["rms"] else motions["rms"][-1]
-            covered = model["coverage_95"]
-            rows.append(
-                [
-                    name,
-                    *(median(model[score]) for score in ("nrmse", "force_rms", "nlpd")),
-                    NONE if covered is None else f"{100.0 * covered['median']:.1f} %",
-                    median(last),
-                ]
-            )
+            errors = [median(model[score]) for score in ("nrmse", "force_rms", "nlpd")]
+            rows.append([name, *errors, median(model["coverage_95"], percent), median(last)])
         header = ["model", "nRMSE", "force error", "NLPD", "in 95 %", "motion"]
         title = f"{self.data}: medians over {len(document['seeds'])} seed(s) and {len(document['splits'])} split(s)"
         failed = [
