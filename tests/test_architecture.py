@@ -26,7 +26,7 @@ PACKAGES = {
     "robots": {"errors", "summary", "atomic_files", "codegen"},
     "mechanics": {"errors", "summary", "robots"},
     "data": {"errors", "summary", "atomic_files", "robots", "mechanics"},
-    "recordings": {"errors", "robots", "mechanics", "data"},
+    "recordings": {"errors", "summary", "atomic_files", "robots", "mechanics", "data"},
     "analytical": {"errors", "summary", "robots", "mechanics", "data"},
     "checks": {"errors", "summary", "robots", "mechanics", "data", "analytical"},
     "priors": {"errors", "robots", "mechanics"},

@@ -271,5 +271,10 @@ def _text(folder: Path, names: Iterable[str]) -> str:
 
 
 def _line(folder: Path, name: str) -> str:
-    with (folder / name).open("rb") as file:
-        return f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {name}\n"
+    return f"{file_digest(folder / name)}  {name}\n"
+
+
+def file_digest(path: Path) -> str:
+    """The SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

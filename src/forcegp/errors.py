@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import importlib
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -154,6 +155,15 @@ class BackendError(ForceGPError):
 
 class MissingExtra(ForceGPError, ImportError):
     """An optional dependency is not installed; the message holds the pip command."""
+
+
+def required_extra(module: str, extra: str, what: str) -> Any:
+    """The module of an optional package, which `what` needs; MissingExtra names the `extra` that installs it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        raise MissingExtra(f"{what} needs {package}: pip install 'forcegp[{extra}]'") from error
 
 
 class NumericalWarning(UserWarning):

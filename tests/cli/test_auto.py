@@ -122,7 +122,7 @@ def test_the_printed_command_keeps_every_option():
         ("auto log.csv --out x", "--robot"),
         ("auto log.csv --robot arm.urdf --out deep/er", "the folder deep does not exist"),
         ("auto log.csv --robot arm.urdf --q Wnkel_{1..2} --u Moment_{1..2} --time Zeit --out x", "Wnkel_1"),
-        ("auto log.csv --robot arm.urdf --every 0 --out x", "every is 0"),
+        ("auto log.csv --robot arm.urdf --every 0 --out x", "--every 0 must be an integer of at least 1"),
         ("auto log.csv --robot arm.urdf --out mine", "mine was not written by forcegp auto"),
     ],
 )

@@ -101,7 +101,7 @@ REFUSALS = {
     ("prepare", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
     ("prepare", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",
     ("prepare", "noisy.h5", "--lag", "auto", "--delay", "each", "--out", "x.h5"): "give one of them in s",
-    ("prepare", "noisy.h5", "--every", "0", "--out", "x.h5"): "every is 0",
+    ("prepare", "noisy.h5", "--every", "0", "--out", "x.h5"): "--every 0 must be an integer of at least 1",
     ("prepare", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("prepare", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 is not a file",
     ("check", "clean.h5", "--plots", "mine"): "was not written by `forcegp check`, so it is not overwritten",

@@ -94,7 +94,7 @@ WRONG = [
     (f"compare train.h5 {TWO} --points 1", "--points 1 must be an integer from 2 to 60, the rows"),
     (f"compare train.h5 {TWO} --block-seconds 0", "seconds is 0.0; it must be positive"),
     (f"compare train.h5 {TWO} --block-seconds 50", "too few to compare by"),
-    (f"compare train.h5 {TWO} --seed -1", "--seed is -1"),
+    (f"compare train.h5 {TWO} --seed -1", "--seed=-1 must be an integer of at least 0"),
     (f"compare train.h5 {TWO} --noise loud", "--noise is 'loud'"),
     (f"compare train.h5 {TWO} --test missing.h5", "missing.h5 is not a file"),
     (f"compare train.h5 {TWO} --out train.h5", "train.h5 would be written over train.h5"),

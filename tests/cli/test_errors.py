@@ -51,7 +51,7 @@ WRONG = [
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --robot missing.urdf --out run", "missing.urdf: no such file"),
     ("fit arm.h5 --points 1 --out run", "--points 1 must be an integer from 2 to 20, the rows"),
-    ("fit arm.h5 --seed -1 --out run", "--seed is -1; it must be at least 0"),
+    ("fit arm.h5 --seed -1 --out run", "--seed=-1 must be an integer of at least 0"),
     ("fit arm.h5 --restarts 0 --out run", "--restarts 0 must be"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
     ("fit arm.h5 --noise -0.1 --out run", "give a positive, finite standard deviation"),
@@ -138,7 +138,7 @@ def test_a_run_of_another_robot_is_refused(folder, capfd):
     dataclasses.replace(Dataset.load("no_robot.h5"), joint_names=names).save("other.h5")
     capfd.readouterr()
     assert main(["evaluate", "run", "other.h5"]) == 2
-    assert "dataset are pan, lift, wrist, those of the model pan, lift, bend" in capfd.readouterr().err
+    assert "other.h5 has joints pan, lift, wrist; the model was trained on pan, lift, bend" in capfd.readouterr().err
 
 
 def test_robot_and_contact_replace_those_of_the_dataset(folder):

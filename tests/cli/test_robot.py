@@ -10,7 +10,7 @@ from tests.robots.test_base import LOOSE
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_remedies import MANY
 
-from forcegp import Dataset, Robot
+from forcegp import Dataset, MechanicalSystem, Robot
 from forcegp.cli.main import parse_arguments
 
 
@@ -87,20 +87,20 @@ def test_every_command_with_a_robot_takes_its_base(tmp_path):
     path = tmp_path / "dog.urdf"
     path.write_text(LOOSE["legs"])
     command = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path), "--base", "fixed"])
-    robot = command.chosen_robot()
-    assert robot.base == "fixed"
-    again = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path)]).chosen_robot(robot)
+    recorded = command.chosen()
+    assert recorded.robot.base == "fixed"
+    again = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path)]).chosen(recorded).robot
     assert again.base == "fixed"  # as recorded
     assert isinstance(again, Robot)
 
 
 @pytest.mark.filterwarnings("ignore::forcegp.errors.RobotFileWarning")
 def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
-    recorded = Robot.from_urdf_text(CHAIN)
-    recorded.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
+    recorded = MechanicalSystem(Robot.from_urdf_text(CHAIN))
+    recorded.robot.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
     words = ["fit", "log.h5", "--out", "run", "--robot", str(tmp_path / "identified.urdf")]
-    assert parse_arguments(words).chosen_robot(recorded).armature.tolist() == [0.0, 0.3, 0.0, 0.0]
-    assert parse_arguments([*words, "--armature", "tilt=1"]).chosen_robot(recorded).armature.tolist() == [0, 0, 0, 1]
+    assert parse_arguments(words).chosen(recorded).robot.armature.tolist() == [0.0, 0.3, 0.0, 0.0]
+    assert parse_arguments([*words, "--armature", "tilt=1"]).chosen(recorded).robot.armature.tolist() == [0, 0, 0, 1]
 
 
 def test_an_undefined_root_is_named(tmp_path, forcegp):

@@ -14,7 +14,7 @@ from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.main import parse_arguments
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError, NonPhysicalInertia
-from forcegp.mechanics import CoulombJointFriction
+from forcegp.mechanics import CoulombJointFriction, MechanicalSystem
 from forcegp.robots import Robot
 
 
@@ -38,10 +38,14 @@ def folder(tmp_path_factory):
 
 
 def test_every_option_reaches_the_robot(folder):
-    chosen = options(
-        *("--robot", str(folder / "arm.urdf"), "--armature", "pan=0.5", "--gravity", "0,1,-9"),
-        *("--lock", "bend=0.3"),
-    ).chosen_robot()
+    chosen = (
+        options(
+            *("--robot", str(folder / "arm.urdf"), "--armature", "pan=0.5", "--gravity", "0,1,-9"),
+            *("--lock", "bend=0.3"),
+        )
+        .chosen()
+        .robot
+    )
     assert chosen.joint_names == ("pan", "lift")
     assert chosen.locked == {"bend": 0.3}
     assert chosen.armature.tolist() == [0.5, 0.0]
@@ -49,25 +53,25 @@ def test_every_option_reaches_the_robot(folder):
 
 
 def test_what_no_urdf_holds_stays_as_recorded(folder):
-    recorded = Robot.from_urdf_text(URDF, gravity=(0.0, 0.0, -1.6), armature=[0.1, 0.2, 0.3])
+    recorded = MechanicalSystem(Robot.from_urdf_text(URDF, gravity=(0.0, 0.0, -1.6), armature=[0.1, 0.2, 0.3]))
     words = "--robot", str(folder / "arm.urdf")
-    same = options(*words).chosen_robot(recorded)
+    same = options(*words).chosen(recorded).robot
     assert same.gravity.tolist() == [0.0, 0.0, -1.6]
     assert same.armature.tolist() == [0.1, 0.2, 0.3]
     for given in (words, ()):  # also without another URDF
-        other = options(*given, "--armature", "lift=0.9", "--gravity", "0,0,-9.81").chosen_robot(recorded)
+        other = options(*given, "--armature", "lift=0.9", "--gravity", "0,0,-9.81").chosen(recorded).robot
         assert other.gravity.tolist() == [0.0, 0.0, -9.81]
         assert other.armature.tolist() == [0.1, 0.9, 0.3]
-    assert options().chosen_robot(recorded) is recorded
-    assert options().chosen_robot() is None
+    assert options().chosen(recorded) is recorded
+    assert options().chosen() is None
 
 
 def test_impossible_inertias_are_refused_or_repaired(folder):
     words = "--robot", str(folder / "broken.urdf")
     with pytest.raises(NonPhysicalInertia, match=r"inertias='nearest'.*--inertias nearest"):
-        options(*words).chosen_robot()
+        options(*words).chosen()
     with pytest.warns(DataWarning, match="'arm'"):
-        assert options(*words, "--inertias", "nearest").chosen_robot().nv == 1
+        assert options(*words, "--inertias", "nearest").chosen().robot.nv == 1
 
 
 def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_data(folder):
@@ -76,6 +80,9 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
         system = options("--identified", str(given)).chosen_system(data, folder / "log.h5")
         np.testing.assert_array_equal(system.known_forces[-1].coefficients, [0.1, 0.2, 0.3])
         assert system.contacts == data.system.contacts
+        np.testing.assert_array_equal(
+            options("--identified", str(given)).chosen().known_forces[-1].coefficients, [0.1, 0.2, 0.3]
+        )
 
 
 @pytest.mark.parametrize(
@@ -126,4 +133,4 @@ def test_a_pipe_is_refused_at_once(tmp_path):
     """To open it would wait for a writer for ever."""
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ForceGPError, match="pipe is not a regular file"):
-        options("--identified", str(tmp_path / "pipe")).chosen_robot()
+        options("--identified", str(tmp_path / "pipe")).chosen()

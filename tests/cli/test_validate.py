@@ -149,7 +149,7 @@ WRONG = [
     (f"validate log.h5 {OUT} --split thirds", "the split is 'thirds'"),
     (f"validate log.h5 {OUT} --split episodes:9", "no episode or log is called so"),
     (f"validate log.h5 {OUT} --split blocks:5:9", "name some of 1 to 5"),
-    (f"validate log.h5 {OUT} --every 0", "every is 0"),
+    (f"validate log.h5 {OUT} --every 0", "--every 0 must be an integer of at least 1"),
     (f"validate log.h5 {OUT} --split blocks:5:3 --guard -1", "guard is -1"),
     (f"validate log.h5 {OUT} --points 500", "two thirds"),
     (f"validate log.h5 {OUT} --seeds 0", "number of seeds is 0"),

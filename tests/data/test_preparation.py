@@ -310,10 +310,10 @@ def test_rows_that_no_longer_carry_the_motion_are_warned_of():
     [
         ({"cutoff": -1.0}, "cutoff is -1.0; give a frequency > 0 in Hz"),
         ({"cutoff": "automatic"}, "cutoff is 'automatic'"),
-        ({"order": 0}, "order is 0"),
+        ({"order": 0}, "`order=0`"),
         ({"delay": "soon"}, "delay is 'soon'; give seconds"),
         ({"delay": (0.1, np.nan)}, "delay is"),
-        ({"every": 0}, "every is 0; it must be an integer of at least 1"),
+        ({"every": 0}, "`every=0` must be an integer of at least 1"),
         ({"trim": -1.0}, "trim is -1.0"),
         ({"differentiate": "u"}, "allowed: 'q' or 'v'"),
     ],

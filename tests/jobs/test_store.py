@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from forcegp.atomic_files import write_json
+from forcegp.atomic_files import remove_leftovers, write_json
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.jobs import JobStore
 
@@ -100,7 +100,7 @@ def test_leftovers_of_killed_runs_go(results):
     store(results, "fits/a", "1", {})
     leftover = results.folder / "jobs" / "fits" / ".b.0123456789ab.tmp"
     leftover.mkdir()
-    results.remove_leftovers()
+    remove_leftovers(results.folder)
     assert not leftover.exists()
     assert results.has("fits/a", "1")
 
@@ -111,7 +111,7 @@ def test_a_run_killed_before_its_description_does_not_block_the_folder(tmp_path)
     (folder / ".jobs.json.0123456789ab.tmp").write_text('{"kind"')
     results = JobStore.open(folder, KIND, {"preset": "smoke"})
     with results.locked():
-        results.remove_leftovers()
+        remove_leftovers(results.folder)
     assert sorted(entry.name for entry in folder.iterdir()) == [".lock", "jobs", "jobs.json"]
 
 

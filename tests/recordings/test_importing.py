@@ -24,7 +24,7 @@ import forcegp.recordings.reading as reading
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
-from forcegp.recordings.episode_rows import EpisodeRows, Stretch
+from forcegp.recordings.episode_rows import Stretch, episode_rows
 from forcegp.recordings.formats import open_source
 from forcegp.recordings.moving_base import Layout
 from forcegp.recordings.reading import Spool
@@ -120,11 +120,11 @@ def test_pieces_of_an_episode_are_those_of_the_whole(tmp_path, rows, logged):
         "log", source, 0, data["time"] - data["time"][0], 0.0, np.array([[0, 0]]), np.zeros(4), np.zeros(4), ()
     )
     layout = Layout({name: slice(2 * k, 2 * k + 2) for k, name in enumerate(logged)}, ConfigurationSpace(2))
-    episode = EpisodeRows(Stretch(recording, 0, 1000, 0), np.ones(1000, bool), layout, STEP)
+    stretch = Stretch(recording, 0, 1000, 0)
     with Spool(tmp_path, signals.shape[1]) as spool:
         spool.append(signals[:400])
         spool.append(signals[400:])
-        found = list(episode.pieces(spool, rows))
+        found = list(episode_rows(spool, stretch, np.ones(1000, bool), layout, STEP, rows))
     joined = {name: np.concatenate([piece[name] for piece in found]) for name in found[0]}
     # the oracle is another implementation of splines, fitted to everything at once
     time = STEP * np.arange(len(joined["time"]))

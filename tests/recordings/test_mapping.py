@@ -129,7 +129,7 @@ def test_whole_thousandths_round_once():
 
 def test_every_quantity_has_its_own_units():
     assert all(units for units in UNITS.values())
-    with pytest.raises(InvalidInput, match="u has no unit 'NM'; did you mean Nm"):
+    with pytest.raises(InvalidInput, match="no unit 'NM' in the units of u; did you mean 'Nm'"):
         log_unit("u", "NM")
 
 

@@ -21,6 +21,7 @@ from forcegp.checks.successive_rows import (
     white_noise,
 )
 from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
+from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
@@ -76,11 +77,6 @@ def import_flags(correction: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> str
 def worst(findings: Sequence[Finding]) -> Severity:
     """The severity of the worst of them; ok if there are none."""
     return SEVERITIES[max((SEVERITIES.index(finding.severity) for finding in findings), default=0)]
-
-
-def plain(values: np.ndarray) -> list[float | None]:
-    """Numbers for JSON, which has no NaN."""
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def numbers_of(values: Sequence[float | None]) -> np.ndarray:
@@ -227,8 +223,7 @@ def _mended(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
 
 
 def _angular(dataset: Dataset) -> np.ndarray:
-    units = dataset.units["q"]
-    return np.array([unit == "rad" for unit in ([units] * dataset.nv if isinstance(units, str) else units)])
+    return np.array(unit_of_each("q", dataset.units["q"], dataset.nv)) == "rad"
 
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:

@@ -24,6 +24,7 @@ from forcegp.checks.torques import (
     with_gravity,
 )
 from forcegp.data import Dataset
+from forcegp.data.dataset_fields import unit_of_each
 from forcegp.robots import Robot
 
 SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
@@ -257,11 +258,8 @@ def _gravity(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hy
 
 def _degrees(given: Dataset, signal: str, turned: np.ndarray) -> tuple[str, ...]:
     """The unit of the signal of every joint, with degrees where `turned`."""
-    units = given.units[signal]
-    each = [units] * given.nv if isinstance(units, str) else units
-    return tuple(
-        unit.replace("rad", "deg") if degrees else str(unit) for unit, degrees in zip(each, turned, strict=True)
-    )
+    each = zip(unit_of_each(signal, given.units[signal], given.nv), turned, strict=True)
+    return tuple(unit.replace("rad", "deg") if degrees else unit for unit, degrees in each)
 
 
 def _worth(now: Hypothesis, joint: int) -> bool:

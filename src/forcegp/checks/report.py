@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, numbers_of, plain, worst
+from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, numbers_of, worst
 from forcegp.checks.dynamics import dynamics_findings
 from forcegp.checks.excitation import excitation_findings, noise_findings, stated_noise_findings, torque_noise
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
@@ -18,6 +18,7 @@ from forcegp.checks.stance import stance_findings, unmeasured_base_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.preparation import plain
 from forcegp.errors import require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot

@@ -8,6 +8,7 @@ import numpy as np
 from forcegp.checks.check_input import CheckInput, Finding, listed, look, wrong
 from forcegp.checks.successive_rows import consecutive, runs
 from forcegp.data import Dataset
+from forcegp.data.dataset_fields import unit_of_each
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
@@ -196,7 +197,7 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
         row, joint = (int(index) for index in np.unravel_index(np.argmax(excess), excess.shape))
         beyond = inputs.named(np.flatnonzero((excess > 0.0).any(axis=0)))
         others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
-        unit = log.units[name] if isinstance(log.units[name], str) else log.units[name][joint]
+        unit = unit_of_each(name, log.units[name], log.nv)[joint]
         yield look(
             subject="limits",
             seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, look, ok, plain, wrong
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, look, ok, wrong
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT
+from forcegp.data.preparation import plain
 from forcegp.errors import DatasetError
 
 NO_WORSE = 2.0  # factor by which more may remain without a rotor inertia

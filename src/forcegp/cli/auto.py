@@ -10,8 +10,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from rich.table import Table
-from rich.text import Text
 from typing_extensions import override
 from tyro.conf import arg
 
@@ -19,8 +17,6 @@ import forcegp
 import forcegp.analytical
 import forcegp.checks
 import forcegp.data
-import forcegp.evaluation
-import forcegp.recordings
 import forcegp.report
 import forcegp.validation
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
@@ -30,7 +26,7 @@ from forcegp.cli.fit import calibrated_with_progress
 from forcegp.cli.import_log import Import
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import MODEL_PARTS
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import Terminal, facts, findings_table
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
 
 MOST_CORRECTIONS = 8
@@ -89,7 +85,7 @@ class Auto(Resuming, Import):
             dataset, done, mapping, mistakes = self._imported(terminal, system, mapping, path)
             corrected = self._command(mapping)
             if mistakes and not self.correct:
-                terminal.show(_findings(terminal, mistakes), "Run:")
+                terminal.show(findings_table(mistakes, terminal.worded), "Run:")
                 terminal.command(corrected)
                 raise DatasetError(
                     f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
@@ -98,7 +94,7 @@ class Auto(Resuming, Import):
                 report = forcegp.check(dataset)
             wrong = [finding for finding in report.findings if finding.severity == "wrong"]
             if wrong and not self.accept:
-                terminal.show(_findings(terminal, wrong))
+                terminal.show(findings_table(wrong, terminal.worded))
                 raise DatasetError(
                     f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
                     "add --accept to continue."
@@ -138,12 +134,7 @@ class Auto(Resuming, Import):
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
         identified.system.robot.to_urdf(self.out / "identified.urdf")
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
-        table = Table.grid(padding=(0, 2))
-        table.add_column(style="bold", no_wrap=True)
-        table.add_column(overflow="fold")
-        for line in answer:
-            table.add_row(*map(Text, line))
-        terminal.show(table, Text(best))
+        terminal.show(facts("", dict(answer)), best)
         return content
 
     def _require_own_folder(self) -> None:
@@ -316,15 +307,3 @@ def _mistake(error: MistakenUnit, correction: Mapping[str, Any]) -> forcegp.chec
     seen, remedy = str(error).partition(" Is ")[0], f"forcegp import {forcegp.checks.import_flags(correction)}"
     subject = f"unit of {error.quantity}"
     return forcegp.checks.Finding(severity="wrong", subject=subject, seen=seen, remedy=remedy, correction=correction)
-
-
-def _findings(terminal: Terminal, findings: list[forcegp.checks.Finding]) -> Table:
-    table = Table.grid(padding=(0, 1))
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    for finding in findings:
-        table.add_row(
-            Text(finding.severity, style="bold red"), Text(f"{finding.subject}: {terminal.worded(finding.seen)}")
-        )
-        table.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
-    return table

@@ -12,16 +12,14 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, unless_given
+from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
-from forcegp.cli.terminal import Terminal, columns, shown
+from forcegp.cli.terminal import Terminal, columns, findings_table, shown
 from forcegp.errors import DatasetError
-
-COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(CutoffOptions, RobotOptions):
+class Check(CutoffOptions, RobotOptions, Overwriting):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
     Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
@@ -39,8 +37,6 @@ class Check(CutoffOptions, RobotOptions):
     """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
@@ -70,21 +66,12 @@ class Check(CutoffOptions, RobotOptions):
 
 def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
     """One paragraph per finding, worst first, and the numbers of every joint."""
-    from rich.table import Table
     from rich.text import Text
 
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
-    findings = Table.grid(padding=(0, 1))
-    findings.add_column(no_wrap=True)
-    findings.add_column(overflow="fold")
-    for finding in report.findings:
-        text = Text(f"{finding.subject}: ", style="bold")
-        text.append(terminal.worded(finding.seen), style="not bold")
-        findings.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
-        if finding.remedy:
-            findings.add_row("", Text(f"→ {terminal.worded(finding.remedy)}", style="dim"))
+    findings = findings_table(report.findings, terminal.worded)
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
     return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, get_type_hints
 from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+import forcegp.data
 import forcegp.parallel
 from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_writable, write_digests, write_json
 from forcegp.cli.terminal import Terminal
@@ -250,6 +251,35 @@ class BackendOptions(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Overwriting(Command):
+    """A command that may replace what an earlier one wrote."""
+
+    overwrite: bool = False
+    """Replace what is there, if forcegp wrote it."""
+
+    def require_free_file(
+        self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
+    ) -> None:
+        """Refuse what exists, but `own` or empty with --overwrite, or cannot be written. None is no file.
+
+        `own` is whether a file is `what` forcegp writes. Raises InvalidInput and OSError.
+        """
+        if path is None:
+            return
+        if path.is_dir():
+            raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
+        if path.exists() and not path.is_file():
+            raise InvalidInput(f"{path} is not a regular file; choose another name.")
+        if path.exists() and not self.overwrite:
+            raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
+        if not path.parent.is_dir():
+            raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
+        if path.exists() and path.stat().st_size and not (own or forcegp.data.is_dataset)(path):
+            raise InvalidInput(f"{path} is not {what}, so it is not overwritten; choose another name.")
+        require_writable(path)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Resuming(Command):
     """A command that keeps every finished piece of work in its folder."""
 
@@ -257,21 +287,9 @@ class Resuming(Command):
     replaces: ClassVar[bool] = False
 
 
-def require_free_file(
-    path: Path, *, overwrite: bool, own: Callable[[Path], bool], what: str = "a dataset of forcegp"
-) -> None:
-    """Refuse what exists (but `own` or empty, with --overwrite) or cannot be written: InvalidInput, OSError."""
-    if path.is_dir():
-        raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
-    if path.exists() and not path.is_file():
-        raise InvalidInput(f"{path} is not a regular file; choose another name.")
-    if path.exists() and not overwrite:
-        raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
-    if not path.parent.is_dir():
-        raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
-    if path.exists() and path.stat().st_size and not own(path):
-        raise InvalidInput(f"{path} is not {what}, so it is not overwritten; choose another name.")
-    require_writable(path)
+def begins(mark: bytes) -> Callable[[Path], bool]:
+    """Whether a file begins so."""
+    return lambda path: path.read_bytes().startswith(mark)
 
 
 def _config(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from tyro.conf import arg
 
 import forcegp
 import forcegp.evaluation
-import forcegp.inference
 import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
@@ -56,8 +56,6 @@ class Compare(LearningOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, compare, write if asked to, and show."""
-        if self.seed < 0:
-            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         if len(self.priors) < 2:
             given = f"only {self.priors[0]}" if self.priors else "none"
             raise InvalidInput(f"--priors lists the candidates, and there is {given}; give two or more, as in a,b.")
@@ -119,7 +117,7 @@ class Compare(LearningOptions):
                 priors,
                 points=points,
                 system=system,
-                noise=resolved_noise(self.noise, dataset, self.force_noise),
+                noise=resolved_noise(self.noise, self.force_noise),
                 restarts=restarts,
                 backend=self._backend(),
                 options=options,
@@ -140,11 +138,8 @@ class Compare(LearningOptions):
         if self.out is not None:
             following = f"Next: forcegp evaluate {self.out / folders[preferred]} TEST.h5"
         else:
-            chosen = "".join(f" {_quoted(word)}" for word in self.words(*SAME))
-            following = (
-                f"Next: forcegp fit {self.data}{chosen} --prior {_quoted(preferred)} --points {comparison.points} "
-                "--out run"
-            )
+            words = [str(self.data), *self.words(*SAME), "--prior", preferred, "--points", str(comparison.points)]
+            following = f"Next: forcegp fit {shlex.join(words)} --out run"
         table = columns(title, header, rows, long_names=True)
         return [table, comparison.verdict, following]
 
@@ -173,7 +168,3 @@ def _folders(comparison: forcegp.PriorComparison) -> dict[str, str]:
     return {
         name: text if taken.count(text) == 1 else f"{text}-{place}" for place, (name, text) in enumerate(plain.items())
     }
-
-
-def _quoted(name: str) -> str:
-    return name if re.fullmatch(r"[\w.:=,/@-]+", name) else f'"{name}"'

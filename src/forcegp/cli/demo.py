@@ -13,8 +13,6 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 import forcegp
-import forcegp.evaluation
-import forcegp.inference
 import forcegp.models
 import forcegp.report
 import forcegp.simulation

@@ -14,9 +14,9 @@ import forcegp.evaluation
 import forcegp.models
 import forcegp.report
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Command, listed, require_free_file, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, listed, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
-from forcegp.cli.input_options import SystemChoice, carried_over, with_observed_wind
+from forcegp.cli.input_options import SystemChoice, model_and_data
 from forcegp.cli.terminal import (
     NORMAL_FORCES,
     NORMAL_FORCES_KNOWN,
@@ -32,7 +32,7 @@ from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Command):
+class Evaluate(Overwriting):
     """Score a fitted model on a dataset that it has not seen: errors, likelihood, coverage, constraint error.
 
     For example:
@@ -60,21 +60,15 @@ class Evaluate(Command):
     """Also write a report in one file: the robot in motion with its forces, figures and errors."""
     shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
     """A URDF with visual elements for the links in the report, its meshes beside it."""
-    overwrite: bool = False
-    """Replace the folder of plots and the report if forcegp wrote them."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Evaluate, draw if asked to, and show."""
         if self.every < 1:
             raise InvalidInput(f"--every is {self.every}; it must be at least 1.")
         self.require_free(self.plots)
-        if self.report is not None:
-            require_free_file(self.report, overwrite=self.overwrite, own=forcegp.report.is_page, what="a report")
+        self.require_free_file(self.report, forcegp.report.is_page, "a report")
 
-        posterior = forcegp.load_posterior(self.run_folder)
-        dataset = forcegp.Dataset.load(self.data)
-        posterior = carried_over(terminal, posterior, dataset, self.system)
-        posterior, dataset = with_observed_wind(terminal, posterior, dataset)
+        posterior, dataset = model_and_data(terminal, self.run_folder, self.data, self.system)
         dataset = dataset.rows(slice(None, None, self.every))
         if self.contact:
             posterior = posterior.with_system(
@@ -122,7 +116,11 @@ class Evaluate(Command):
         scores: Mapping[str, Any],
     ) -> None:
         assert self.report is not None
-        unit = acceleration_unit(dataset)
+        unit, mu, pictures = acceleration_unit(dataset), self.friction_coefficient, []
+        if mu is not None:
+            figure = forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
+            caption = "How much more force along the ground every foot could bear."
+            pictures.append(forcegp.report.Picture(caption, figure))
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
                 posterior,
@@ -131,20 +129,13 @@ class Evaluate(Command):
                 best=forcegp.report.evaluation_sentence(evaluation, unit),
                 findings=[forcegp.report.Finding("warning", each) for each in scores["warnings"]],
                 tables=[forcegp.report.evaluation_table(evaluation)],
-                pictures=self._pictures(posterior, dataset),
+                pictures=pictures,
                 details={**scores, "forcegp": forcegp.__version__},
                 shapes=self.shapes,
                 progress=progress,
             )
             forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
         terminal.note(f"report: {self.report}")
-
-    def _pictures(self, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset) -> list[forcegp.report.Picture]:
-        mu = self.friction_coefficient
-        if mu is None:
-            return []
-        figure = forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
-        return [forcegp.report.Picture("How much more force along the ground every foot could bear.", figure)]
 
 
 def evaluate_with_progress(

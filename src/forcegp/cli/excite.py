@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, listed, numbers_of, require_free_file, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, begins, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import RobotOptions
 from forcegp.cli.terminal import Terminal, columns, number
@@ -20,7 +19,7 @@ from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Excite(RobotOptions):
+class Excite(RobotOptions, Overwriting):
     """Choose the motion within limits, from rest to rest, that reduces the uncertainty of learned forces most.
 
     With --robot instead of a model, one that identifies base parameters and friction.
@@ -54,17 +53,14 @@ class Excite(RobotOptions):
     """How many motions to look at."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the motions that are looked at."""
-    overwrite: bool = False
-    """Replace the files if forcegp wrote them."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Choose, write, draw and show."""
         picture = self.out.with_suffix(".png")
-        for path, begin in ((self.out, b"t,q_"), (picture, b"\x89PNG")):
-            own = partial(_begins, begin)
-            require_free_file(path, overwrite=self.overwrite, own=own, what="what forcegp writes there")
-        robot, limits = self.chosen_robot(), {}
-        if (robot is None) == (self.run_folder is None):
+        for path, mark in ((self.out, b"t,q_"), (picture, b"\x89PNG")):
+            self.require_free_file(path, begins(mark), "what forcegp writes there")
+        system, limits = self.chosen(), {}
+        if (system is None) == (self.run_folder is None):
             raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
         for word in self.limits:
             name, _, values = word.partition("=")
@@ -73,7 +69,7 @@ class Excite(RobotOptions):
         given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
         with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
             chosen = forcegp.excitation(
-                self.with_loops(robot) if robot else forcegp.load_posterior(str(self.run_folder)),
+                system or forcegp.load_posterior(str(self.run_folder)),
                 **given,
                 margin=self.limit_share,
                 motions=self.tries,
@@ -86,7 +82,8 @@ class Excite(RobotOptions):
         chosen.save_csv(self.out)
         forcegp.evaluation.save_figure(forcegp.evaluation.excitation_figure(chosen), picture)
         terminal.note(f"figure: {picture}")
-        table = {f"{name}\nover limit": values.tolist() for name, values in chosen.usage.items()}
+        usage = {name: values.tolist() for name, values in chosen.usage.items()}
+        table = {f"{name}\nover limit": values for name, values in usage.items()}
         spread = None if chosen.spread is None else chosen.spread.tolist()
         if spread is not None:
             table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
@@ -94,10 +91,4 @@ class Excite(RobotOptions):
             [name, *map(number, each)] for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
         ]
         terminal.show(columns(str(self.out), ["joint", *table], rows))
-        usage = {name: values.tolist() for name, values in chosen.usage.items()}
         return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}
-
-
-def _begins(text: bytes, path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(text)) == text

@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
-from forcegp.cli.command import MODEL, Command, unless_given
+from forcegp.cli.command import MODEL, Overwriting, unless_given
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Command):
+class Export(Overwriting):
     """Write a fitted model as a program that needs no Python.
 
     c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
@@ -43,8 +43,6 @@ class Export(Command):
     """How the step of --steps is computed: symplectic-euler, rk4 or implicit-midpoint (stiff friction)."""
     unchecked: bool = False
     """Do not compile the program and compare it with the model."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Write and show."""

@@ -46,8 +46,6 @@ class Fit(ModelOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit and save."""
-        if self.seed < 0:
-            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         self.require_free(self.out)
         if self.motions is not None and not 0.0 < self.motions < math.inf:
             raise InvalidInput(f"--motions is {self.motions:g}; give the length of the windows in seconds, such as 1.")
@@ -102,7 +100,7 @@ class Fit(ModelOptions):
         if command.learn_from != "accelerations":
             name = forcegp.evaluation.usual_prior(system)
             return replace(command, prior=(name,)), f"prior: {name}, the usual one; windows are not looked at"
-        noise = resolved_noise(command.noise, dataset, command.force_noise)
+        noise = resolved_noise(command.noise, command.force_noise)
         options = replace(forcegp.models.default_options(forcegp.evaluation.LOOK), iterations=command.iterations)
         name, why = forcegp.evaluation.choose_prior(dataset, system, noise=noise, seed=command.seed, options=options)
         return replace(command, prior=(name,)), f"prior: {why}"

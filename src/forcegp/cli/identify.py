@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ from tyro.conf import arg
 import forcegp
 import forcegp.analytical
 import forcegp.inference
+import forcegp.mechanics
 import forcegp.models
 import forcegp.priors
 from forcegp.atomic_files import write_json
@@ -79,7 +79,13 @@ INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 
 def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
-    _refuse_what_does_nothing(command)
+    # the silent neglect of options of the other models would be a surprise
+    if given := command.words("learn", "prior", "mean", "points", "learning_points", "noise"):
+        option = given[0].partition("=")[0]
+        raise InvalidInput(
+            f"{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
+            "rows; leave it out, or use --model structured."
+        )
     if command.motions is not None and command.model != "consistent":
         raise InvalidInput("--motions refines a robot, which least-squares need not find; use --model consistent.")
     friction = friction_laws(command.friction)
@@ -132,16 +138,6 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*tables, *_report_of_regression(command, found, content, identified))
     return {"run": str(command.out), "data": str(command.data), **content}
-
-
-def _refuse_what_does_nothing(command: IdentifyOptions) -> None:
-    """Options of the other models, whose silent neglect would be a surprise. Raises InvalidInput."""
-    if given := command.words("learn", "prior", "mean", "points", "learning_points", "noise"):
-        option = given[0].partition("=")[0]
-        raise InvalidInput(
-            f"{option} means nothing to --model {command.model}, which estimates every inertia by regression on all "
-            "rows; leave it out, or use --model structured."
-        )
 
 
 def _report_of_regression(
@@ -209,15 +205,6 @@ def _report_of_regression(
     return [*tables, *lines]
 
 
-COEFFICIENT_NAMES = (
-    "viscous-joint-friction.",
-    "coulomb-joint-friction.",
-    "load-joint-friction.",
-    "armature.",
-    "rotor-inertia.",
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Identify(IdentifyOptions):
     """Estimate physical parameters of the robot along with the unknown forces, and report their standard errors.
@@ -235,8 +222,6 @@ class Identify(IdentifyOptions):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Identify and save."""
-        if self.seed < 0:
-            raise InvalidInput(f"--seed is {self.seed}; it must be at least 0.")
         if self.model == "analytical" and self.mean == "zero":
             raise InvalidInput("--model analytical has nothing but its mean; leave --mean zero out.")
         if self.model in INERTIAS:
@@ -260,7 +245,7 @@ class Identify(IdentifyOptions):
             system,
             forcegp.priors.named_prior(prior, system),
             self.mean,
-            resolved_noise(self.noise, dataset, self.force_noise),
+            resolved_noise(self.noise, self.force_noise),
         )
         posterior = fit_with_progress(
             terminal,
@@ -282,8 +267,7 @@ class Identify(IdentifyOptions):
             found = replace(posterior.identification, progress=report)
             content = found.to_dict()
         summary = fit_summary(posterior, time.monotonic() - begin)
-        identification = json.dumps(content, indent=1, allow_nan=False) + "\n"
-        self._write(posterior, {"identification.json": identification}, posterior.system.robot)
+        self._write(posterior, content)
         for name in added:
             terminal.note(f"{name} was not among the known forces, and is now.")
         if rows_note is not None:
@@ -318,8 +302,8 @@ def _report(command: Identify, found: forcegp.models.Identification, summary: Ma
 
 def _owner_and_part(name: str) -> tuple[str, str]:
     """Link or force, and part or joint."""
-    if name.startswith(COEFFICIENT_NAMES):
-        owner, _, part = name.partition(".")
+    owner, _, part = name.partition(".")
+    if owner in forcegp.mechanics.KNOWN_FORCES:
         return owner, part
     pieces = name.rsplit(".", 1 if name.endswith(".mass") else 2)
     return pieces[0], ".".join(pieces[1:])

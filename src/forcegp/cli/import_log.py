@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.data
 import forcegp.inference
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, listed, require_free_file, unless_given
+from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -29,7 +28,7 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(PreparationOptions, RobotOptions):
+class Import(PreparationOptions, RobotOptions, Overwriting):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
@@ -120,16 +119,13 @@ class Import(PreparationOptions, RobotOptions):
     """Accept positions beyond the limits of the URDF."""
     max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
     """Refuse a log with more rows."""
-    overwrite: bool = False
-    """Replace the files if they exist."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, check and write."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
-        if self.write_mapping is not None:
-            require_free_file(self.write_mapping, overwrite=self.overwrite, own=_is_mapping, what="a mapping")
+        self.require_free_file(self.out)
+        self.require_free_file(self.write_mapping, _is_mapping, "a mapping")
         mapping = self._mapping(terminal)
         options = self._options()
         system, preparation = self._system(), self._preparation()
@@ -154,19 +150,15 @@ class Import(PreparationOptions, RobotOptions):
     def _system(self) -> forcegp.MechanicalSystem | None:
         """The robot of the options, with the known forces and contacts of --identified, or with feet and wheels."""
         touching = [*parse_feet(self.feet), *parse_wheels(self.wheels)]
+        system = self.chosen()
+        if not touching:
+            return system
         option = "--feet" if self.feet else "--wheels"
-        found = self._identified_system()
-        if found is not None:
-            if touching:
-                raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
-            return found
-        robot = self.chosen_robot()
-        if robot is None:
-            if touching:
-                raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
-            return None
-        system = self.with_loops(robot)
-        return system.with_contacts((*touching, *system.loops)) if touching else system
+        if self.identified is not None:
+            raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
+        if system is None:
+            raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
+        return system.with_contacts((*touching, *system.loops))
 
     def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""
@@ -185,9 +177,7 @@ class Import(PreparationOptions, RobotOptions):
         return stored.changed_by(self._flags())
 
     def _flags(self) -> forcegp.ColumnMapping:
-        names = ("time", "step", "q", "v", "u", "a", "joints", "episode", "episodes", "orientation")
-        given: dict[str, Any] = {name: getattr(self, name) for name in names}
-        given |= {"side_by_side": self.side_by_side, "ned": self.ned}
+        given: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(forcegp.ColumnMapping)}
         if self.delimiter is not None:
             given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
@@ -195,13 +185,9 @@ class Import(PreparationOptions, RobotOptions):
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
             given["headerless"] = [int(word) for word in words]
-        for name in ("unit", "axes"):
-            if (text := getattr(self, name)) is not None:
-                given[name] = forcegp.recordings.by_quantity(name, text)
-        for name in ("sign", "scale", "offset"):
-            text = getattr(self, name)
-            if text is not None:
-                given[name] = forcegp.recordings.factors_of(name, text)
+        readers = dict.fromkeys(("unit", "axes"), forcegp.recordings.by_quantity)
+        readers |= dict.fromkeys(("sign", "scale", "offset"), forcegp.recordings.factors_of)
+        given |= {name: read(name, given[name]) for name, read in readers.items() if given[name] is not None}
         return forcegp.recordings.mapping_of(given)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ import forcegp.models
 from forcegp.atomic_files import require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import FileFormatError, InvalidInput, RobotFileWarning
+from forcegp.errors import FileFormatError, InvalidInput
 
 ROBOT_OPTIONS = ("robot", "inertias", "base", "root", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
@@ -71,79 +70,55 @@ class RobotOptions(RobotFileOptions):
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
     """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
 
-    def chosen_robot(self, recorded: forcegp.Robot | None = None) -> forcegp.Robot | None:
-        """The robot that the options ask for, else `recorded`; what no URDF holds is as recorded.
+    def chosen(self, recorded: forcegp.MechanicalSystem | None = None) -> forcegp.MechanicalSystem | None:
+        """What the options ask for, else `recorded`, whose contacts and forces stay, and what no URDF holds.
 
-        None where there is neither. Raises InvalidInput for options that contradict each other or make no sense, and
-        what `Robot.from_file` raises.
+        Closed loops of a file come along. None where there is neither. Raises InvalidInput for options that contradict
+        each other or make no sense, and what `Robot.from_file` raises.
         """
-        if self.identified is not None:
-            system = self._identified_system()
-            return None if system is None else system.robot
+        found = self._identified_system()
+        if found is not None:
+            kept = {} if recorded is None else {"contacts": recorded.contacts, "baumgarte": recorded.baumgarte}
+            return replace(found, **kept)
         changes = self._changes()
-        if self.robot is None and recorded is None:
+        if self.robot is None and (recorded is None or not changes):
             if changes:
                 raise InvalidInput(f"--{next(iter(changes)).replace('locked', 'lock')} needs --robot ARM.urdf.")
-            return None
-        if self.robot is None and not changes:
             return recorded
-        return self._made(recorded, changes)
+        if recorded is not None:
+            before = recorded.robot
+            changes = {"gravity": before.gravity.tolist(), "locked": before.locked, "base": before.base} | changes
+        if self.robot is not None:
+            own = forcegp.MechanicalSystem.from_file(self.robot, inertias=self.inertias, **changes)
+        else:
+            assert recorded is not None, "there is one of both"
+            text, source = recorded.robot.urdf_text, recorded.robot.source
+            changed = forcegp.Robot.from_urdf_text(text, source=source, inertias=self.inertias, **changes)
+            own = forcegp.MechanicalSystem(changed)
+        # robots with other joints are refused by their names: clearer than an armature of the wrong length
+        if recorded is None or own.robot.joint_names != recorded.robot.joint_names:
+            return own
+        robot = own.robot
+        if self.robot is None or self.armature or not bool(robot.armature.any()):  # else those beside the file count
+            rotors = dict(zip(robot.joint_names, recorded.robot.armature.tolist(), strict=True))
+            robot = robot.with_armature(rotors | changes.get("armature", {}))
+        system = recorded.with_robot(robot)
+        return system.with_contacts((*system.touching, *own.loops)) if own.loops else system
 
     def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
         """The dataset's own system, with what is replaced. Raises InvalidInput for none, and where joints differ."""
-        system = dataset.system
-        found = self._identified_system()
-        if found is not None and system is not None:
-            found = replace(found, contacts=system.contacts, baumgarte=system.baumgarte)
-        robot = self.chosen_robot(None if system is None else system.robot) if found is None else found.robot
-        if robot is None:
+        system = self.chosen(dataset.system)
+        if system is None:
             raise InvalidInput(
                 f"{path} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
             )
-        if robot.joint_names != tuple(dataset.joint_names):
+        if system.robot.joint_names != tuple(dataset.joint_names):
             raise InvalidInput(
-                f"{self.robot or self.identified or 'the robot'} has joints {', '.join(robot.joint_names)}; {path} has "
-                f"{', '.join(dataset.joint_names)}. Give the robot that was recorded, or --lock what was not."
+                f"{self.robot or self.identified or 'the robot'} has joints {', '.join(system.robot.joint_names)}; "
+                f"{path} has {', '.join(dataset.joint_names)}. Give the robot that was recorded, or "
+                "--lock what was not."
             )
-        if found is not None:
-            return found
-        return self.with_loops(robot, system)
-
-    def with_loops(
-        self, robot: forcegp.Robot, system: forcegp.MechanicalSystem | None = None
-    ) -> forcegp.MechanicalSystem:
-        """The robot with contacts and forces of a system, or of its own file, and with closed loops of the file."""
-        if self.robot is None:
-            return forcegp.MechanicalSystem(robot) if system is None else system.with_robot(robot)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RobotFileWarning)  # they were given when the robot was read
-            own = self._in_file(self._changes())
-        system = (own if system is None else system).with_robot(robot)
-        return system.with_contacts((*system.touching, *own.loops)) if own.loops else system
-
-    def _in_file(self, changes: dict[str, Any]) -> forcegp.MechanicalSystem:
-        assert self.robot is not None, "checked by the caller"
-        return forcegp.MechanicalSystem.from_file(self.robot, inertias=self.inertias, **changes)
-
-    def _made(self, recorded: forcegp.Robot | None, changes: dict[str, Any]) -> forcegp.Robot:
-        """A robot from its file, or from the recorded one's text, with what the options change."""
-        if recorded is not None:
-            kept = {"gravity": recorded.gravity.tolist(), "locked": recorded.locked, "base": recorded.base}
-            changes = kept | changes
-        if self.robot is not None:
-            robot = self._in_file(changes).robot
-        else:
-            assert recorded is not None, "checked by the caller"
-            robot = forcegp.Robot.from_urdf_text(
-                recorded.urdf_text, source=recorded.source, inertias=self.inertias, **changes
-            )
-        # robots with other joints are refused by their names: clearer than an armature of the wrong length
-        if recorded is None or robot.joint_names != recorded.joint_names:
-            return robot
-        if self.robot is not None and not self.armature and bool(robot.armature.any()):
-            return robot  # a file beside the URDF says more than the recording
-        kept = dict(zip(recorded.joint_names, recorded.armature.tolist(), strict=True))
-        return robot.with_armature(kept | changes.get("armature", {}))
+        return system
 
     def _identified_system(self) -> forcegp.MechanicalSystem | None:
         if self.identified is None:
@@ -191,28 +166,24 @@ def _finite(text: str, what: str) -> float:
 SystemChoice = Literal["model", "data"]
 
 
-def carried_over(
-    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, choice: SystemChoice
-) -> forcegp.models.Posterior:
-    """The posterior for the chosen system.
-
-    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data,
-    which is reported on stderr. Raises InvalidInput where the data carry no system or the model cannot move there.
-    """
-    if choice == "model":
-        return posterior
-    if dataset.system is None:
-        raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-    system = forcegp.evaluation.moved_system(posterior, dataset.system)
-    if system is not dataset.system:
-        terminal.note("--system data: contacts of the data; the robot stays the identified one")
-    return posterior.with_system(system)
-
-
-def with_observed_wind(
-    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset
+def model_and_data(
+    terminal: Terminal, run: Path, data: Path, choice: SystemChoice
 ) -> tuple[forcegp.models.Posterior, forcegp.Dataset]:
-    """Both with the slow force that a model of air observes from the past of the recording, reported on stderr."""
+    """A fitted model for the chosen system, and a recording of the same robot; what was changed is reported on stderr.
+
+    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data.
+    A model of air observes a slow force from the past of the recording. Raises InvalidInput for another robot, where
+    the data carry no system, and where the model cannot move there.
+    """
+    posterior, dataset = forcegp.load_posterior(run), forcegp.Dataset.load(data)
+    require_same_joints(posterior, dataset, data)
+    if choice == "data":
+        if dataset.system is None:
+            raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
+        system = forcegp.evaluation.moved_system(posterior, dataset.system)
+        if system is not dataset.system:
+            terminal.note("--system data: contacts of the data; the robot stays the identified one")
+        posterior = posterior.with_system(system)
     observed, seen = forcegp.models.observing(posterior, dataset)
     if observed is not posterior:
         terminal.note("wind: observed from earlier rows of each episode (aerodynamic:observe=0 leaves it unknown)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
 import warnings
 from collections.abc import Sequence
@@ -18,7 +17,8 @@ import forcegp.data
 import forcegp.mechanics
 import forcegp.models
 import forcegp.robots
-from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, listed, numbers_of, unless_given
+from forcegp.atomic_files import file_digest
+from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import ROBOT_OPTIONS, RobotOptions
 from forcegp.cli.terminal import Terminal
@@ -78,8 +78,6 @@ def friction_laws(given: Sequence[str]) -> tuple[str, ...]:
     return tuple(law for law in given if law != "none")
 
 
-RowsChoice = Literal["auto", "in-contact", "all"]
-
 NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
 HARDLY_ANY = 0.2
@@ -113,13 +111,11 @@ KNOWN = ("actuation", "rigid-body-bias", "viscous-joint-friction", "coulomb-join
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningOptions(BackendOptions, RobotOptions):
+class LearningOptions(BackendOptions, RobotOptions, Overwriting):
     """What every command asks that learns from a dataset."""
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
     """The dataset to learn from (HDF5)."""
-    out: Annotated[Path | None, unless_given("FOLDER", "none")] = None
-    """The folder to write."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
     where it does not)."""
@@ -140,13 +136,11 @@ class LearningOptions(BackendOptions, RobotOptions):
     known_force: Annotated[tuple[str, ...], listed("NAME,...", "the dataset's")] = ()
     """The complete list of known forces, instead of the dataset's: actuation, rigid-body-bias,
     viscous-joint-friction, coulomb-joint-friction (both with the coefficients of the URDF)."""
-    rows: RowsChoice = "auto"
+    rows: Literal["auto", "in-contact", "all"] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     checks: Annotated[bool, arg(help_behavior_hint="")] = True
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def _check(
         self, terminal: Terminal, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem, accelerations: bool = True
@@ -211,5 +205,5 @@ class LearningOptions(BackendOptions, RobotOptions):
             for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
             if name not in ("json", "debug", "overwrite")
         }
-        data = {"path": str(self.data), "sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
+        data = {"path": str(self.data), "sha256": file_digest(self.data)}
         return {"options": options, "data": data}

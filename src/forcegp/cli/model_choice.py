@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -13,7 +13,8 @@ import forcegp
 import forcegp.data
 import forcegp.models
 import forcegp.priors
-from forcegp.cli.command import FIELDS, listed, unless_given
+from forcegp.atomic_files import write_json
+from forcegp.cli.command import FIELDS, listed, numbers_of, unless_given
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.errors import InvalidInput
 
@@ -35,23 +36,17 @@ ITERATIONS_HINT = f"{ITERATIONS}; networks 5000, ensembles 3000"
 class FitOptions(LearningOptions):
     """What every command asks that writes one fitted model."""
 
-    out: Annotated[Path, arg(metavar="FOLDER")] = field()
+    out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
 
-    def _write(
-        self,
-        posterior: forcegp.models.Posterior,
-        more: Mapping[str, str] | None = None,
-        identified: forcegp.Robot | None = None,
-    ) -> None:
-        """The model, `more` files by name with their text, the URDF of a robot, and how it was made."""
+    def _write(self, posterior: forcegp.models.Posterior, identification: Mapping[str, Any] | None = None) -> None:
+        """The model and how it was made; of an identification also its numbers and the URDF of its robot."""
         content = {**self._given(), "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
-            for name, text in (more or {}).items():
-                (folder / name).write_bytes(text.encode("utf-8"))  # as text, line ends would change
-            if identified is not None:
-                identified.to_urdf(folder / "identified.urdf")
+            if identification is not None:
+                write_json(folder / "identification.json", identification)
+                posterior.system.robot.to_urdf(folder / "identified.urdf")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,14 +146,17 @@ def make_model(
     if command.model in NETWORKS:
         # None where neither SIGMA nor the dataset states it: the network then estimates it
         unknown = command.noise == "dataset" and dataset.noise_std is None
-        noise = None if unknown else resolved_noise(command.noise, dataset)
+        noise = None if unknown else resolved_noise(command.noise)
         steps = {} if command.iterations is None else {"steps": command.iterations}
         network = forcegp.NeuralNetwork if command.model == "neural-network" else forcegp.NetworkEnsemble
         return network(system, noise, **steps)
-    windows = command.learn_from != "accelerations"
-    noise = (noise_of_windows if windows else resolved_noise)(command.noise, dataset, command.force_noise)
+    # no dataset states the noise of windows: it is learned unless it is a number
+    learned = command.noise == "dataset" and command.learn_from != "accelerations"
+    noise = resolved_noise("learned" if learned else command.noise, command.force_noise)
     if command.measured_torque:
-        noise = of_measured_torque(noise)
+        if noise is None or noise.force is None:
+            raise InvalidInput("--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA.")
+        noise = replace(noise, measured_torque=True)
     if command.model == "independent-gp":
         return forcegp.IndependentGP(system, noise=noise)
     if command.model == "unconstrained":
@@ -205,21 +203,7 @@ def window_observation(learn_from: LearnFrom, seconds: float | None) -> forcegp.
     return forcegp.WeakForm(WINDOW if seconds is None else seconds)
 
 
-def noise_of_windows(given: str, dataset: forcegp.Dataset, force: float | None = None) -> forcegp.Noise | None:
-    """`resolved_noise` of windows, which no dataset states: it is learned unless it is a number."""
-    if given in ("dataset", "learned"):
-        return forcegp.Noise(None, force, learn=True)
-    return resolved_noise(given, dataset, force)
-
-
-def of_measured_torque(noise: forcegp.Noise | None) -> forcegp.Noise:
-    """The noise, with its forces those of torque sensors. Raises InvalidInput where it has none of forces."""
-    if noise is None or noise.force is None:
-        raise InvalidInput("--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA.")
-    return replace(noise, measured_torque=True)
-
-
-def resolved_noise(given: str, dataset: forcegp.Dataset, force: float | None = None) -> forcegp.Noise | None:
+def resolved_noise(given: str, force: float | None = None) -> forcegp.Noise | None:
     """The model's noise for `learned`, `dataset` or a number, and for the noise of forces.
 
     Raises InvalidInput for anything else.
@@ -228,8 +212,5 @@ def resolved_noise(given: str, dataset: forcegp.Dataset, force: float | None = N
         return forcegp.Noise(None, force, learn=True)
     if given == "dataset":
         return None if force is None else forcegp.Noise(None, force)
-    try:
-        sigma = float(given)
-    except ValueError:
-        raise InvalidInput(f"--noise is {given!r}; give learned, dataset or a number such as 0.1.") from None
-    return forcegp.Noise(sigma, force)
+    complaint = f"--noise is {given!r}; give learned, dataset or a number such as 0.1."
+    return forcegp.Noise(numbers_of(given, complaint, one=True)[0], force)

@@ -16,7 +16,7 @@ import forcegp.data
 import forcegp.evaluation
 import forcegp.recordings
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import LOG, MAPPING, MODEL, Command, unless_given
+from forcegp.cli.command import LOG, MAPPING, MODEL, Overwriting, unless_given
 from forcegp.cli.input_options import require_same_joints
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
@@ -27,7 +27,7 @@ APART = 0.25  # alarms that are less apart in s belong to one contact
 
 
 @dataclass(frozen=True, kw_only=True)
-class Monitor(Command):
+class Monitor(Overwriting):
     """Find contacts in a log without a force sensor: time, link and force of each.
 
     A residual torque counts as a contact if it exceeds what free motion of the same robot shows.
@@ -54,8 +54,6 @@ class Monitor(Command):
     """Accepted false alarms per hour."""
     bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
     """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Calibrate, look, draw and show."""

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.analytical
 from forcegp.atomic_files import write_json, write_text
-from forcegp.cli.command import DATASET, listed, unless_given
+from forcegp.cli.command import DATASET, Overwriting, listed, unless_given
 from forcegp.cli.input_options import SYSTEM_FILE, PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import friction_laws
 from forcegp.cli.terminal import Terminal, columns
@@ -23,7 +23,7 @@ LABELS |= {f"inertia.{x}": (f"inertia {x}", "kg m²", 1.0) for x in ("xx", "yy",
 
 
 @dataclass(frozen=True, kw_only=True)
-class Payload(PreparationOptions, RobotOptions):
+class Payload(PreparationOptions, RobotOptions, Overwriting):
     """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
 
     The log is a motion of 20 s or more that turns every joint in both directions, without contact but for feet that
@@ -49,8 +49,6 @@ class Payload(PreparationOptions, RobotOptions):
     """Delay of u in the log, in s."""
     out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
     """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, estimate, write and show."""

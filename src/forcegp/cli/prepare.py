@@ -13,7 +13,7 @@ import forcegp
 import forcegp.data
 import forcegp.evaluation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import DATASET, require_free_file, unless_given
+from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.import_log import stance_text
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, facts, shown
@@ -21,7 +21,7 @@ from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prepare(PreparationOptions, RobotOptions):
+class Prepare(PreparationOptions, RobotOptions, Overwriting):
     """Filter, align, differentiate and thin out a raw log, and report what that costs.
 
     The low-pass filter runs forwards and backwards, so that nothing is delayed; v and a are computed anew.
@@ -40,14 +40,12 @@ class Prepare(PreparationOptions, RobotOptions):
     """auto: set the switches of contacts to what motion and forces show, and leave out rows that leave one open."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
     """Also draw the spectra before and after, with the cut-off, into this folder."""
-    overwrite: bool = False
-    """Replace the file if it exists, and the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, save, draw if asked to, and show."""
         if not self.words("cutoff", "delay", "lag", "stance", "every", "trim"):
             raise InvalidInput("nothing to do: give --cutoff, --delay, --lag, --stance, --every or --trim.")
-        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
+        self.require_free_file(self.out)
         self.require_free(self.plots)
 
         preparation = replace(self._preparation(), stance=self.stance)

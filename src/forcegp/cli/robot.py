@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.evaluation
 import forcegp.report
-from forcegp.cli.command import URDF, require_free_file, unless_given
+from forcegp.cli.command import URDF, Overwriting, unless_given
 from forcegp.cli.input_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import RobotFileWarning
@@ -24,7 +24,7 @@ NONE = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Robot(RobotFileOptions):
+class Robot(RobotFileOptions, Overwriting):
     """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
     Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, MJCF where
@@ -48,13 +48,10 @@ class Robot(RobotFileOptions):
     """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
     browser: bool = False
     """Show the robot in the browser, until Ctrl-C."""
-    overwrite: bool = False
-    """Replace that file."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
-        if self.out is not None:
-            require_free_file(self.out, overwrite=self.overwrite, own=_own, what="a PNG or a robot file")
+        self.require_free_file(self.out, _own, "a PNG or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
             options = {"inertias": self.inertias, "strict": self.strict, **self._changes()}

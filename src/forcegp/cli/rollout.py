@@ -14,8 +14,8 @@ import forcegp
 import forcegp.evaluation
 import forcegp.models
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Command, listed, numbers_of, unless_given
-from forcegp.cli.input_options import SystemChoice, carried_over, require_same_joints, with_observed_wind
+from forcegp.cli.command import DATASET, MODEL, Overwriting, listed, numbers_of, unless_given
+from forcegp.cli.input_options import SystemChoice, model_and_data
 from forcegp.cli.terminal import Terminal, columns, facts, number, percent, shown
 from forcegp.errors import InvalidInput
 
@@ -27,7 +27,7 @@ ENOUGH_SAMPLES = 20  # fewer span less by chance
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rollout(Command):
+class Rollout(Overwriting):
     """Predict whole motions under recorded torques with a fitted model, and compare them with the recording.
 
     The motions begin at rows of the dataset.
@@ -59,20 +59,16 @@ class Rollout(Command):
     """Also roll out N functions drawn from the model, for intervals. Time grows with N."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the functions."""
-    overwrite: bool = False
-    """Replace the folder if forcegp wrote it."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Roll out, compare, draw and show."""
-        rows = self._starts()
+        if self.start_rows and self.starts is not None:
+            raise InvalidInput("--start-rows and --starts were both given; give the rows or their number.")
+        rows = list(self.start_rows) or (DEFAULT_STARTS if self.starts is None else self.starts)
         baumgarte = parse_baumgarte(self.baumgarte)
         self.require_free(self.out)
 
-        posterior = forcegp.load_posterior(self.run_folder)
-        dataset = forcegp.Dataset.load(self.data)
-        require_same_joints(posterior, dataset, self.data)
-        posterior = carried_over(terminal, posterior, dataset, self.system)
-        posterior, dataset = with_observed_wind(terminal, posterior, dataset)
+        posterior, dataset = model_and_data(terminal, self.run_folder, self.data, self.system)
         for sentence in forcegp.evaluation.system_warnings(posterior, dataset):
             terminal.warn(sentence)
         recorded = forcegp.data.recorded_motions(dataset, rows, self.seconds)
@@ -102,11 +98,6 @@ class Rollout(Command):
         terminal.note(f"figure: {self.out / 'rollout.png'}")
         terminal.show(*_report(summary))
         return summary
-
-    def _starts(self) -> int | list[int]:
-        if self.start_rows and self.starts is not None:
-            raise InvalidInput("--start-rows and --starts were both given; give the rows or their number.")
-        return list(self.start_rows) or (DEFAULT_STARTS if self.starts is None else self.starts)
 
     def _summary(
         self,

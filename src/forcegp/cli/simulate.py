@@ -13,10 +13,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.data
 import forcegp.simulation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import Command, require_free_file, unless_given
+from forcegp.cli.command import Overwriting, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -28,7 +27,7 @@ JOINT_FRICTION = arg(help_behavior_hint="(default: none; stribeck for free arms)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate(Command):
+class Simulate(Overwriting):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
@@ -74,12 +73,10 @@ class Simulate(Command):
     """ideal: the tool never leaves the surface. bullet: PyBullet's contact, which it leaves now and then."""
     wind: Annotated[float | None, unless_given("M/S", "4; only of quadrotor", float)] = None
     """Mean wind of a quadrotor in m/s, from a random side, with gusts."""
-    overwrite: bool = False
-    """Replace the file if it exists."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Simulate and save."""
-        require_free_file(self.out, overwrite=self.overwrite, own=forcegp.data.is_dataset)
+        self.require_free_file(self.out)
         start = time.monotonic()
         dataset = simulate_with_progress(terminal, self.scenario, **self._config())
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:

@@ -8,12 +8,13 @@ import os
 import re
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import forcegp
+import forcegp.checks
 import forcegp.evaluation
 
 if TYPE_CHECKING:
@@ -231,6 +232,8 @@ NORMAL_FORCES_KNOWN = "it follows from the known forces alone"
 NORMAL_FORCES_SEEN = "this prior leaves no force along the contact normal free, so accelerations decide it"
 
 
+COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
+"""Of findings by their severity."""
 PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
@@ -240,8 +243,8 @@ def facts(title: str, values: Mapping[str, str]) -> Table:
     from rich.text import Text
 
     table = Table(title=title, box=None, show_header=False, **PLAIN)
-    table.add_column(style="dim")
-    table.add_column()
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
     for name, value in values.items():
         table.add_row(name, Text(value))
     return table
@@ -272,6 +275,22 @@ def columns(
     if last:
         table.add_section()
         table.add_row(*map(Text, last), style="bold")
+    return table
+
+
+def findings_table(findings: Sequence[forcegp.checks.Finding], worded: Callable[[str], str]) -> Table:
+    """One paragraph per finding: how bad it is, what was seen, and below it what to do, `worded` for the command."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 1))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        text = Text(f"{finding.subject}: ", style="bold").append(worded(finding.seen), style="not bold")
+        table.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
+        if finding.remedy:
+            table.add_row("", Text(f"→ {worded(finding.remedy)}", style="dim"))
     return table
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,13 +13,16 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.validation
+from forcegp.atomic_files import file_digest
 from forcegp.cli.command import DATASET, BackendOptions, Resuming, listed, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import MODEL_PARTS, friction_laws
-from forcegp.cli.terminal import NONE, Terminal, columns, number
+from forcegp.cli.terminal import NONE, Terminal, columns, number, percent
 
 SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")
 """Options that have the names of fields of `forcegp.Comparison`."""
+BRIEF = ("models", "winners", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
+"""What --json prints of the document."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +84,6 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     measured_torque: bool = False
     """u comes from noisy sensors; predictions account for this noise. It applies to models with physics and a force
     noise."""
-    jobs: Annotated[int | None, unless_given("J", "1", int)] = None
-    """Pieces of work at once, each on one core."""
     overwrite: bool = False
     """Compute everything anew where the folder holds results."""
 
@@ -113,18 +113,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
             terminal.note(f"{best}, learned from all rows: {self.out / 'model'}")
         terminal.note(f"{time.monotonic() - start:.0f} s; numbers: {self.out / 'results.json'}")
         terminal.show(*self._report(validation.document))
-        brief = (
-            "models",
-            "winners",
-            "verdicts",
-            "against_baseline",
-            "splits",
-            "preparation",
-            "mass_matrix",
-            "seeds",
-            "points",
-        )
-        return {"out": str(self.out), **{name: validation.document[name] for name in brief}}
+        return {"out": str(self.out), **{name: validation.document[name] for name in BRIEF}}
 
     def _comparison(self, terminal: Terminal) -> forcegp.Comparison:
         raw = forcegp.Dataset.load(self.data)
@@ -162,13 +151,13 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
             )
 
     def _source(self) -> dict[str, Any]:
-        digest = hashlib.sha256(self.data.read_bytes()).hexdigest()
+        digest = file_digest(self.data)
         robot = [f"robot from {self.robot}"] if self.robot is not None else []
         return {"title": str(self.data), "data": [f"{self.data} (SHA-256 {digest[:16]}…)", *robot], "sha256": digest}
 
     def _report(self, document: Mapping[str, Any]) -> list[Any]:
-        def median(value: Mapping[str, Any] | None) -> str:
-            return number(None if value is None else value["median"])
+        def median(value: Mapping[str, Any] | None, show: Callable[[float | None], str] = number) -> str:
+            return show(None if value is None else value["median"])
 
         rows = []
         for name, model in document["models"].items():
@@ -177,15 +166,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
                 continue
             motions = model["motions"]
             last = None if motions is None or not motions["rms"] else motions["rms"][-1]
-            covered = model["coverage_95"]
-            rows.append(
-                [
-                    name,
-                    *(median(model[score]) for score in ("nrmse", "force_rms", "nlpd")),
-                    NONE if covered is None else f"{100.0 * covered['median']:.1f} %",
-                    median(last),
-                ]
-            )
+            errors = [median(model[score]) for score in ("nrmse", "force_rms", "nlpd")]
+            rows.append([name, *errors, median(model["coverage_95"], percent), median(last)])
         header = ["model", "nRMSE", "force error", "NLPD", "in 95 %", "motion"]
         title = f"{self.data}: medians over {len(document['seeds'])} seed(s) and {len(document['splits'])} split(s)"
         failed = [

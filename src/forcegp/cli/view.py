@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.report
-from forcegp.cli.command import URDF, Command, InputPath, require_free_file, unless_given
+from forcegp.cli.command import URDF, InputPath, Overwriting, begins, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -19,7 +19,7 @@ EXISTING = InputPath(" does not exist; give a folder of forcegp fit, or a datase
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Command):
+class View(Overwriting):
     """Show a recording in 3D in the browser, with the forces of a model as arrows, or the recorded torques.
 
     Sliders choose the time, the forces that are shown, and the joint whose force is drawn over time. The page is
@@ -47,8 +47,6 @@ class View(Command):
     """Write the scene to this file instead of serving it."""
     rerun: Annotated[Path | None, unless_given("FILE.rrd", "no file")] = None
     """Write a log for the viewer of rerun instead of serving."""
-    overwrite: bool = False
-    """Replace these files."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Serve, or write."""
@@ -56,11 +54,8 @@ class View(Command):
             raise InvalidInput(f"{len(self.shown)} paths were given; give a dataset, or a model and a dataset.")
         *runs, data = self.shown
         run = runs[0] if runs else None
-        if self.html is not None:
-            require_free_file(self.html, overwrite=self.overwrite, own=forcegp.report.is_page, what="a report")
-        if self.rerun is not None:
-            own = lambda path: path.read_bytes().startswith(b"RRF")  # noqa: E731
-            require_free_file(self.rerun, overwrite=self.overwrite, own=own, what="a log of rerun")
+        self.require_free_file(self.html, forcegp.report.is_page, "a report")
+        self.require_free_file(self.rerun, begins(b"RRF"), "a log of rerun")
         posterior = None if run is None else forcegp.load_posterior(run)
         recorded = forcegp.report.recorded_scene(
             forcegp.Dataset.load(data), posterior, start=self.start, seconds=self.seconds, shapes=self.shapes

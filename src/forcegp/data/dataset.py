@@ -96,7 +96,10 @@ class Dataset(Summary):
         for name, columns in (("v", names), ("u", actuators), ("a", names)):
             put(name, finite_columns(name, getattr(self, name), columns, rows))
         if self.system is not None and positions != names:
-            _check_turns(self.system.robot, self.q)
+            try:
+                self.system.robot.space.check(torch.tensor(self.q))
+            except InvalidInput as error:  # a quaternion of another length than 1
+                raise DatasetError(str(error)) from None
         put("time", finite_columns("time", self.time, None, rows))
         put("episode", integer_column("episode", np.zeros(rows, int) if self.episode is None else self.episode, rows))
         put("units", validated_units(self.units, names))
@@ -249,14 +252,6 @@ class Dataset(Summary):
 
     def _fields(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
-
-
-def _check_turns(robot: forcegp.robots.Robot, q: np.ndarray) -> None:
-    """Raise DatasetError for quaternions of a length other than 1."""
-    try:
-        robot.space.check(torch.tensor(q))
-    except InvalidInput as error:
-        raise DatasetError(str(error)) from None
 
 
 def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSystem | None) -> tuple[str, ...]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from typing import Any, NoReturn
 
 import numpy as np
 
 import forcegp.robots
-from forcegp.errors import DatasetError, MissingExtra
+from forcegp.errors import DatasetError, required_extra
 from forcegp.robots.arguments import real_array
 
 
@@ -174,7 +173,7 @@ def frame_of(arrays: Mapping[str, np.ndarray], names: Mapping[str, tuple[str, ..
 
     Raises MissingExtra without pandas.
     """
-    pandas = _pandas()
+    pandas = required_extra("pandas", "pandas", "a DataFrame")
     columns = {}
     for name, values in arrays.items():
         if values.ndim == 1:
@@ -191,7 +190,7 @@ def arrays_of(frame: Any, own: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
 
     `own` names the columns of q and u where these are not the joints.
     """
-    _pandas()
+    required_extra("pandas", "pandas", "a DataFrame")
     joints = tuple(column[2:] for column in map(str, frame.columns) if column.startswith("v."))
     columns: dict[str, dict[str, np.ndarray]] = {}
     for column in map(str, frame.columns):
@@ -216,10 +215,3 @@ def arrays_of(frame: Any, own: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
             raise DatasetError(f"the frame has {name} of {', '.join(parts)}, but v of {', '.join(joints)}.")
         (arrays["truth"] if name.startswith(TRUTH) else arrays)[name.removeprefix(TRUTH)] = values
     return arrays
-
-
-def _pandas() -> Any:
-    try:
-        return import_module("pandas")
-    except ImportError as error:
-        raise MissingExtra("pandas is not installed; install it with: pip install 'forcegp[pandas]'") from error

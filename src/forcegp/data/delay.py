@@ -156,7 +156,7 @@ def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, ki
         spread = np.square(shifted - shifted.mean(axis=1, keepdims=True)).sum(axis=1)
         if not spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():
             continue  # a torque that does not change has no delay
-        profiles[joint] = _profiles(_orthonormal(features[joint]), shifted)
+        profiles[joint] = least_squares(_orthonormal(features[joint]), shifted.T)
         residual[:, joint] = profiles[joint, 0, zero] / spread[zero], profiles[joint, 0].min() / spread[zero]
     seconds = np.array([[lowest(profile, parts.shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
@@ -166,21 +166,23 @@ def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, ki
     likelihood = likelihoods[0]
     return Delay(
         common=float(common[0]),
-        common_std=float(_jackknife(common[None, 1:])[0]),
+        common_std=float(jackknife(common[None, 1:])[0]),
         seconds=seconds[:, 0],
-        std=_jackknife(seconds[:, 1:]),
+        std=jackknife(seconds[:, 1:]),
         residual=residual,
         remains=float(np.exp((likelihood.min() - likelihood[zero]) / max(len(finite), 1))),
         kind=kind,
     )
 
 
-def _profiles(basis: Float[np.ndarray, "rows columns"], shifted: Float[np.ndarray, "shifts rows"]) -> np.ndarray:
-    """Least sum of squares of every shift: (1 + blocks, shifts), of all rows and of all but each block."""
-    blocks = np.array_split(np.arange(shifted.shape[1]), BLOCKS)
+def least_squares(
+    basis: Float[np.ndarray, "rows columns"], targets: Float[np.ndarray, "rows targets"]
+) -> Float[np.ndarray, "parts targets"]:
+    """What columns leave of the square sum of every target: of all rows, then of all but each block of them."""
+    blocks = np.array_split(np.arange(len(targets)), BLOCKS)
     normal = np.stack([basis[rows].T @ basis[rows] for rows in blocks])
-    right = np.stack([basis[rows].T @ shifted[:, rows].T for rows in blocks])
-    square = np.stack([np.square(shifted[:, rows]).sum(axis=1) for rows in blocks])
+    right = np.stack([basis[rows].T @ targets[rows] for rows in blocks])
+    square = np.stack([np.square(targets[rows]).sum(axis=0) for rows in blocks])
     sums = [part.sum(axis=0) for part in (normal, right, square)]
     without = [
         _unexplained(sums[0] - n, sums[1] - r, sums[2] - s) for n, r, s in zip(normal, right, square, strict=True)
@@ -188,7 +190,7 @@ def _profiles(basis: Float[np.ndarray, "rows columns"], shifted: Float[np.ndarra
     return np.stack([_unexplained(*sums), *without])
 
 
-def _jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
+def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
     """Standard deviation of an estimate from its values without each block; NaN where one of them is."""
     return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
 

@@ -11,7 +11,9 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.data.configurations import actuators, continuous, rates, space_of, through
 from forcegp.data.dataset import Dataset
+from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 JITTER = 0.01
@@ -38,8 +40,7 @@ def zero_phase_low_pass(
         raise InvalidInput(
             f"cutoff is {cutoff} Hz; it must be > 0 and below {sample_rate / 2} Hz, half the sample rate."
         )
-    if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= 12:
-        raise InvalidInput(f"order is {order!r}; it must be an integer from 1 to 12.")
+    whole_number("order", order, 1, 12)
     from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
     sections = butter(order, cutoff, fs=sample_rate, output="sos")
@@ -212,15 +213,14 @@ def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.
 
 def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
-    space, units = space_of(rows), rows.units["q"]
+    space = space_of(rows)
     continuous(space, rows.q)
-    grouped = {row for group in space.groups for row in range(*group.rows.indices(rows.nv))}
-    single = [k for k in range(rows.nv) if k not in grouped]
-    angular = [(units if isinstance(units, str) else units[k]) == "rad" for k in single]
+    units = unit_of_each("q", rows.units["q"], rows.nv)
+    angular = [units[k] == "rad" for k in space.single_rows]
     jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi
     if jumps.any():
         row, column = np.argwhere(jumps)[0]
-        joint = rows.joint_names[np.asarray(single)[angular][column]]
+        joint = rows.joint_names[np.asarray(space.single_rows)[angular][column]]
         raise DatasetError(
             f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
             "Unwrap it first (np.unwrap(q, axis=0))."

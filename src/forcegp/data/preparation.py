@@ -19,6 +19,7 @@ from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
+from forcegp.robots.arguments import whole_number
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 AUTOMATIC = "auto", "each"
@@ -61,8 +62,7 @@ class Preparation:
     def __post_init__(self) -> None:
         if self.cutoff not in (None, "auto") and not (_finite(self.cutoff) and self.cutoff > 0):
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
-        if isinstance(self.order, bool) or not isinstance(self.order, int) or not 1 <= self.order <= 12:
-            raise InvalidInput(f"order is {self.order!r}; it must be an integer from 1 to 12.")
+        whole_number("order", self.order, 1, 12)
         for name in LATE:
             given = getattr(self, name)
             if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
@@ -74,8 +74,7 @@ class Preparation:
                 raise InvalidInput(f"lag is {given!r}; an actuator acts after its command: at least 0 s.")
         if self.delay in AUTOMATIC and self.lag in AUTOMATIC:
             raise InvalidInput("delay and lag are both to be estimated, and look alike; give one of them in s.")
-        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
-            raise InvalidInput(f"every is {self.every!r}; it must be an integer of at least 1.")
+        whole_number("every", self.every, 1)
         if not _finite(self.trim) or self.trim < 0:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
         if self.differentiate not in ("q", "v"):
@@ -183,7 +182,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
                 reasons["cutoff"] += f"; of held-out torques stay unexplained {shares}"
                 cutoff = best
         chosen = replace(given, cutoff=cutoff)
-        reasons["cutoff_per_joint"] = _plain(each)
+        reasons["cutoff_per_joint"] = plain(each)
     for name in LATE:
         how = getattr(given, name)
         if how not in AUTOMATIC:
@@ -198,8 +197,8 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
         chosen = replace(chosen, **{name: found.significant if how == "auto" else tuple(found.each)})
         reasons[name] = found.reason if how == "auto" else "that of each joint where it is sure"
-        reasons[f"{name}_common"], reasons[f"{name}_common_std"] = _plain(np.array([found.common, found.common_std]))
-        reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = _plain(found.seconds), _plain(found.std)
+        reasons[f"{name}_common"], reasons[f"{name}_common_std"] = plain(np.array([found.common, found.common_std]))
+        reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = plain(found.seconds), plain(found.std)
     return chosen, reasons
 
 
@@ -315,7 +314,7 @@ def _report(
         spectrum = motion_spectrum(raw, chosen.differentiate)
         before = spectrum.acceleration_noise()
         after = spectrum.acceleration_noise(lambda f: low_pass_gain(f, rate, float(chosen.cutoff or 0.0), chosen.order))
-    report["acceleration_noise"] = {"before": _plain(before), "after": _plain(after)}
+    report["acceleration_noise"] = {"before": plain(before), "after": plain(after)}
     unshifted = _filtered(replace(chosen, delay=0.0, lag=0.0), raw) if any(map(any, per_joint.values())) else filtered
     report["power_removed"] = {name: _power_removed(raw, unshifted, name) for name in ("q", "v", "a", "u")}
     return report
@@ -328,10 +327,11 @@ def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | N
     if name == "q" and not space.is_vector_space:
         old, change = as_vectors(before), space.difference(*(torch.tensor(x) for x in (new, old))).numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
+        return plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
 
 
-def _plain(values: Float[np.ndarray, " nv"]) -> list[float | None]:
+def plain(values: np.ndarray) -> list[float | None]:
+    """Numbers for JSON, which has no NaN."""
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.robots.arguments import whole_number
 
 
 def time_blocks(
@@ -83,8 +84,7 @@ def farthest_point_sampling(
             f"points must be a (rows, features) table of finite numbers; given: {table.dtype} {table.shape}."
         )
     rows = table.shape[0]
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= rows:
-        raise InvalidInput(f"count is {count!r}; it must be an integer from 1 to {rows}, the number of rows.")
+    count = whole_number("count", count, 1, rows, "the number of rows")
     columns = _standardized_columns(table)
     distance = np.full(rows, np.inf)
     chosen = np.empty(count, dtype=np.int64)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import lagged, lowest
+from forcegp.data.delay import jackknife, lagged, least_squares, lowest
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.manifold import Group
@@ -17,7 +17,6 @@ from forcegp.robots.manifold import Group
 FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
 TRIED = np.linspace(0.0, 0.3, 31)  # s
 SETTLED = 0.5  # s, of an episode, after which nothing depends on how it began
-BLOCKS = 8
 
 
 def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
@@ -40,20 +39,16 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
             "the recording is too short for the lag of thrusters; record 1,000 rows or more, or give the lag in s."
         )
     target = np.concatenate([_fast(part.a[:, group.rows], part.time) for part in episodes])
-    blocks = np.array_split(np.arange(len(target)), BLOCKS)
     misfits = []
     for seconds in TRIED:
         causes = [_causes(part, columns, powers, group, float(seconds)) for part in episodes]
         X = np.concatenate([_fast(own, part.time) for own, part in zip(causes, episodes, strict=True)])
         X /= np.linalg.norm(X, axis=0) + 1e-300
-        sums = [(X[k].T @ X[k], X[k].T @ target[k], np.square(target[k]).sum(0)) for k in blocks]
-        whole = [np.sum(part, axis=0) for part in zip(*sums, strict=True)]
-        without = [[a - b for a, b in zip(whole, own, strict=True)] for own in sums]
-        misfits.append([_log_residual(*parts) for parts in (whole, *without)])
+        misfits.append(np.log(np.maximum(least_squares(X, target), 1e-300)).sum(axis=1))
     lags = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])
     if not np.isfinite(lags).all():
         raise DatasetError("the recording shows no lag of the thrusters between 0 and .3 s; give the lag in s, or 0.")
-    return float(lags[0]), float(np.sqrt((BLOCKS - 1) * np.var(lags[1:])))
+    return float(lags[0]), float(jackknife(lags[None, 1:])[0])
 
 
 def thruster_columns(system: forcegp.mechanics.MechanicalSystem | None) -> dict[int, int]:
@@ -85,8 +80,3 @@ def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"])
     """Without what a low pass of first order leaves, where that has settled."""
     slow = np.stack([lagged(column, time, FAST) for column in values.T], axis=1)
     return (values - slow)[time - time[0] > SETTLED]
-
-
-def _log_residual(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> float:
-    solution = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
-    return float(np.log(np.maximum(square - (right * solution).sum(0), 1e-300)).sum())

@@ -84,15 +84,10 @@ class WeakForm:
     def __post_init__(self) -> None:
         if not (isinstance(self.seconds, int | float) and 0.0 < self.seconds < float("inf")):
             raise InvalidInput(f"WeakForm seconds is {self.seconds!r}; it must be positive and finite.")
-        if isinstance(self.nodes, bool) or not isinstance(self.nodes, int) or self.nodes < 1:
-            raise InvalidInput(f"WeakForm nodes is {self.nodes!r}; it must be a whole number from 1.")
+        whole_number("nodes", self.nodes, 1)
         if self.signal not in ("q", "v"):
             raise InvalidInput(f"WeakForm signal is {self.signal!r}; allowed: 'q' (positions) or 'v' (velocities).")
-        least = 2 if self.signal == "q" else 1
-        if isinstance(self.order, bool) or not isinstance(self.order, int) or not least <= self.order <= 16:
-            raise InvalidInput(
-                f"WeakForm order is {self.order!r}; on {self.signal} it must be a whole number from {least} to 16."
-            )
+        whole_number("order", self.order, 2 if self.signal == "q" else 1, 16, f"of windows of {self.signal}")
 
     def signal_weights(self, time: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
         """w with y = sum_i w_i signal(t_i)."""

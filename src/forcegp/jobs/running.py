@@ -128,10 +128,6 @@ class JobStore:
             folder.mkdir()
             yield folder
 
-    def remove_leftovers(self) -> None:
-        """Delete what killed runs left half written; call it under the lock."""
-        remove_leftovers(self.folder)
-
 
 def _is_own_start(entry: Path) -> bool:
     """What a run leaves that is killed before it has written its description."""
@@ -155,7 +151,7 @@ def run_jobs(
     if all(store.has(name, digest) for name, digest in wanted.items()):
         return 0
     with store.locked():
-        store.remove_leftovers()
+        remove_leftovers(store.folder)
         by_name = {job.name: job for job in jobs}
         missing = {name: job for name, job in by_name.items() if not store.has(name, wanted[name])}
         if missing:
@@ -215,7 +211,7 @@ class _Run:
         finally:
             if at_work:
                 backend.stop()
-            self.store.remove_leftovers()
+            remove_leftovers(self.store.folder)
         if self.failed:
             name, cause = next(iter(self.failed.items()))
             others = f" and {len(self.failed) - 1} more failed" if len(self.failed) > 1 else " failed"

@@ -23,8 +23,11 @@ from forcegp.recordings.source import (
     reading,
     require_plausible_size,
 )
+from forcegp.summary import listed
 
 SEPARATOR = "/"
+MOST_NAMES = 12
+"""Of arrays in a message."""
 
 
 class ArrayFile(Source):
@@ -53,7 +56,9 @@ class ArrayFile(Source):
         names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.shapes())
         found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
         if not found:
-            raise InvalidInput(f"no array or group of {self.path} matches {pattern!r}; it has {_some(list(names))}.")
+            raise InvalidInput(
+                f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, MOST_NAMES)}."
+            )
         return sorted(found, key=_by_numbers)
 
     @cached_property
@@ -72,7 +77,7 @@ class ArrayFile(Source):
             inside = f" under {self.within!r}" if self.within else ""
             raise FileFormatError(
                 f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}; "
-                f"it has {_some(list(self.shapes()))}."
+                f"it has {listed(self.shapes(), MOST_NAMES)}."
             )
         return places
 
@@ -94,9 +99,9 @@ class ArrayFile(Source):
         shapes = self.shapes()
         lengths = {shapes[array][0] for array in arrays}
         if len(lengths) > 1:
-            listed = ", ".join(f"{array} {shapes[array][0]}" for array in arrays)
+            counts = ", ".join(f"{array} {shapes[array][0]}" for array in arrays)
             raise FileFormatError(
-                f"{self.path}: its arrays have different numbers of rows ({listed}); map those of one."
+                f"{self.path}: its arrays have different numbers of rows ({counts}); map those of one."
             )
         for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
             tables = dict(zip(arrays, pieces, strict=True))
@@ -122,10 +127,6 @@ def _by_numbers(name: str) -> list[tuple[int, int, str]]:
     """So that demo_10 comes after demo_9."""
     parts = re.findall(r"\d+|\D", name)
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "") or "none"
 
 
 WHAT = "a NumPy archive"

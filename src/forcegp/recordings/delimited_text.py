@@ -13,7 +13,16 @@ from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.recordings.source import Columns, Source, Wrapper, arrow_numbers, gzip_stream, reading, require_distinct
+from forcegp.recordings.source import (
+    Columns,
+    Source,
+    Wrapper,
+    arrow_numbers,
+    exact,
+    gzip_stream,
+    reading,
+    require_distinct,
+)
 
 FIRST_BYTES = 2**16
 """What is looked at to detect the header, the delimiter and whether there are comments."""
@@ -217,7 +226,7 @@ class DelimitedText(Source):
                     convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
                 )
                 columns = ({name: arrow_numbers(batch.column(name)) for name in wanted} for batch in batches)
-                yield from _pieces(self._stacked(columns, names) if stacked else columns, rows)
+                yield from exact(self._stacked(columns, names) if stacked else columns, rows)
             except pa.ArrowInvalid as error:
                 raise self._told_by_pyarrow(error) from error
 
@@ -266,13 +275,6 @@ def _remedy(value: str) -> str:
     if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", value):
         return "Write the time as a number of seconds, or give `step`."
     return "Repair or remove that row."
-
-
-def _pieces(batches: Iterator[Columns], rows: int) -> Iterator[Columns]:
-    for batch in batches:
-        length = len(next(iter(batch.values())))
-        for start in range(0, length, rows):
-            yield {name: values[start : start + rows] for name, values in batch.items()}
 
 
 def _detected_delimiter(lines: Sequence[str], path: Path) -> str:

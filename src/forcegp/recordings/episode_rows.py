@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError, MistakenUnit
 from forcegp.recordings.moving_base import Layout
-from forcegp.recordings.reading import RawRecording, Spool
+from forcegp.recordings.reading import ROWS_AT_A_TIME, RawRecording, Spool
 
 REPEATED = 0.05
 """Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
@@ -167,8 +167,6 @@ def _first_of_each(time: np.ndarray, begins: np.ndarray, least: float) -> np.nda
     return kept
 
 
-ROWS_AT_A_TIME = 16384
-
 SPLINE_HALO = 64
 """Rows on either side that a piece of a spline is fitted with: the rest moves it by less than 0.27^64 of itself."""
 
@@ -176,47 +174,40 @@ DIFFERENCE_HALO = 3
 """Rows on either side that two differences reach: 2 where both are central, 3 where one is one-sided at an end."""
 
 
-@dataclass(frozen=True)
-class EpisodeRows:
-    """The rows of a stretch in pieces, equal to those of the whole stretch at once up to rounding.
+def episode_rows(
+    spool: Spool, stretch: Stretch, kept: np.ndarray, layout: Layout, step: float | None, rows: int = ROWS_AT_A_TIME
+) -> Iterator[dict[str, np.ndarray]]:
+    """Time and the signals q, v, u, a of a stretch, `rows` at a time, as those of all at once up to rounding.
 
     Parameters: `kept` as in `Stamps`; `layout` of the spool; `step` [s] between even times, or None for the times of
     the log.
     """
+    recording, first = stretch.recording, stretch.start
+    numbers = first + np.flatnonzero(kept[first : stretch.end])  # rows of the recording that are used
+    time = stamps = recording.time[numbers]
+    if step is not None:
+        count = int(np.floor((stamps[-1] - stamps[0]) / step * (1 + 1e-12))) + 1
+        time = np.minimum(stamps[0] + step * np.arange(count), stamps[-1])
 
-    stretch: Stretch
-    kept: np.ndarray
-    layout: Layout
-    step: float | None
+    def logged(start: int, end: int) -> np.ndarray:
+        used = numbers[start:end]
+        table = spool.read(recording.first + int(used[0]), recording.first + int(used[-1]) + 1)
+        return table if len(table) == len(used) else table[used - used[0]]
 
-    def pieces(self, spool: Spool, rows: int = ROWS_AT_A_TIME) -> Iterator[dict[str, np.ndarray]]:
-        """Time and the signals q, v, u, a, `rows` at a time."""
-        recording, first = self.stretch.recording, self.stretch.start
-        numbers = first + np.flatnonzero(self.kept[first : self.stretch.end])  # rows of the recording that are used
-        time = stamps = recording.time[numbers]
-        if self.step is not None:
-            count = int(np.floor((stamps[-1] - stamps[0]) / self.step * (1 + 1e-12))) + 1
-            time = np.minimum(stamps[0] + self.step * np.arange(count), stamps[-1])
+    def interpolated(at: np.ndarray) -> np.ndarray:
+        low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
+        high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
+        table, held = logged(low, high), list(layout.held)
+        between = make_interp_spline(stamps[low:high], table, k=3)(at)
+        if held:
+            before = np.searchsorted(stamps[low:high], at * (1 + 1e-12), side="right") - 1
+            between[:, held] = table[before][:, held]
+        return between
 
-        def logged(start: int, end: int) -> np.ndarray:
-            used = numbers[start:end]
-            table = spool.read(recording.first + int(used[0]), recording.first + int(used[-1]) + 1)
-            return table if len(table) == len(used) else table[used - used[0]]
-
-        def interpolated(at: np.ndarray) -> np.ndarray:
-            low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
-            high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
-            table, held = logged(low, high), list(self.layout.held)
-            between = make_interp_spline(stamps[low:high], table, k=3)(at)
-            if held:
-                before = np.searchsorted(stamps[low:high], at * (1 + 1e-12), side="right") - 1
-                between[:, held] = table[before][:, held]
-            return between
-
-        for start in range(0, len(time), rows):
-            end = min(start + rows, len(time))
-            low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
-            table = logged(low, high) if self.step is None else interpolated(time[low:high])
-            signals = self.layout.signals(table, time[low:high])
-            own = slice(start - low, end - low)
-            yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}
+    for start in range(0, len(time), rows):
+        end = min(start + rows, len(time))
+        low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
+        table = logged(low, high) if step is None else interpolated(time[low:high])
+        signals = layout.signals(table, time[low:high])
+        own = slice(start - low, end - low)
+        yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}

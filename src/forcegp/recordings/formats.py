@@ -5,17 +5,16 @@ from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 
-import h5py
-import numpy as np
 from typing_extensions import override
 
+from forcegp.data import is_dataset
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings.array_file import ArrayFile, NumpyArchive
 from forcegp.recordings.delimited_text import DelimitedText
 from forcegp.recordings.hdf5_and_matlab import HDF5Arrays, matlab_file
 from forcegp.recordings.parquet import INFO, LeRobotFolder, ParquetFile
 from forcegp.recordings.ros_bag import RosBag
-from forcegp.recordings.source import Columns, Source, reading
+from forcegp.recordings.source import Columns, Source, exact
 
 
 class SideBySide(Source):
@@ -64,7 +63,7 @@ class SideBySide(Source):
         self.require(names)
         used = list(dict.fromkeys(self._owners[name][0] for name in names))
         own = {source: [self._owners[name][1] for name in names if self._owners[name][0] is source] for source in used}
-        streams = [_exact(source.chunks(list(dict.fromkeys(own[source])), rows), rows) for source in used]
+        streams = [exact(source.chunks(list(dict.fromkeys(own[source])), rows), rows) for source in used]
         counts = dict.fromkeys(used, 0)
         for pieces in zip_longest(*streams):
             lengths = [len(next(iter(piece.values()))) if piece else 0 for piece in pieces]
@@ -77,21 +76,6 @@ class SideBySide(Source):
                 raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
             found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
             yield {name: found[self._owners[name][0]][self._owners[name][1]] for name in names}
-
-
-def _exact(pieces: Iterator[Columns], rows: int) -> Iterator[Columns]:
-    """The same rows in pieces of exactly `rows`, but for the last."""
-    waiting: list[Columns] = []
-    count = 0
-    for piece in pieces:
-        waiting.append(piece)
-        count += len(next(iter(piece.values())))
-        while count >= rows:
-            joined = {name: np.concatenate([part[name] for part in waiting]) for name in piece}
-            yield {name: values[:rows] for name, values in joined.items()}
-            waiting, count = [{name: values[rows:] for name, values in joined.items()}], count - rows
-    if count:
-        yield {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")
@@ -130,10 +114,8 @@ def open_source(
     if kind in TEXT:
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:
-        if kind != ".npz" and h5py.is_hdf5(path):
-            with reading(path, "an HDF5 file"), h5py.File(path, "r") as file:
-                if file.attrs.get("format") == "forcegp-dataset":
-                    raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
+        if kind != ".npz" and is_dataset(path):
+            raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
         return ARRAYS[kind](path, within=within)
     return LeRobotFolder(path) if kind == "lerobot" else RosBag(path) if kind == "ros2" else TABLES[kind](path)
 

@@ -73,8 +73,7 @@ class HDF5Arrays(ArrayFile):
             stored = file[name]
             assert isinstance(stored, h5py.Dataset)
             for start in range(0, self._arrays[name][0], rows):
-                piece = stored[..., start : start + rows].T if self.transposed else stored[start : start + rows]
-                yield piece
+                yield stored[..., start : start + rows].T if self.transposed else stored[start : start + rows]
 
 
 WHAT = "a MATLAB file"

@@ -1,6 +1,5 @@
 """`import_recordings`: from log files to one dataset file, whatever their format and size."""
 
-import hashlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 import forcegp.mechanics
+from forcegp.atomic_files import file_digest
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import EpisodeRows, Stamps, Stretch, read_stamps
+from forcegp.recordings.episode_rows import Stamps, Stretch, episode_rows, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
@@ -128,22 +128,22 @@ def import_recordings(
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
         step = _even_step(stamps, options)
         episodes = [
-            EpisodeRows(stretch, own.kept, each.layout, step)
+            (stretch, own.kept, each.layout)
             for each, own in zip(plans, stamps, strict=True)
             for stretch in own.stretches
         ]
-        for stretch in (rows.stretch for rows in episodes):
+        for stretch, *_ in episodes:
             _require_no_jumps(stretch)
         done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
         with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
-            for number, rows in enumerate(episodes):
+            for number, (stretch, kept, layout) in enumerate(episodes):
                 report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
                 before = writer.rows
-                for piece in rows.pieces(spool):
+                for piece in episode_rows(spool, stretch, kept, layout, step):
                     writer.append(**piece, episode=number)
-                recording, begin = rows.stretch.recording, rows.stretch.start
+                recording, begin = stretch.recording, stretch.start
                 stamp = recording.begin + float(recording.time[begin])
-                own = {"recording": recording.label, "number": rows.stretch.number, "row": begin, "begin": stamp}
+                own = {"recording": recording.label, "number": stretch.number, "row": begin, "begin": stamp}
                 done["episodes"].append({**own, "rows": writer.rows - before})
             done["rows"] = writer.rows
             writer.finish({"import": done})
@@ -224,7 +224,7 @@ def _what_was_done(
     made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
     lacking = {name for name, entries in plan.layout.derived.items() if entries}
     return {
-        "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": _digest(file)} for file in files],
+        "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": file_digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
         "columns": {
@@ -256,8 +256,3 @@ def _what_was_done(
         "end": options.end,
         "episodes": [],
     }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,6 +1,5 @@
 """`ColumnMapping`: which columns are what, in which units; its YAML files, and the short forms of the command line."""
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -12,7 +11,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from forcegp.errors import FileFormatError, InvalidInput, usable_arguments
+from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
 from forcegp.recordings.column_names import listed
 from forcegp.recordings.source import reading
 
@@ -33,15 +32,9 @@ class LogUnit:
         return values / self.denominator if self.denominator != 1.0 else values
 
 
-def _units(si: str, **factors: Fraction | int | float) -> dict[str, LogUnit]:
-    made = {}
-    for name, factor in factors.items():
-        name = name.replace("_per_", "/").replace("squared", "^2")
-        if isinstance(factor, Fraction):
-            made[name] = LogUnit(name, si, float(factor.numerator), float(factor.denominator))
-        else:
-            made[name] = LogUnit(name, si, float(factor))
-    return made
+def _units(si: str, factors: Mapping[str, Fraction | float]) -> dict[str, LogUnit]:
+    parts = {name: (x, 1) if isinstance(x, float) else (x.numerator, x.denominator) for name, x in factors.items()}
+    return {name: LogUnit(name, si, float(above), float(below)) for name, (above, below) in parts.items()}
 
 
 _MILLI, _MICRO, _NANO = Fraction(1, 1000), Fraction(1, 10**6), Fraction(1, 10**9)
@@ -51,32 +44,28 @@ ONE = LogUnit("1", "1")
 """Of parts of a quaternion, of shares of a thrust and of switches."""
 
 UNITS: dict[str, dict[str, LogUnit]] = {
-    "time": _units("s", s=1, ms=_MILLI, us=_MICRO, ns=_NANO, min=60),
-    "q": _units("rad", rad=1, mrad=_MILLI, deg=_DEGREE, rev=_TURN)
-    | _units("m", m=1, cm=Fraction(1, 100), mm=_MILLI, um=_MICRO)
+    "time": _units("s", {"s": 1, "ms": _MILLI, "us": _MICRO, "ns": _NANO, "min": 60}),
+    "q": _units("rad", {"rad": 1, "mrad": _MILLI, "deg": _DEGREE, "rev": _TURN})
+    | _units("m", {"m": 1, "cm": Fraction(1, 100), "mm": _MILLI, "um": _MICRO})
     | {"1": ONE},
-    "v": _units("rad/s", rad_per_s=1, mrad_per_s=_MILLI, deg_per_s=_DEGREE, rev_per_s=_TURN, rpm=_TURN / 60.0)
-    | _units("m/s", m_per_s=1, cm_per_s=Fraction(1, 100), mm_per_s=_MILLI),
-    "u": _units("Nm", Nm=1, mNm=_MILLI, uNm=_MICRO, kNm=1000, Ncm=Fraction(1, 100))
-    | _units("N", N=1, mN=_MILLI, kN=1000)
+    "v": _units("rad/s", {"rad/s": 1, "mrad/s": _MILLI, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0})
+    | _units("m/s", {"m/s": 1, "cm/s": Fraction(1, 100), "mm/s": _MILLI}),
+    "u": _units("Nm", {"Nm": 1, "mNm": _MILLI, "uNm": _MICRO, "kNm": 1000, "Ncm": Fraction(1, 100)})
+    | _units("N", {"N": 1, "mN": _MILLI, "kN": 1000})
     | {"1": ONE}
-    | _units("rad/s", rad_per_s=1, rev_per_s=_TURN, rpm=_TURN / 60.0),
-    "a": _units("rad/s^2", rad_per_ssquared=1, deg_per_ssquared=_DEGREE)
-    | _units("m/s^2", m_per_ssquared=1, mm_per_ssquared=_MILLI),
+    | _units("rad/s", {"rad/s": 1, "rev/s": _TURN, "rpm": _TURN / 60.0}),
+    "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREE}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": _MILLI}),
 }
 """By quantity and name: what `ColumnMapping.unit` accepts."""
 
 
 def log_unit(quantity: str, name: str) -> LogUnit:
     """The unit of that name. Raises InvalidInput listing those of the quantity."""
-    units = UNITS[quantity]
     spelled = name.strip().replace("**", "^").replace("²", "^2").replace("µ", "u").replace("·", "").replace("°", "deg")
-    if spelled in units:
-        return units[spelled]
-    lower = {known.lower(): known for known in units}
-    close = lower.get(spelled.lower()) or next(iter(difflib.get_close_matches(spelled, units, n=1)), None)
-    hint = f"; did you mean {close}?" if close else "."
-    raise InvalidInput(f"{quantity} has no unit {name!r}{hint} Known: {', '.join(units)}.")
+    units = UNITS[quantity]
+    meant = {known.lower(): known for known in units}
+    require_known("unit", spelled, f"the units of {quantity}", units, synonyms=meant)
+    return units[spelled]
 
 
 SIGNALS = ("q", "v", "u", "a")
@@ -308,8 +297,7 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
     known = [item.name for item in fields(ColumnMapping)]
     values: dict[str, Any] = {}
     for key, value in content.items():
-        if key not in known:
-            raise InvalidInput(f"key {key!r} is not known; there are {', '.join(known)}.")
+        require_known("key", key, "a mapping of columns", known)
         if value is None:
             continue
         if key in SIGNALS or key == "joints":

@@ -60,12 +60,6 @@ def bases(robot: Robot) -> tuple[Group, ...]:
     return tuple(group for group in robot.space.groups if robot.layout.parents[group.body] == WORLD)
 
 
-def singles(robot: Robot) -> tuple[str, ...]:
-    """Joints of one degree of freedom."""
-    of_bases = {row for group in robot.space.groups for row in range(group.rows.start, group.rows.stop)}
-    return tuple(name for row, name in enumerate(robot.joint_names) if row not in of_bases)
-
-
 def columns_of(
     mapping: ColumnMapping, system: MechanicalSystem | None, joints: tuple[str, ...]
 ) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
@@ -75,7 +69,7 @@ def columns_of(
     """
     if system is None:
         return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
-    robot, own = system.robot, singles(system.robot)
+    robot, own = system.robot, system.robot.single_joint_names
     kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
     of_log = dict(zip(own, joints, strict=True))
     driven = tuple(system.actuation.names) == own
@@ -217,10 +211,7 @@ class Layout:
 
 
 def layout_of(
-    mapping: ColumnMapping,
-    system: MechanicalSystem | None,
-    lacking: Mapping[str, Sequence[bool]],
-    nv: int,
+    mapping: ColumnMapping, system: MechanicalSystem | None, lacking: Mapping[str, Sequence[bool]], nv: int
 ) -> Layout:
     """Where everything stands once positions are those of a Dataset.
 

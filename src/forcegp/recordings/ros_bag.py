@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from forcegp.errors import FileFormatError, InvalidInput, MissingExtra
+from forcegp.errors import FileFormatError, InvalidInput, required_extra
 from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, as_column, reading, require_plausible_size
 
 LOG_TIME = "log_time"
@@ -49,19 +49,15 @@ class RosBag(Source):
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise MissingExtra("reading bags needs rosbags: pip install 'forcegp[logs]'") from error
-
-        known = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
+        reader_of = required_extra("rosbags.highlevel", "logs", "reading bags").AnyReader
+        types = required_extra("rosbags.typesys", "logs", "reading bags")
+        known = types.get_typestore(types.Stores.ROS1_NOETIC if self.ros1 else types.Stores.LATEST)
         if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
             raise FileFormatError(
                 f"{self.path} has no metadata.yaml; give a whole ROS 2 bag, or its .mcap or .db3 file."
             )
         # Exception: rosbags meets damaged files with whatever its parsers, sqlite, zstd and lz4 raise
-        with reading(self.path, "a bag", Exception), AnyReader([self.path], default_typestore=known) as reader:
+        with reading(self.path, "a bag", Exception), reader_of([self.path], default_typestore=known) as reader:
             _require_plausible_chunks(self.path, reader)
             yield reader
 

@@ -14,12 +14,15 @@ from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, uni
 from forcegp.errors import InvalidInput
 from forcegp.recordings.column_names import LinearExpression, expanded, guessed_columns, guessed_time, parse_expression
 from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping, LogUnit, log_unit
-from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, layout_of, singles
+from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, layout_of
 from forcegp.recordings.source import Columns, Source
+from forcegp.summary import listed
 
 LACKING = LinearExpression({}, 0.0)
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
+MOST_NAMES = 40
+"""Of columns in a message."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ def signal_plan(
         if signal not in found and (system is None or log[signal]):
             raise InvalidInput(
                 f"no columns for {signal} ({why}); name them with --{signal}. "
-                f"{source.path} has {_some(source.columns())}"
+                f"{source.path} has {listed(source.columns(), MOST_NAMES)}."
             )
     if system is None and not joints:
         example = ",".join(f"joint{index + 1}" for index in range(len(found["q"])))
@@ -125,7 +128,7 @@ def signal_plan(
         if name is None:
             raise InvalidInput(
                 "no column for the time; name it with `time`, or `step` for the time between rows. "
-                f"{source.path} has {_some(source.columns())}"
+                f"{source.path} has {listed(source.columns(), MOST_NAMES)}."
             )
         guessed.append(f"time = {name}")
         time = LinearExpression({name: 1.0})
@@ -170,7 +173,7 @@ def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     if robot is None:
         return mapping.joints
-    own = singles(robot)
+    own = robot.single_joint_names
     if mapping.joints and sorted(mapping.joints) != sorted(own):
         raise InvalidInput(
             f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
@@ -234,8 +237,9 @@ def _signals(
                 "leave u out, or give actuators: motors of an MJCF file, or a file that MechanicalSystem.to_json wrote "
                 "(`identified`)."
             )
-        listed = ", ".join(names) or "none"
-        raise InvalidInput(f"{signal} has {len(expressions)} columns for {len(names)} {what} ({listed}); {remedy}")
+        raise InvalidInput(
+            f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
+        )
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, ())]
     switches = [name for name in names if signal == "u" and columns[name] == "1"]
     for name in order:
@@ -303,7 +307,3 @@ def _default_time_unit(time: LinearExpression | None) -> LogUnit:
     """Stamps of ROS are whole nanoseconds; everything else is taken for seconds."""
     stamps = time is not None and time.is_column and next(iter(time.weights)).endswith((":header.stamp", ":log_time"))
     return log_unit("time", "ns" if stamps else "s")
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "") + "."

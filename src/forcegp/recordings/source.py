@@ -133,6 +133,21 @@ def arrow_numbers(column: Any) -> np.ndarray:
     return values.astype(np.float64) if values.dtype == object or column.null_count else values
 
 
+def exact(pieces: Iterator[Columns], rows: int) -> Iterator[Columns]:
+    """The same rows in pieces of exactly `rows`, but for the last."""
+    waiting: list[Columns] = []
+    count = 0
+    for piece in pieces:
+        waiting.append(piece)
+        count += len(next(iter(piece.values())))
+        while count >= rows:
+            joined = {name: np.concatenate([part[name] for part in waiting]) for name in piece}
+            yield {name: values[:rows] for name, values in joined.items()}
+            waiting, count = [{name: values[rows:] for name, values in joined.items()}], count - rows
+    if count:
+        yield {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
+
+
 @contextmanager
 def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
     """Turn what a library meets in a damaged file into a FileFormatError that names the path.

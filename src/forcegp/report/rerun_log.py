@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.atomic_files import atomic_file
-from forcegp.errors import MissingExtra
+from forcegp.errors import required_extra
 from forcegp.report.motion import RecordedScene
 from forcegp.report.scene import COLORS, DARK_LINK, LINK, quaternion
 
@@ -18,10 +18,7 @@ def write_rerun(path: str | Path, recorded: RecordedScene, *, overwrite: bool = 
 
     Raises MissingExtra without rerun-sdk, InvalidInput where the file is there or its folder is not.
     """
-    try:
-        import rerun as rr  # pyright: ignore[reportMissingImports]  # an extra that `make check` does not install
-    except ImportError as error:
-        raise MissingExtra("a log for rerun needs rerun-sdk: pip install 'forcegp[rerun]'") from error
+    rr = required_extra("rerun", "rerun", "a log for its viewer")
     with atomic_file(path, overwrite=overwrite) as temporary:
         stream = rr.RecordingStream("forcegp")
         stream.save(str(temporary))

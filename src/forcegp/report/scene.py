@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.errors import MissingExtra
+from forcegp.errors import required_extra
 from forcegp.report.motion import RecordedScene
 
 LINK, DARK_LINK = (150, 157, 166), (118, 126, 136)
@@ -26,10 +26,7 @@ OPACITY = 0.6
 @contextmanager
 def viser_server(host: str = "127.0.0.1", port: int | None = None) -> Iterator[Any]:
     """A running viser server, on a free port where none is given; stopped at the end. Raises MissingExtra."""
-    try:
-        import viser
-    except ImportError as error:
-        raise MissingExtra("the robot is drawn with viser: pip install 'forcegp[view]'") from error
+    viser = required_extra("viser", "view", "drawing the robot")
     with redirect_stdout(io.StringIO()):  # where it prints its address, which results must not be mixed with
         server = viser.ViserServer(host=host, port=_free_port(host) if port is None else port)
     try:

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import torch
 
-from forcegp.errors import InvalidInput, MissingExtra, RobotModelError
+from forcegp.errors import InvalidInput, RobotModelError, required_extra
 from forcegp.robots import Robot
 from forcegp.robots.inertia import rotation_from_rpy, transform
 from forcegp.robots.robot_file import read_robot_file
@@ -37,11 +37,7 @@ class LinkShape:
 
 def trimesh_module() -> Any:
     """The package trimesh. Raises MissingExtra without it."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingExtra("the robot is drawn with viser and trimesh: pip install 'forcegp[view]'") from error
-    return trimesh
+    return required_extra("trimesh", "view", "drawing the robot")
 
 
 def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[LinkShape], list[str]]:

@@ -59,13 +59,7 @@ def check_base(description: RobotDescription, standing: Sequence[str], problems:
         found = [name for name in names[kind] if any(re.fullmatch(kind, x.lower()) for x in re.findall(WORD, name))]
         if len(found) >= enough:
             seen = f"its base {root!r} has {mass:.3g} kg, and there is {', '.join(map(repr, found[:4]))}"
-            problems.errors.append(_question(problems.source, seen))
+            doubt = f"{problems.source}: this looks like a robot that is not bolted to the world: {seen}"
+            question = ". base='floating' lets it move freely; base='fixed' takes it as bolted."
+            problems.errors.append(UnstatedBase(doubt, question, {"base": "floating"}))
             return
-
-
-def _question(source: str, seen: str) -> UnstatedBase:
-    return UnstatedBase(
-        f"{source}: this looks like a robot that is not bolted to the world: {seen}",
-        ". base='floating' lets it move freely; base='fixed' takes it as bolted.",
-        {"base": "floating"},
-    )

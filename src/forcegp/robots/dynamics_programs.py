@@ -193,15 +193,9 @@ def _merged(unrolled: UnrolledRobot, request: Request, graph: Graph, parameters:
 def _results(
     at: UnrolledKinematics, arguments: dict[str, list[Expression]], inertias: list[Scalars] | None, function: str
 ) -> list[Scalars]:
-    match function:
-        case "mass_matrix":
-            return [at.mass_matrix(inertias).ravel()]
-        case "mass_matrix_and_bias":
-            return [at.mass_matrix(inertias).ravel(), at.bias_forces(inertias)]
-        case "inverse_dynamics":
-            return [at.inverse_dynamics(scalars(arguments["a"]), inertias)]
-        case _:
-            return [getattr(at, function)(inertias)]
+    names = ("mass_matrix", "bias_forces") if function == "mass_matrix_and_bias" else (function,)
+    a = [scalars(arguments["a"])] if function == "inverse_dynamics" else []
+    return [getattr(at, name)(*a, inertias).ravel() for name in names]
 
 
 PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the robot itself")

@@ -18,21 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from forcegp.errors import (
-    InvalidInput,
-    KinematicLoop,
-    RobotModelError,
-    UnknownJoint,
-    UnknownLink,
-    require_known,
-)
+from forcegp.errors import InvalidInput, KinematicLoop, RobotModelError, UnknownJoint, UnknownLink, require_known
 from forcegp.robots.base import WORLDS, BaseChoice
-from forcegp.robots.inertia import (
-    inverse,
-    rotation_about,
-    rotation_of_z_onto,
-    transform,
-)
+from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.manifold import MOTIONS, Group
 from forcegp.robots.mimic import Drive, followed, with_followers
 from forcegp.robots.problems import Problems
@@ -156,7 +144,7 @@ def lay_out(
         free = joint.type in MOTIONS
         bolted = joint.name in own and base == "fixed"
         if bolted or joint.type == "fixed" or joint.name in held:
-            still = np.eye(4) if free else _joint_motion(joint, held.get(joint.name, 0.0))
+            still = np.eye(4) if free else joint_motion(joint, held.get(joint.name, 0.0))
             links[joint.child] = Placement(above.body, offset @ still)
         else:
             rows, turn = [joint], transform(rotation_of_z_onto(joint.axis), np.zeros(3))
@@ -254,8 +242,10 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[JointDe
     return roots[0], children
 
 
-def _joint_motion(joint: JointDescription, position: float) -> np.ndarray:
-    axis = np.array(joint.axis)
+def joint_motion(joint: JointDescription, position: float) -> np.ndarray:
+    """How a joint that stands still is displaced, (4, 4)."""
+    if not position:
+        return np.eye(4)
     if joint.type == "prismatic":
-        return transform(np.eye(3), position * axis)
-    return transform(rotation_about(axis, position), np.zeros(3)) if position else np.eye(4)
+        return transform(np.eye(3), position * np.array(joint.axis))
+    return transform(rotation_about(joint.axis, position), np.zeros(3))

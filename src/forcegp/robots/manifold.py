@@ -16,6 +16,7 @@ appendices B and D; Hairer, Lubich & Wanner, "Geometric Numerical Integration" (
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -103,6 +104,12 @@ class ConfigurationSpace:
     def nq(self) -> int:
         """Size of q."""
         return self.nv + sum(group.extra for group in self.groups)
+
+    @property
+    def single_rows(self) -> list[int]:
+        """Entries of v of the joints of one degree of freedom."""
+        grouped = {row for group in self.groups for row in range(*group.rows.indices(self.nv))}
+        return [row for row in range(self.nv) if row not in grouped]
 
     @property
     def is_vector_space(self) -> bool:
@@ -409,34 +416,20 @@ def _smooth(
     return torch.where(large, closed(torch.where(large, square, 1.0).sqrt()), total)
 
 
-def _sine(square: Tensor) -> Tensor:
-    """sin t / t."""
-    return _smooth(square, _SINE, lambda t: t.sin() / t)
-
-
-def _versine(square: Tensor) -> Tensor:
-    """(1 - cos t) / t^2."""
-    return _smooth(square, _VERSINE, lambda t: 2.0 * ((0.5 * t).sin() / t) ** 2)
-
-
-def _rest(square: Tensor) -> Tensor:
-    """(t - sin t) / t^3."""
-    return _smooth(square, _REST, lambda t: (t - t.sin()) / t**3)
-
-
-def _cotangent(square: Tensor) -> Tensor:
-    """(1 - t/2 cot(t/2)) / t^2."""
-    return _smooth(square, _COTANGENT, lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
-
-
-def _arctangent(square: Tensor) -> Tensor:
-    """2 atan(t/2) / t."""
-    return _smooth(square, _ARCTANGENT, lambda t: 2.0 * torch.atan(0.5 * t) / t)
-
-
-def _advance(square: Tensor) -> Tensor:
-    """(1 / (1 + t^2/4) - 2 atan(t/2) / t) / t^2: how much less a screw advances than it turns."""
-    return _smooth(square, _ADVANCE, lambda t: (1.0 / (1.0 + 0.25 * t * t) - 2.0 * torch.atan(0.5 * t) / t) / t**2)
+_sine = partial(_smooth, series=_SINE, closed=lambda t: t.sin() / t)
+"""sin t / t."""
+_versine = partial(_smooth, series=_VERSINE, closed=lambda t: 2.0 * ((0.5 * t).sin() / t) ** 2)
+"""(1 - cos t) / t^2."""
+_rest = partial(_smooth, series=_REST, closed=lambda t: (t - t.sin()) / t**3)
+"""(t - sin t) / t^3."""
+_cotangent = partial(_smooth, series=_COTANGENT, closed=lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
+"""(1 - t/2 cot(t/2)) / t^2."""
+_arctangent = partial(_smooth, series=_ARCTANGENT, closed=lambda t: 2.0 * torch.atan(0.5 * t) / t)
+"""2 atan(t/2) / t."""
+_advance = partial(
+    _smooth, series=_ADVANCE, closed=lambda t: (1.0 / (1.0 + 0.25 * t * t) - 2.0 * torch.atan(0.5 * t) / t) / t**2
+)
+"""(1 / (1 + t^2/4) - 2 atan(t/2) / t) / t^2: how much less a screw advances than it turns."""
 
 
 def _arc(sine_square: Tensor, cosine: Tensor) -> Tensor:

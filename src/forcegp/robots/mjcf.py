@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from forcegp.errors import MalformedMjcf, MissingExtra, NonPhysicalInertia, UnreadableRobotFile
+from forcegp.errors import MalformedMjcf, NonPhysicalInertia, UnreadableRobotFile, required_extra
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.mjcf_model import WORLD, CompiledModel, Translation
 from forcegp.robots.problems import Problems
@@ -46,11 +46,7 @@ def translate(text: str, path: Path | None, nearest: bool, for_system: bool, pro
     """
     included: dict[str, bytes] = {}
     _require_bounded(text, [] if path is None else [path.parent], problems.source, included)
-    try:
-        import mujoco
-    except ImportError:
-        raise MissingExtra(f"{problems.source}: MJCF needs MuJoCo: pip install 'forcegp[mujoco]'.") from None
-    made: Any = mujoco
+    made = required_extra("mujoco", "mujoco", f"{problems.source}: MJCF")
     needed: list[str] = []
     before, noted = made.get_mju_user_warning(), []
     made.set_mju_user_warning(noted.append)  # otherwise they go into a file in the current folder

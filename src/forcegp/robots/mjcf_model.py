@@ -129,13 +129,11 @@ class CompiledModel:
             last = joint + 1 == first + model.body_jntnum[body] and not anchor.any()
             child = name if last else self._named(f"{self.joints[joint]}_link", self.links)
             self._link(child, inside if last else "")
-            self._joint(self.joints[joint], *self._kind(joint, kind), upper, child, at, self._parts(joint, kind))
+            turns = "continuous" if kind == "revolute" and not model.jnt_limited[joint] else kind
+            self._joint(self.joints[joint], turns, upper, child, at, self._parts(joint, kind))
             upper, at = child, transform(np.eye(3), -anchor)
         if upper != name:
             self._fixed(upper, name, at, inside)
-
-    def _kind(self, joint: int, kind: str) -> tuple[str]:
-        return ("continuous" if kind == "revolute" and not self.model.jnt_limited[joint] else kind,)
 
     def _inertial(self, body: int) -> str:
         model = self.model
@@ -271,17 +269,12 @@ class CompiledModel:
                 poses = [held @ transform(np.eye(3), -data[:3]), np.eye(4)]
             else:
                 bodies, poses = ends, [transform(np.eye(3), data[:3]), transform(np.eye(3), data[3:6])]
+            first, second = (self.bodies[body] for body in bodies)
+            points: list[Any] = [tuple(pose[:3, 3].tolist()) for pose in poses]
             if weld:
-                first, second = (
-                    (self._frame(f"{name}_{side}", body, pose), (0.0, 0.0, 0.0))
-                    for side, body, pose in zip("ab", bodies, poses, strict=True)
-                )
-            else:
-                first, second = (
-                    (self.bodies[body], (float(pose[0, 3]), float(pose[1, 3]), float(pose[2, 3])))
-                    for body, pose in zip(bodies, poses, strict=True)
-                )
-            yield LoopDescription(name, (first[0], second[0]), (first[1], second[1]), weld)
+                first, second = map(self._frame, (f"{name}_a", f"{name}_b"), bodies, poses)
+                points = [(0.0, 0.0, 0.0)] * 2
+            yield LoopDescription(name, (first, second), (points[0], points[1]), weld)
 
     def _frame(self, name: str, body: int, pose: np.ndarray) -> str:
         if np.array_equal(pose, np.eye(4)):

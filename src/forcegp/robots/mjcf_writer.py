@@ -12,8 +12,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from forcegp.errors import RobotModelError
-from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
-from forcegp.robots.layout import BASE, OUTSIDE
+from forcegp.robots.inertia import inverse, rotation_of_z_onto, transform
+from forcegp.robots.layout import BASE, OUTSIDE, joint_motion
 from forcegp.robots.manifold import MOTIONS
 from forcegp.robots.mimic import followed
 from forcegp.robots.mjcf_model import LoopDescription
@@ -110,7 +110,7 @@ class MjcfWriter:
     def _chain(self, joint: JointDescription, pose: np.ndarray, depth: int) -> None:
         """The body that a joint moves, with the joints above it that move no mass."""
         if joint.name not in self.moving:
-            self._body(joint.child, pose @ _motion(joint, self.held.get(joint.name, 0.0)), [], depth)
+            self._body(joint.child, pose @ joint_motion(joint, self.held.get(joint.name, 0.0)), [], depth)
             return
         joints = self._axes(joint)
         while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
@@ -138,7 +138,7 @@ class MjcfWriter:
         for name in (names := [link]):
             for joint in self.children[name]:
                 if joint.name not in self.moving:
-                    still = joint.origin @ _motion(joint, self.held.get(joint.name, 0.0))
+                    still = joint.origin @ joint_motion(joint, self.held.get(joint.name, 0.0))
                     found[joint.child] = found[name] @ still
                     names.append(joint.child)
         return found
@@ -181,15 +181,6 @@ class MjcfWriter:
             for joint in self.robot.description.joints
             if joint.mimics is not None and joint.name in self.moving
         ]
-
-
-def _motion(joint: JointDescription, position: float) -> np.ndarray:
-    """How a joint that stands still is displaced."""
-    if not position:
-        return np.eye(4)
-    if joint.type == "prismatic":
-        return transform(np.eye(3), position * np.array(joint.axis))
-    return transform(rotation_about(joint.axis, position), np.zeros(3))
 
 
 def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from forcegp.atomic_files import write_json
-from forcegp.errors import InvalidNumber, MalformedUrdf, MissingExtra, RobotFileWarning
+from forcegp.errors import InvalidNumber, MalformedUrdf, RobotFileWarning, required_extra
 from forcegp.robots.urdf_file import before_the_end, read_text, write_text
 
 COMMENT = "<!-- rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json -->\n"
@@ -25,12 +25,7 @@ def read_robot_file(path: str | Path) -> str:
     text = read_text(path)
     if Path(path).suffix != ".xacro":
         return text
-    try:
-        import xacro  # pyright: ignore[reportMissingImports]  # an extra
-    except ImportError:
-        raise MissingExtra(
-            f"{path}: xacro files need the package xacro: pip install 'forcegp[xacro]'; or expand it elsewhere."
-        ) from None
+    xacro = required_extra("xacro", "xacro", f"{path}: a file that is not expanded elsewhere")
     try:
         document: Any = xacro.process_file(str(path))  # a document of minidom; its annotation is too wide
         return document.toxml()

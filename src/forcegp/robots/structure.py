@@ -130,8 +130,7 @@ class RobotStructure(Summary):
     @property
     def single_joint_names(self) -> tuple[str, ...]:
         """Names of the joints of one degree of freedom: where there are actuators and friction."""
-        grouped = {row for group in self.layout.groups for row in range(*group.rows.indices(self.nv))}
-        return tuple(name for row, name in enumerate(self.joint_names) if row not in grouped)
+        return tuple(self.joint_names[row] for row in self.space.single_rows)
 
     @property
     def posture_names(self) -> tuple[str, ...]:

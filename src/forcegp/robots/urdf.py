@@ -12,14 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from forcegp.errors import (
-    DanglingJoint,
-    DuplicateName,
-    InvalidNumber,
-    MalformedUrdf,
-    MissingElement,
-    UnsupportedJoint,
-)
+from forcegp.errors import DanglingJoint, DuplicateName, InvalidNumber, MalformedUrdf, MissingElement, UnsupportedJoint
 from forcegp.robots.inertia import rotation_from_rpy, transform
 from forcegp.robots.problems import Problems
 from forcegp.robots.xml_text import parse_xml, refuse_xacro
@@ -130,7 +123,9 @@ def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
     found: dict[str, Element] = {}
     for element in root.findall(kind):
         with problems.collected():
-            name = _name(element, kind, problems.source)
+            name = element.get("name", "")
+            if not name.strip():
+                raise MissingElement(f'{problems.source}: a <{kind}> has no name; write <{kind} name="...">.')
             if name in found:
                 seen = f"{problems.source}: two {kind}s are called {name!r}"
                 raise DuplicateName(seen, f"; {kind} names must be unique, rename one.")
@@ -155,13 +150,6 @@ class _Place:
 
     def __str__(self) -> str:
         return f"{self.source}: {self.owner}"
-
-
-def _name(element: Element, kind: str, source: str) -> str:
-    name = element.get("name")
-    if name is None or not name.strip():
-        raise MissingElement(f'{source}: a <{kind}> has no name; write <{kind} name="...">.')
-    return name
 
 
 def _attribute(element: Element, attribute: str, place: _Place) -> str:

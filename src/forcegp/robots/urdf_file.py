@@ -9,7 +9,7 @@ three variables.
 
 import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.atomic_files import write_bytes
-from forcegp.errors import InvalidInput, NonPhysicalInertia, UnknownJoint, UnknownLink, UnreadableRobotFile
+from forcegp.errors import InvalidInput, NonPhysicalInertia, UnknownJoint, UnknownLink, UnknownName, UnreadableRobotFile
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
 from forcegp.robots.problems import Problems
@@ -91,21 +91,13 @@ def replace_inertial(
     ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, axes of the link frame.
     """
     data = text.encode("utf-8")
-    newline = b"\r\n" if b"\r\n" in data else b"\n"
-    spans = _find(data, "link", link, "inertial")
-    if spans is None:
-        raise UnknownLink(f"{source}: no link {link!r} in the URDF text.")
-    (start, head_end), inertial = spans
-    if inertial is not None:
-        first, last = inertial
-        element = _inertial(mass, center_of_mass, inertia, newline + _indent_of(data, first))
-        return (data[:first] + element + data[last:]).decode("utf-8")
-    indent = _indent_of(data, start)
-    element = newline + indent + b"  " + _inertial(mass, center_of_mass, inertia, newline + indent + b"  ")
-    if data[head_end - 2 : head_end] == b"/>":  # <link name="tool"/> has no inside yet
-        opened = data[: head_end - 2].rstrip() + b">"
-        return (opened + element + newline + indent + b"</link>" + data[head_end:]).decode("utf-8")
-    return (data[:head_end] + element + data[head_end:]).decode("utf-8")
+    parts = [f"  {part}".encode() for part in inertial_parts(mass, center_of_mass, inertia)]
+    element = [b"<inertial>", *parts, b"</inertial>"]
+    head, inertial = _find(data, "link", link, "inertial", UnknownLink(f"{source}: no link {link!r} in the URDF text."))
+    if inertial is None:
+        return _with_child(data, head, b"link", element)
+    first, last = inertial
+    return (data[:first] + _line_start(data, first).join(element) + data[last:]).decode("utf-8")
 
 
 def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
@@ -114,16 +106,11 @@ def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, sour
     Attributes that are not named stay, with digits that read back exactly.
     """
     data = text.encode("utf-8")
-    spans = _find(data, "joint", joint, "dynamics")
-    if spans is None:
-        raise UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
-    (start, head_end), dynamics = spans
+    unknown = UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
+    head, dynamics = _find(data, "joint", joint, "dynamics", unknown)
     if dynamics is None:
-        indent = _indent_of(data, start)
-        newline = b"\r\n" if b"\r\n" in data else b"\n"
         attributes = " ".join(f'{name}="{value!r}"' for name, value in values.items())
-        element = newline + indent + b"  " + f"<dynamics {attributes}/>".encode()
-        return (data[:head_end] + element + data[head_end:]).decode("utf-8")
+        return _with_child(data, head, b"joint", [f"<dynamics {attributes}/>".encode()])
     first, last = dynamics
     element = data[first:last].decode("utf-8")
     for name, value in values.items():
@@ -133,8 +120,16 @@ def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, sour
     return (data[:first] + element.encode() + data[last:]).decode("utf-8")
 
 
-def _find(data: bytes, kind: str, name: str, part: str) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
-    """Byte offsets (first, one past last) of an element's start tag, and of the element ``part`` directly in it."""
+REST_OF_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
+
+
+def _find(
+    data: bytes, kind: str, name: str, part: str, unknown: UnknownName
+) -> tuple[tuple[int, int], tuple[int, int] | None]:
+    """Byte offsets (first, one past last) of an element's start tag, and of the element ``part`` directly in it.
+
+    Raises ``unknown`` where there is no such element.
+    """
     parser = expat.ParserCreate("utf-8")
     depth = 0
     inside = False
@@ -142,16 +137,9 @@ def _find(data: bytes, kind: str, name: str, part: str) -> tuple[tuple[int, int]
     child: list[int] = []
 
     def after_tag(position: int) -> int:
-        quote = b""
-        while True:
-            byte = data[position : position + 1]
-            if quote:
-                quote = b"" if byte == quote else quote
-            elif byte in (b'"', b"'"):
-                quote = byte
-            elif byte == b">":
-                return position + 1
-            position += 1
+        tag = REST_OF_TAG.match(data, position)
+        assert tag is not None, "the text is well-formed"
+        return tag.end()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth, inside
@@ -174,13 +162,24 @@ def _find(data: bytes, kind: str, name: str, part: str) -> tuple[tuple[int, int]
     parser.EndElementHandler = end
     parser.Parse(data, True)
     if not found:
-        return None
+        raise unknown
     return (found[0], found[1]), ((child[0], child[1]) if child else None)
 
 
-def _indent_of(data: bytes, position: int) -> bytes:
+def _with_child(data: bytes, head: tuple[int, int], kind: bytes, lines: Sequence[bytes]) -> str:
+    """The text with one more element, of these lines, in the element whose start tag has the offsets ``head``."""
+    line_start, head_end = _line_start(data, head[0]), head[1]
+    element = b"".join(line_start + b"  " + line for line in lines)
+    before, after = data[:head_end], data[head_end:]
+    if before.endswith(b"/>"):  # <link name="tool"/> has no inside yet
+        before, after = before[:-2].rstrip() + b">", line_start + b"</" + kind + b">" + after
+    return (before + element + after).decode("utf-8")
+
+
+def _line_start(data: bytes, position: int) -> bytes:
+    """The end of a line of this text, and the indentation of the line of that offset."""
     line = data[data.rfind(b"\n", 0, position) + 1 : position]
-    return line if not line.strip() else b""
+    return (b"\r\n" if b"\r\n" in data else b"\n") + (b"" if line.strip() else line)
 
 
 def inertial_parts(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> list[str]:
@@ -189,11 +188,6 @@ def inertial_parts(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray)
     moments = " ".join(f'{key}="{float(inertia[index])!r}"' for key, index in entries.items())
     origin = f'<origin xyz="{numbers(center_of_mass)}" rpy="0 0 0"/>'
     return [origin, f'<mass value="{float(mass)!r}"/>', f"<inertia {moments}/>"]
-
-
-def _inertial(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, line_start: bytes) -> bytes:
-    inner = [b"  " + element.encode() for element in inertial_parts(mass, center_of_mass, inertia)]
-    return line_start.join([b"<inertial>", *inner, b"</inertial>"])
 
 
 InertiaChoice = Literal["strict", "nearest"]

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from forcegp.checks.check_input import plain
 from forcegp.data import Dataset, time_blocks
 from forcegp.data.configurations import space_of
 from forcegp.data.motion_records import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.data.preparation import plain
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
