@@ -106,6 +106,8 @@ REFUSALS = {
     ("prepare", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 is not a file",
     ("check", "clean.h5", "--plots", "mine"): "was not written by `forcegp check`, so it is not overwritten",
     ("check", "clean.h5", "--cutoff", "-3"): "cutoff is -3.0",
+    ("check", "bare.h5", "--gravity", "0,0,9"): "--gravity needs --robot",  # not left out without a word
+    ("prepare", "bare.h5", "--cutoff", "9", "--lock", "pan=0", "--out", "x.h5"): "--lock needs --robot",
     ("check", "arm.urdf"): "is not an HDF5 file",
 }
 

@@ -44,8 +44,7 @@ class Check(CutoffOptions, RobotOptions, Overwriting):
 
         preparation = self._preparation()
         dataset = forcegp.Dataset.load(self.data)
-        needs_robot = self.robot is not None or self.identified is not None or dataset.system is not None
-        system = self.chosen_system(dataset, self.data) if needs_robot else None
+        system = self.system_if_any(dataset, self.data)
         with terminal.progress("checking"):
             report = forcegp.check(dataset, system, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}

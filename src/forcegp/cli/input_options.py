@@ -107,12 +107,17 @@ class RobotOptions(RobotFileOptions):
 
     def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
         """The dataset's own system, with what is replaced. Raises InvalidInput for none, and where joints differ."""
-        system = self.chosen(dataset.system)
+        system = self.system_if_any(dataset, path)
         if system is None:
             raise InvalidInput(
                 f"{path} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
             )
-        if system.robot.joint_names != tuple(dataset.joint_names):
+        return system
+
+    def system_if_any(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem | None:
+        """The same, or None where there is no robot and no option asks for one."""
+        system = self.chosen(dataset.system)
+        if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
             raise InvalidInput(
                 f"{self.robot or self.identified or 'the robot'} has joints {', '.join(system.robot.joint_names)}; "
                 f"{path} has {', '.join(dataset.joint_names)}. Give the robot that was recorded, or "

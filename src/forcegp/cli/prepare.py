@@ -50,8 +50,7 @@ class Prepare(PreparationOptions, RobotOptions, Overwriting):
 
         preparation = replace(self._preparation(), stance=self.stance)
         dataset = forcegp.Dataset.load(self.data)
-        if self.robot is not None or self.identified is not None or dataset.system is not None:
-            dataset = replace(dataset, system=self.chosen_system(dataset, self.data))
+        dataset = replace(dataset, system=self.system_if_any(dataset, self.data))
         with terminal.progress("preparing"):
             prepared = preparation.apply(dataset)
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:
