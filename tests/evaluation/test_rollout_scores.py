@@ -43,6 +43,8 @@ def test_errors_are_ways_on_the_manifold(posterior, log):
     errors = rollout_errors(replace(rollout, q=lost), recorded, log.system)
     assert np.isnan(errors.joint[1, 5:]).all()
     assert np.isfinite(errors.joint[1, :5]).all()
+    assert errors.tool is not None
+    assert errors.constraint is None  # feet have no surface to be away from
 
 
 def test_samples_give_intervals_about_the_mean(posterior, log):
@@ -63,6 +65,20 @@ def test_a_base_is_drawn_by_its_way_from_the_start(posterior, log):
     start = torch.tensor(recorded.q[0, :1])
     way = log.system.robot.difference(start.expand(len(drawn), -1), torch.tensor(recorded.q[0]))
     np.testing.assert_allclose(drawn, way[:, 0], atol=1e-12)
+
+
+def test_a_diverged_motion_is_the_farthest_of_a_median(posterior, log):
+    """A median over what is left would drop where the worst motion ends."""
+    rollout, recorded = rolled(posterior, log)
+    errors = rollout_errors(rollout, recorded, log.system)
+    joint = np.ones((3, *errors.joint.shape[1:])) * np.array([1.0, 2.0, 4.0])[:, None, None]
+    joint[2, 5:] = joint[1, 10:] = np.nan
+    diverged = replace(errors, joint=joint, diverged_at=np.array([-1, 10, 5]))
+    figure = rollout_figure(rollout, recorded, diverged, log, "title")
+    (median,) = [line for line in figure.subfigs[1].axes[0].lines if line.get_label() == "median"]
+    drawn = np.asarray(median.get_ydata())  # from row 1
+    assert (drawn[:9] == 2.0).all()
+    assert np.isnan(drawn[9:]).all()
 
 
 def test_starts_that_are_counted_avoid_gaps(log):

@@ -179,23 +179,25 @@ def _number(values: Any, statistic: str) -> float | None:
 
 
 def _report(summary: Mapping[str, Any]) -> list[Any]:
-    contacts = summary["constraint_max"] is not None
+    of_contacts = {"tool_error_median": "tool error,\nmedian", "constraint_max": "largest |c|\nso far"}
+    of_contacts = {
+        name: title for name, title in of_contacts.items() if any(each[name] is not None for each in summary["moments"])
+    }
     intervals = any(moment["inside_95"] is not None for moment in summary["moments"])
     header = ["after", "motions", "joint error,\nmedian", "\nlargest"]
-    header += ["tool error,\nmedian", "largest |c|\nso far"] if contacts else []
+    header += of_contacts.values()
     header += ["in 95 %\ninterval"] if intervals else []
     rows = []
     for moment in summary["moments"]:
         cells = [f"{moment['time']:.3g} s", str(moment["lasting"])]
         cells += [number(moment["joint_error_median"]), number(moment["joint_error_max"])]
-        if contacts:
-            cells += [shown(moment[name], "{:.3g} mm", 1e3) for name in ("tool_error_median", "constraint_max")]
+        cells += [shown(moment[name], "{:.3g} mm", 1e3) for name in of_contacts]
         rows.append([*cells, percent(moment["inside_95"])] if intervals else cells)
     count = len(summary["rows"])
     title = f"{count} motions against {summary['data']}; joint error: the worst joint, {summary['unit']}"
     ended = sum(row >= 0 for row in summary["diverged_at"])
     values = {"integrator": summary["integrator"], "diverged": f"{ended} of {count}"}
-    if summary["integrator"] == "projected" and contacts:
+    if summary["integrator"] == "projected" and of_contacts:
         moved = summary["initial_correction"]
         values["initial states"] = f"moved onto the contacts by up to {moved[0]:.1e} rad and {moved[1]:.1e} rad/s"
     values["time"] = f"{summary['cpu_seconds']:.1f} s CPU"

@@ -21,8 +21,8 @@ class RolloutErrors:
 
     joint: (B, T+1, nv) |q - q_recorded| in rad or m; of a base that moves, displacement and turn along its own axes.
     tool: (B, T+1) largest distance of a contact point from the recorded one in m; None without contacts.
-    constraint: (B, T+1) largest |c(q)| of a contact in m; None without contacts. recorded_constraint: that of the
-        recording.
+    constraint: (B, T+1) largest |c(q)| of a contact in m; None without contacts, and where all of them hold what they
+        stand on, wherever it is. recorded_constraint: that of the recording.
     spread: (B, T+1, nv) half the width of the 95 % interval of q (`Rollout.interval`); None where there is none.
     inside: (B, T+1, nv) whether the recorded q lies in that interval (NaN after a divergence); None without one.
     diverged_at: (B,) see `Rollout`.
@@ -50,9 +50,10 @@ def rollout_errors(rollout: Rollout, recorded: RecordedMotions, system: Mechanic
             for contact in system.contacts
         ]
         tool = torch.where(lost, torch.nan, torch.stack(apart).amax(0)).cpu().numpy()
-        constraint = rollout.constraint.abs().amax(-1).cpu().numpy()
-        distances = [contact.distance(there).abs() for contact in system.contacts]
-        recorded_constraint = torch.stack(distances).amax(0).cpu().numpy()
+        distances = torch.stack([contact.distance(there).abs() for contact in system.contacts]).amax(0)
+        if bool(distances.any()) or bool(rollout.constraint.nan_to_num().any()):
+            constraint = rollout.constraint.abs().amax(-1).cpu().numpy()
+            recorded_constraint = distances.cpu().numpy()
     if rollout.samples is not None or rollout.intervals is not None:
         low, high = (end.cpu().numpy() for end in interval_about(rollout, rollout.q, system.robot.space))
         spread, off = 0.5 * (high - low), apart_from(rollout.q, actual, system.robot.space).cpu().numpy()

@@ -107,11 +107,9 @@ def _draw_all(
 
 
 def _median(values: Float[np.ndarray, "motions rows"]) -> Float[np.ndarray, " rows"]:
-    """Over the motions that have not diverged; NaN where none is left."""
-    lasting = np.isfinite(values).any(0)
-    median = np.full(values.shape[1], np.nan)
-    median[lasting] = np.nanmedian(values[:, lasting], axis=0)
-    return median
+    """Over all motions, where those that diverged are the farthest; NaN where it is one of these."""
+    median = np.median(np.where(np.isfinite(values), values, np.inf), axis=0)
+    return np.where(np.isfinite(median), median, np.nan)
 
 
 def _finish(axes: Axes, title: str, unit: str) -> None:
