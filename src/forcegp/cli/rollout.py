@@ -155,7 +155,7 @@ def parse_baumgarte(given: str) -> forcegp.Baumgarte | None:
 
 
 def _moment(errors: forcegp.evaluation.RolloutErrors, row: int) -> dict[str, Any]:
-    """Errors over all motions that have not diverged, at one moment; the joint error is that of the worst joint."""
+    """Errors at one moment; the joint error is that of the worst joint. What diverged is the farthest of a median."""
     worst = errors.joint[:, row].max(-1)
     return {
         "time": float(errors.time[row]),
@@ -169,13 +169,15 @@ def _moment(errors: forcegp.evaluation.RolloutErrors, row: int) -> dict[str, Any
 
 
 def _number(values: Any, statistic: str) -> float | None:
-    """A statistic of the finite values of an array; None if there are none."""
+    """A statistic of the finite values of an array, a median of all; None if there is none."""
     import numpy as np  # here, so that --help does not wait for it
 
     if values is None:
         return None
-    finite = values[np.isfinite(values)]
-    return float(getattr(np, statistic)(finite)) if finite.size else None
+    finite = np.isfinite(values)
+    counted = np.where(finite, values, np.inf) if statistic == "median" else values[finite]
+    found = float(getattr(np, statistic)(counted)) if counted.size else np.inf
+    return found if np.isfinite(found) else None
 
 
 def _report(summary: Mapping[str, Any]) -> list[Any]:
