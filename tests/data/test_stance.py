@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import Preparation
+from forcegp import Dataset, MechanicalSystem, Preparation, Robot
 from forcegp.data import estimate_stance, motion_spectrum
 from forcegp.errors import ContactError, DatasetError, DataWarning, InvalidInput
-from forcegp.mechanics import fixed_frame
+from forcegp.mechanics import fixed_frame, fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 SWITCHES = slice(-4, None)
@@ -48,6 +48,23 @@ def test_what_a_filter_leaves_of_noise_is_no_motion():
     assert (found.flags == flags)[decided].mean() > 0.999
     assert decided.all(axis=1).mean() > 0.8
     assert (found.flags[flags == 0.0] == 0.0).mean() > 0.8
+
+
+def test_a_foot_that_swings_most_of_the_time():
+    """A hopper whose flight is as fast as the noise of its velocity: what it seldom carries is stance, not the rest."""
+    body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
+    robot = Robot.from_urdf_text(f'<robot name="hopper"><link name="foot">{body}</link></robot>', base="floating")
+    time = np.arange(2000) / 200
+    flags = (time % 0.8 < 0.25).astype(float)
+    v, a = np.zeros((2, len(time), 6))
+    v[:, 2] = (1.0 - flags) * np.random.default_rng(0).normal(size=len(time))
+    a[:, 2] = -9.75 * (1.0 - flags)
+    system = MechanicalSystem(robot, fixed_point("foot", switch="stands"))
+    q = np.tile(robot.neutral().numpy(), (len(time), 1))
+    found = estimate_stance(Dataset(q=q, v=v, u=0.0 * flags[:, None], a=a, time=time, system=system))
+    decided = np.isfinite(found.flags[:, 0])
+    assert (found.flags[:, 0] == flags)[decided].all()
+    assert decided.mean() > 0.75
 
 
 def test_what_noise_hides_stays_open():

@@ -6,9 +6,10 @@ The payload is one more body, fixed to a link, in the equations of `forcegp.anal
 
 with h = 1 in the rows in which the robot holds it and b the body that carries it (Atkeson, An & Hollerbach 1986).
 Equations are averaged over windows of time, which takes noise of the acceleration, under which inertias look too small,
-but leaves friction as sharp as it is. Forces of feet that stand are left out before (`recorded_rows`). Without a
-`baseline` the links are those of the URDF. With one they are estimated, too, and an error that both logs share is not
-mistaken for the payload.
+but leaves friction as sharp as it is. Where a base moves, that is too little: Y is that of the accelerations that are
+likely by the robot identified before (`RecordedRows.likely`), and noise of a stays in the residuals. Forces of feet
+that stand are left out before (`recorded_rows`). Without a `baseline` the links are those of the URDF. With one they
+are estimated, too, and an error that both logs share is not mistaken for the payload.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from scipy.stats import t as student
 
 from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
 from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
-from forcegp.analytical.identification import ROWS, joint_terms
+from forcegp.analytical.identification import ROWS, identify_analytical, joint_terms
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import with_terms
@@ -157,7 +158,15 @@ def identify_payload(
     stated = standard_parameters(robot).reshape(-1, 10).cpu().numpy()[: len(links) if baseline is None else 0]
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
-    regressor = recorded.regressor(a)
+    likely_a, from_noise = a, np.zeros(1)
+    if not robot.space.is_vector_space:  # noise of a would explain any mass of a base
+        parts = np.split(np.arange(len(a)), np.flatnonzero(np.diff(holds)) + 1)
+        likely = [
+            _likely(log, system, (q[at], v[at], u[at], a[at]), friction, rotors)
+            for log, at in zip(logs, parts, strict=True)
+        ]
+        likely_a, from_noise = (np.concatenate(x) for x in zip(*likely, strict=True))
+    regressor = recorded.regressor(likely_a)
     held = regressor[:, :, [terms.bodies.index(placement.body)]] * holds[:, None, None, None]
     regressor = np.concatenate([regressor, held], axis=2)
     split, known = bodies.size, len(stated)
@@ -165,7 +174,8 @@ def identify_payload(
 
     def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parameters = np.concatenate([stated, bodies.parameters(x[:split])])
-        r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
+        r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], likely_a, regressor)
+        r = r + from_noise
         in_bodies = np.einsum("nibp,bpk->nibk", in_parameters[:, :, known:], bodies.derivatives(x[:split]))
         jacobian = np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1)
         return windows.mean(recorded.without_contacts(r)), windows.mean(recorded.without_contacts(jacobian))
@@ -227,6 +237,18 @@ class _Windows:
         """(rows, ...) as (windows, ...)."""
         sums = np.add.reduceat(values, self.starts, axis=0)
         return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _likely(
+    log: Dataset, system: MechanicalSystem, rows: tuple[np.ndarray, ...], friction: tuple[str, ...], rotors: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """a* and the offset that it leaves (`LikelyAccelerations`) in rows of a log, by the robot identified from it."""
+    found = identify_analytical(log, system, friction=friction, rotors=rotors, likelihood="both")
+    q, v, u, a = rows
+    recorded, split = RecordedRows(found.given, found.terms, q, v, u), found.bodies.size
+    parameters = found.bodies.parameters(found.fit.x[:split])
+    likely = recorded.likely(parameters, found.fit.x[split:], a, recorded.regressor(a))
+    return likely.a, likely.offset
 
 
 def _last_link(robot: Robot) -> str:

@@ -29,7 +29,8 @@ SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
 QUARTER = 0.3186
 """Of |x| of a normal number, in standard deviations: a quarter of the rows is quiet also where a foot moves much."""
 FREE, LEAST, BEARS = 0.95, 0.02, 0.4
-"""Quantile of the forces on feet that clearly move; shares of the median force at rest: nothing, and surely bearing."""
+"""Quantile of the forces on feet that clearly move; shares of the force above and below which feet at rest carry half
+of all that they carry: nothing, and surely bearing."""
 FEW = 10
 MANY_OPEN = 0.25
 """Share of open rows that more than changes of stance leave."""
@@ -105,8 +106,8 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
 
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
-    the median at rest. Forces decide nothing where moving feet show more than these 40 %. Raises ContactError
-    without contacts that have a switch.
+    the median at rest, of rows weighted by their force. Forces decide nothing where moving feet show more than these
+    40 %. Raises ContactError without contacts that have a switch.
     """
     system = dataset.system if system is None else system
     names = () if system is None else tuple(dict.fromkeys(each.switch for each in system.contacts if each.switch))
@@ -190,7 +191,9 @@ def _averaged(values: Float[np.ndarray, "rows m"], width: int) -> Float[np.ndarr
 
 def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
     """Forces up to which nothing bears, and from which a foot stands [N]; NaN where they do not differ."""
-    standing = float(np.median(force[rests])) if rests.any() else 0.0
+    carried = np.sort(force[rests])  # by what they carry: of a foot that swings most of the time, rest is rare
+    half = np.searchsorted(carried.cumsum(), 0.5 * carried.sum())
+    standing = float(carried[half]) if len(carried) else 0.0
     free, bears = LEAST * standing, BEARS * standing
     if moves.sum() >= FEW:
         free = max(free, float(np.quantile(force[moves], FREE)))

@@ -16,18 +16,21 @@ from forcegp.robots.manifold import Group
 
 FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
 TRIED = np.linspace(0.0, 0.3, 31)  # s
+BLOCK = 4096  # rows
 SETTLED = 0.5  # s, of an episode, after which nothing depends on how it began
 
 
 def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
 
-    For every T, accelerations of the base are fitted by least squares to what thrusters and air can do: each thruster,
-    velocity, speed times velocity, rates, their products, attitude, and thrust times velocity. All columns lose their
-    slow part first, for wind is slow and controllers answer it, which made lags up to a third too short. The best T has
-    the least sum of log residuals, by a parabola; its deviation comes from leaving out each eighth of the time (block
-    jackknife, as in `estimate_delay`). Raises InvalidInput without `Thrusters` on a base that moves freely, and
-    DatasetError where the recording is too short, or shows no lag below .3 s.
+    For every T, the force that the base's acceleration needs is fitted by least squares to what thrusters, air and
+    joints can do: each thruster, velocity, speed times velocity, rates, their products, attitude, thrust times
+    velocity, and the torque regressor of bodies that joints move beside the base. With such bodies only forces count,
+    no torques: a load on an arm changes inertias far more than the mass, which looked like a lag (72 ms of none). All
+    columns lose their slow part first, for wind is slow and controllers answer it, which made lags up to a third too
+    short. The best T has the least sum of log residuals, by a parabola; its deviation comes from leaving out each
+    eighth of the time (block jackknife, as in `estimate_delay`). Raises InvalidInput without `Thrusters` on a base that
+    moves freely, and DatasetError where the recording is too short, or shows no lag below .3 s.
     """
     found = thruster_columns(dataset.system)
     if dataset.system is None or not found:
@@ -38,16 +41,22 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
         raise DatasetError(
             "the recording is too short for the lag of thrusters; record 1,000 rows or more, or give the lag in s."
         )
-    target = np.concatenate([_fast(part.a[:, group.rows], part.time) for part in episodes])
+    forces, moved = (
+        np.concatenate([_fast(values, part.time) for values, part in zip(each, episodes, strict=True)])
+        for each in zip(*(_base_forces(part, group) for part in episodes), strict=True)
+    )
     misfits = []
     for seconds in TRIED:
         causes = [_causes(part, columns, powers, group, float(seconds)) for part in episodes]
         X = np.concatenate([_fast(own, part.time) for own, part in zip(causes, episodes, strict=True)])
-        X /= np.linalg.norm(X, axis=0) + 1e-300
-        misfits.append(np.log(np.maximum(least_squares(X, target), 1e-300)).sum(axis=1))
-    lags = np.array([lowest(profile, TRIED) for profile in np.array(misfits).T])
+        if moved.shape[1] == 0:
+            misfits.append(_misfits(X, forces))
+        else:  # each force has columns of its own
+            own = zip(np.split(moved, 3, axis=1), forces[:, :3].T, strict=True)
+            misfits.append(sum(_misfits(np.hstack([X, more]), force[:, None]) for more, force in own))
+    lags = np.array([lowest(profile, TRIED) if np.argmin(profile) else 0.0 for profile in np.array(misfits).T])
     if not np.isfinite(lags).all():
-        raise DatasetError("the recording shows no lag of the thrusters between 0 and .3 s; give the lag in s, or 0.")
+        raise DatasetError("the recording shows no lag of the thrusters below .3 s; give the lag in s, or 0.")
     return float(lags[0]), float(jackknife(lags[None, 1:])[0])
 
 
@@ -76,7 +85,29 @@ def _causes(
     return np.concatenate([thrust, thrust.sum(1, keepdims=True) * v, v, speed * v, w, *turning, axes], axis=1)
 
 
+def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:
+    """Forces (rows, 6) that accelerate the base, and for each of the first three k columns of bodies beside it."""
+    assert part.system is not None
+    robot, found = part.system.robot, []
+    for start in range(0, len(part), BLOCK):
+        q, v, a = (torch.tensor(x[start : start + BLOCK], device=robot.device) for x in (part.q, part.v, part.a))
+        with torch.no_grad():
+            at = robot.kinematics(q, v)
+            base = at.mass_matrix()[:, group.rows, group.rows] @ a[:, group.rows, None]
+            a[:, group.rows] = 0.0  # what is fitted explains nothing
+            regressor = at.torque_regressor(a)[:, group.rows, group.bodies.stop :][:, :3]
+            found.append((base[..., 0].cpu().numpy(), regressor.flatten(1).cpu().numpy()))
+    forces, moved = zip(*found, strict=True)
+    return np.concatenate(forces), np.concatenate(moved)
+
+
 def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:
     """Without what a low pass of first order leaves, where that has settled."""
-    slow = np.stack([lagged(column, time, FAST) for column in values.T], axis=1)
+    slow = np.stack([lagged(column, time, FAST) for column in values.T], axis=1) if values.size else values
     return (values - slow)[time - time[0] > SETTLED]
+
+
+def _misfits(X: Float[np.ndarray, "rows causes"], target: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " parts"]:
+    """Sums of log residuals of all rows, and without each block."""
+    left = least_squares(X / (np.linalg.norm(X, axis=0) + 1e-300), target)
+    return np.log(np.maximum(left, 1e-300)).sum(axis=1)
