@@ -191,9 +191,7 @@ def test_what_a_log_at_a_high_rate_means_is_named():
     v = np.hstack([world, log.v[:, 3:]])
     (finding,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0)))
     assert (finding.severity, finding.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
-    stated = {
-        "import": {"mapping": {"axes": {"v": ["world"]}}}
-    }  # rates of the body, turned as if they were the world's
+    stated = {"import": {"mapping": {"axes": {"v": "world"}}}}  # rates of the body, turned as if they were the world's
     v = np.hstack([log.v[:, :3], Rotation.from_quat(log.q[:, 3:7]).inv().apply(log.v[:, 3:].copy())])
     (finding,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0), metadata=stated))
     assert (finding.severity, finding.correction) == ("wrong", {"axes": {"v": ("world", "body")}})

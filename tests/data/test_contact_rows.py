@@ -7,7 +7,7 @@ import torch
 from forcegp.data import Dataset, contact_rows, rows_in_contact
 from forcegp.errors import ContactError
 from forcegp.mechanics import Contact, ImplicitSurface, Plane
-from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
+from forcegp.simulation import KukaSurfaceConfig, QuadrupedConfig, simulate_kuka_surface, simulate_quadruped
 
 pytest.importorskip("pybullet")
 
@@ -26,6 +26,13 @@ def test_rows_in_contact_are_those_where_the_simulator_pushed(hopping, noise_is_
     assert (found & true).sum() / true.sum() > 0.98
     kept = rows_in_contact(data)
     np.testing.assert_array_equal(kept.time, data.time[found[:, 0]])
+
+
+def test_flags_decide_where_a_contact_has_a_switch():
+    """Noise of a foot's velocity is no reason to leave its stance out, which would leave swing to learn from."""
+    walk = simulate_quadruped(QuadrupedConfig(seconds=1.0, seed=1))
+    noisy = dataclasses.replace(walk, v=walk.v + 0.05 * np.random.default_rng(0).normal(size=walk.v.shape))
+    assert contact_rows(noisy).all()
 
 
 def test_truth_is_not_looked_at(hopping):

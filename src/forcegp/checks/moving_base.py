@@ -190,7 +190,8 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
 def _stated_axes(dataset: Dataset) -> tuple[str, str]:
     """Of linear and angular velocities in the log file, as its import was given them."""
     with contextlib.suppress(AttributeError, TypeError, KeyError, ValueError):  # somebody else's metadata
-        *_, linear, angular = 2 * tuple(dataset.metadata["import"]["mapping"]["axes"]["v"])
+        given = dataset.metadata["import"]["mapping"]["axes"]["v"]  # one word, or one for each part
+        *_, linear, angular = 2 * ((given,) if isinstance(given, str) else tuple(given))
         return str(linear), str(angular)
     return "body", "body"
 

@@ -42,7 +42,7 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
        rows that pass 1 and 2 than 1 mm or 20 robust standard deviations of them, whichever is more.
 
     Rows of an impact break 2 and do not count. A point at rest, or gliding along just above its surface, cannot be
-    distinguished from one in contact. A closed loop acts in every row.
+    distinguished from one in contact. A closed loop acts in every row, and a contact with a switch where its flag is.
 
     Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
@@ -57,7 +57,7 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
         motions = _point_motions(dataset, system)
     columns = []
     for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
-        if isinstance(contact, forcegp.mechanics.LoopClosure):
+        if isinstance(contact, forcegp.mechanics.LoopClosure) or contact.switch is not None:
             columns.append(np.ones(len(dataset), dtype=bool))
             continue
         columns.append(_acting(motion, recovery))

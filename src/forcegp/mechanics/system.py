@@ -16,7 +16,7 @@ from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidI
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
 from forcegp.mechanics.known_forces import KNOWN_FORCES, Actuation, KnownForce, RigidBodyBias, known_force_to_dict
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
-from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import OBSERVED, Thrusters
 from forcegp.mechanics.wheels import WHEEL, RollingContact
 from forcegp.robots import Kinematics, Robot
@@ -243,6 +243,9 @@ class MechanicalSystem(Summary):
         for index, contact in enumerate(self.contacts):
             if isinstance(contact, LoopClosure | RollingContact):  # in a plane some of its rows constrain nothing
                 size[..., index] = 1.0 + 0.0 * size[..., index]
+            elif isinstance(contact.surface, Held):  # neither do all directions of a held point
+                alike = [k for k, x in enumerate(self.contacts) if (x.frame, x.point) == (contact.frame, contact.point)]
+                size[..., index] = torch.linalg.vector_norm(A[..., alike, :], dim=(-2, -1)) + 0.0 * b[..., index]
             if contact.switch is not None:  # where it does not act it needs no direction
                 size[..., index] += 1.0 - (u[..., self.inputs.index(contact.switch)] > 0.5).to(size.dtype)
         bad = torch.nonzero(~(size > 1e-12))
