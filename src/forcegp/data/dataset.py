@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from typing_extensions import override
 
 import forcegp.mechanics
-import forcegp.robots
 from forcegp.data.dataset_fields import (
     FrozenDict,
     arrays_of,
