@@ -13,7 +13,7 @@ are estimated, too, and an error that both logs share is not mistaken for the pa
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +25,7 @@ from forcegp.analytical.identifiability import body_pseudo_inertias, standard_pa
 from forcegp.analytical.identification import ROWS, identify_analytical, joint_terms
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
 from forcegp.analytical.recorded_rows import RecordedRows
-from forcegp.analytical.result import with_terms
+from forcegp.analytical.result import AnalyticalIdentification, with_terms
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
@@ -111,8 +111,9 @@ def identify_payload(
     baseline: Dataset | None = None,
     link: str | None = None,
     friction: tuple[str, ...] = LAWS,
-    rotors: str | None = "armature",
+    rotors: Literal["armature", "rotor"] | None = "armature",
     rows: int = ROWS,
+    identified: AnalyticalIdentification | None = None,
 ) -> PayloadEstimate:
     """Mass, centre of mass and inertia of a payload on `link`, with friction and rotor inertia estimated along.
 
@@ -124,6 +125,7 @@ def identify_payload(
     link: what carries it; None is the last link of the last joint, or a base that moves.
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
+    identified: what `identify_analytical` found in `dataset`, if it is there already; of use where the base moves.
 
     Standard errors come from leaving out each twentieth of the logs in turn (block jackknife; Kuensch 1989, "The
     jackknife and the bootstrap for general stationary observations"), so that errors of the friction law, which last,
@@ -161,10 +163,14 @@ def identify_payload(
     likely_a, from_noise = a, np.zeros(1)
     if not robot.space.is_vector_space:  # noise of a would explain any mass of a base
         parts = np.split(np.arange(len(a)), np.flatnonzero(np.diff(holds)) + 1)
-        likely = [
-            _likely(log, system, (q[at], v[at], u[at], a[at]), friction, rotors)
-            for log, at in zip(logs, parts, strict=True)
+        states = [(q[at], v[at], u[at], a[at]) for at in parts]
+        found = [
+            identify_analytical(log, system, friction=friction, rotors=rotors, likelihood="both")
+            if identified is None or log is not dataset
+            else identified
+            for log in logs
         ]
+        likely = [_likely(own, *rows) for own, rows in zip(found, states, strict=True)]
         likely_a, from_noise = (np.concatenate(x) for x in zip(*likely, strict=True))
     regressor = recorded.regressor(likely_a)
     held = regressor[:, :, [terms.bodies.index(placement.body)]] * holds[:, None, None, None]
@@ -240,11 +246,9 @@ class _Windows:
 
 
 def _likely(
-    log: Dataset, system: MechanicalSystem, rows: tuple[np.ndarray, ...], friction: tuple[str, ...], rotors: Any
+    found: AnalyticalIdentification, q: np.ndarray, v: np.ndarray, u: np.ndarray, a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """a* and the offset that it leaves (`LikelyAccelerations`) in rows of a log, by the robot identified from it."""
-    found = identify_analytical(log, system, friction=friction, rotors=rotors, likelihood="both")
-    q, v, u, a = rows
+    """a* and the offset that it leaves (`LikelyAccelerations`) in these rows, by an identified robot."""
     recorded, split = RecordedRows(found.given, found.terms, q, v, u), found.bodies.size
     parameters = found.bodies.parameters(found.fit.x[:split])
     likely = recorded.likely(parameters, found.fit.x[split:], a, recorded.regressor(a))

@@ -107,7 +107,8 @@ class Auto(Resuming, Import):
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
             identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
             try:
-                payload, why_not = forcegp.analytical.identify_payload(recording, link=self.link), ""
+                payload = forcegp.analytical.identify_payload(recording, link=self.link, identified=identified)
+                why_not = ""
             except DatasetError as error:
                 payload, why_not = None, f"not estimated: {error}"
         document, posterior = self._validated(terminal, rows, recording, system)
