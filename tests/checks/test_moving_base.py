@@ -137,6 +137,16 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
     assert "--feet" in carried.remedy
 
 
+def test_a_base_in_millimetres(log):
+    q, v, a = log.q.copy(), log.v.copy(), log.a.copy()
+    for values in (q, v, a):
+        values[:, :3] *= 1000.0
+    bare = replace(log, q=q, v=v, a=a, u=log.u[:, :12], system=log.system.with_contacts([]), truth={})
+    (finding,) = [each for each in check(bare).findings if each.subject == "base force"]
+    assert finding.severity == "wrong"
+    assert "--unit q=mm" in finding.remedy
+
+
 def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
         excitation(log.system)

@@ -33,6 +33,8 @@ WINDOW, MOST_TURN = 0.1, 0.5
 """Seconds over which motion is averaged, and rad, since rates are averaged as vectors."""
 CARRIED = 0.5
 """Of the weight: a larger force in half of the rows carries the robot."""
+THOUSANDS = 10.0
+"""Times the weight: a larger force is one of lengths in mm."""
 GAP = 1.5
 """Times the usual time of so many rows: a longer one has a gap."""
 RPM = 2.0 * np.pi / 60.0
@@ -142,6 +144,14 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     if found <= CARRIED * weight:
         return
     numbers, weighs = {"force": found, "weight": weight}, f"(the robot weighs {weight:.3g} N)"
+    if not thrusters and found > THOUSANDS * weight:
+        yield wrong(
+            subject="base force",
+            seen=f"{group.name!r} moves under {found:.3g} N that nothing in the system explains {weighs}.",
+            remedy="Are positions of the base in mm? Then add --unit q=mm (and v=mm/s) to forcegp import.",
+            numbers=numbers,
+        )
+        return
     if not thrusters:
         yield wrong(
             subject="base force",

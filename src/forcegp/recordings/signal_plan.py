@@ -232,6 +232,8 @@ def _signals(
                     "the base was not measured: record its pose by motion capture or a state estimator (position and "
                     "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
                 )
+        elif signal == "u" and names:
+            remedy = f"{remedy[:-1]}, and 0 for a joint that nothing drives."
         elif not names:
             remedy = (
                 "leave u out, or give actuators: motors of an MJCF file, or a file that MechanicalSystem.to_json wrote "
