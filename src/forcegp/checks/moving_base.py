@@ -148,7 +148,7 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
         yield wrong(
             subject="base force",
             seen=f"{group.name!r} moves under {found:.3g} N that nothing in the system explains {weighs}.",
-            remedy="Are positions of the base in mm? Then add --unit q=mm (and v=mm/s) to forcegp import.",
+            remedy="Are positions of the base in mm? Then give their unit, as in forcegp import --unit q=mm,v=mm/s.",
             numbers=numbers,
         )
         return
