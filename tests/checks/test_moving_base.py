@@ -137,6 +137,29 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
     assert "--feet" in carried.remedy
 
 
+@pytest.mark.parametrize(("order", "shift"), [("wxyz", -1), ("xyzw", 1)])
+def test_the_order_of_quaternions_of_a_robot_that_stays_upright(order, shift):
+    """Its rates are a small part of its speed, and either order of the log may have been stated."""
+    time = np.arange(2000) / 200
+    robot = Robot.from_urdf_text(BODY, base="floating")
+    v, q = np.zeros((2000, 6)), [robot.neutral()]
+    for k in range(6):
+        v[:, k] = (1.0 if k < 3 else 0.1) * np.sin((k + 2) * time)
+    for step in torch.tensor(v[:-1] + np.diff(v, axis=0) / 2) / 200:
+        q.append(robot.integrate(q[-1], step))
+    q = torch.stack(q).numpy()
+    actual = "xyzw" if order == "wxyz" else "wxyz"
+    true = Dataset(q=q, v=v, u=np.zeros((2000, 0)), a=np.gradient(v, time, axis=0), time=time,
+                   system=MechanicalSystem(robot, (), (RigidBodyBias(),)))  # fmt: skip
+    assert not [each for each in quick_check(true) if each.subject == "base"]
+    turn = Rotation.from_quat(q[:, 3:])
+    q[:, 3:] = np.roll(q[:, 3:], shift, axis=1)  # as read in the wrong order, with linear velocities in world axes
+    v = np.hstack([Rotation.from_quat(q[:, 3:]).inv().apply(turn.apply(v[:, :3])), v[:, 3:]])
+    stated = {"import": {"mapping": {"orientation": order, "axes": {"v": ["world", "body"]}}}}
+    (finding,) = [each for each in quick_check(replace(true, q=q, v=v, metadata=stated)) if each.subject == "base"]
+    assert (finding.severity, finding.correction) == ("wrong", {"orientation": {"q": (actual,)}})
+
+
 def test_a_base_in_millimetres(log):
     q, v, a = log.q.copy(), log.v.copy(), log.a.copy()
     for values in (q, v, a):

@@ -33,6 +33,8 @@ WINDOW, MOST_TURN = 0.1, 0.5
 """Seconds over which motion is averaged, and rad, since rates are averaged as vectors."""
 CARRIED = 0.5
 """Of the weight: a larger force in half of the rows carries the robot."""
+LEAST = 0.01
+"""Of the speed: a smaller error is that of rounding."""
 THOUSANDS = 10.0
 """Times the weight: a larger force is one of lengths in mm."""
 GAP = 1.5
@@ -89,7 +91,7 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
         windows = _Windows.of(dataset, own[[k for k, free in enumerate(group.motion.free) if free > 2]])
         q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
         at, v, a = q[:, group.places], v[:, group.rows], a[:, group.rows]
-        yield from _of_velocity(windows, group, at, v, _stated_axes(dataset))
+        yield from _of_velocity(windows, group, at, v, _stated_axes(dataset), _stated_order(dataset))
         each = v.unflatten(0, windows.rows.shape)
         change = (each[:, -1] - each[:, 0]) / windows.step
         error, size = _rms(change - windows.mean(a)), _rms(change)
@@ -206,7 +208,16 @@ def _stated_axes(dataset: Dataset) -> tuple[str, str]:
     return "body", "body"
 
 
-def _of_velocity(windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: tuple[str, str]) -> Iterator[Finding]:
+def _stated_order(dataset: Dataset) -> str:
+    """Of quaternions in the log file, as its import was given it."""
+    with contextlib.suppress(AttributeError, TypeError, KeyError):  # somebody else's metadata
+        return str(dataset.metadata["import"]["mapping"]["orientation"])
+    return "xyzw"
+
+
+def _of_velocity(
+    windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: tuple[str, str], order: str
+) -> Iterator[Finding]:
     whole = list(range(v.shape[1]))
     angular = [free > 2 for free in group.motion.free]
     parts = {"linear ": [k for k in whole if not angular[k]], "angular ": [k for k in whole if angular[k]]}
@@ -236,10 +247,12 @@ def _of_velocity(windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: 
     found, other, recorded = best_axes(q)
     speed, meant, correction = _rms(windows.mean(raw)), list[str](), dict[str, dict[str, tuple[str, ...]]]()
     if group.kind != "planar":
-        axes, reordered, _ = best_axes(_reordered(group, q))
-        if mistaken(recorded, reordered, speed) and reordered < other:
-            found, other = axes, reordered
-            meant, correction["orientation"] = ["a quaternion w, x, y, z"], {"q": ("wxyz",)}
+        axes, reordered, _ = best_axes(_reordered(group, q, order))
+        # of a robot that hardly turns, rates are a small part of the speed, and other axes may hide a wrong order
+        hidden = recorded > LEAST * speed and reordered < CLEARLY * other
+        if hidden or (mistaken(recorded, reordered, speed) and reordered < other):
+            found, other, actual = axes, reordered, "xyzw" if order == "wxyz" else "wxyz"
+            meant, correction["orientation"] = [f"a quaternion {', '.join(actual)}"], {"q": (actual,)}
     if found:
         alike = len(found) == 2 and len(set(found.values())) == 1
         named = {"": next(iter(found.values()))} if alike else found
@@ -279,10 +292,10 @@ def _in_world(group: Group, q: Tensor, v: Tensor) -> Tensor:
     return (pose(group.kind, q)[0][:, None] @ six[..., None]).flatten(1)[:, free]
 
 
-def _reordered(group: Group, q: Tensor) -> Tensor:
-    """Positions of a log whose quaternions begin with w."""
+def _reordered(group: Group, q: Tensor, order: str = "xyzw") -> Tensor:
+    """Positions of a log whose quaternions begin with w; or end with it, where they were read in the order wxyz."""
     turned = q.clone()
-    turned[:, group.motion.turn] = q[:, group.motion.turn].roll(-1, -1)
+    turned[:, group.motion.turn] = q[:, group.motion.turn].roll(1 if order == "wxyz" else -1, -1)
     return turned
 
 
