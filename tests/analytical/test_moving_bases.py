@@ -297,6 +297,17 @@ def test_a_payload_on_the_trunk_of_a_walker(walker, noise, rows):
     np.testing.assert_allclose(found.center_of_mass, [0.05, 0.0, 0.1], atol=0.1 if noise else 0.02)
 
 
+def test_a_payload_takes_the_identification_that_is_there(walker):
+    log = recorded(walker, 400, 0.1)
+    known = identify_analytical(log, walker, friction=("viscous",), rotors="armature", likelihood="both")
+    options = {"link": body_names(walker.robot)[0], "friction": ("viscous",)}
+    found = identify_payload(log, walker, identified=known, **options)
+    assert found.values == identify_payload(log, walker, **options).values
+    other = replace(known, given=MechanicalSystem(Robot.from_urdf_text(DRONE, base="floating")))
+    with pytest.raises(InvalidInput, match="identified is of another robot"):
+        identify_payload(log, walker, identified=other, **options)
+
+
 def test_noise_under_constraints_is_that_of_the_rows(walker):
     q, v, u = rows_of(walker, 400)
     dynamics = walker.dynamics(q, v, u)

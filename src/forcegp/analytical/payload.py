@@ -143,6 +143,10 @@ def identify_payload(
                 raise DatasetError(f"{name} has {len(log)} rows; a payload needs {10 * STRETCHES} or more.")
         if whole_number("rows", rows, 0) < 10 * STRETCHES:
             raise InvalidInput(f"rows is {rows}; it must be at least {10 * STRETCHES}.")
+        if identified is not None:
+            require_type("identified", identified, AnalyticalIdentification, ", as identify_analytical returns it")
+            if identified.given.robot.joint_names != system.robot.joint_names:
+                raise InvalidInput("identified is of another robot; give what was found in `dataset`, or leave it out.")
     robot, _ = thickened(system.robot)
     system = system.with_robot(robot)
     link = _last_link(robot) if link is None else link
@@ -249,9 +253,8 @@ def _likely(
     found: AnalyticalIdentification, q: np.ndarray, v: np.ndarray, u: np.ndarray, a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """a* and the offset that it leaves (`LikelyAccelerations`) in these rows, by an identified robot."""
-    recorded, split = RecordedRows(found.given, found.terms, q, v, u), found.bodies.size
-    parameters = found.bodies.parameters(found.fit.x[:split])
-    likely = recorded.likely(parameters, found.fit.x[split:], a, recorded.regressor(a))
+    recorded = RecordedRows(found.given, found.terms, q, v, u)
+    likely = recorded.likely(found.parameters, found.fit.x[found.bodies.size :], a, recorded.regressor(a))
     return likely.a, likely.offset
 
 

@@ -288,8 +288,13 @@ class Resuming(Command):
 
 
 def begins(mark: bytes) -> Callable[[Path], bool]:
-    """Whether a file begins so."""
-    return lambda path: path.read_bytes().startswith(mark)
+    """Whether a file begins so; no more of it is read, for it may be large and not ours."""
+
+    def own(path: Path) -> bool:
+        with path.open("rb") as file:
+            return file.read(len(mark)) == mark
+
+    return own
 
 
 def _config(path: Path) -> dict[str, Any]:
