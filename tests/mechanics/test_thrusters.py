@@ -9,7 +9,7 @@ import torch
 
 from forcegp import MechanicalSystem, Robot
 from forcegp.errors import InvalidInput, UnknownFrame
-from forcegp.mechanics import Actuation, ObservedWrench, RigidBodyBias, Thrusters
+from forcegp.mechanics import Actuation, ObservedWind, ObservedWrench, RigidBodyBias, Thrusters
 
 INERTIA = '<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0.001" ixz="0" iyz="0.002"/>'
 DRONE = f"""<robot name="drone"><link name="body"><inertial><origin xyz="0.01 -0.02 0.03"/><mass value="1.5"/>{INERTIA}
@@ -66,6 +66,27 @@ def test_an_observed_wrench_acts_along_the_axes_of_the_world(robot):
     torch.testing.assert_close(turned, calm.state.kinematics.frame_jacobian("pod")[:, 3:].mT @ u[0, 1:])
 
 
+def test_motions_foresee_a_wrench_that_fades_to_what_lasts(robot):
+    fading = ObservedWrench("pod", tuple("abcdefghijkl"))
+    system = MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), ObservedWind(), fading))
+    assert system.held_inputs == tuple(range(1, 16))
+    u = torch.randn(3, 5, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = system.foreseen(u, 0.1)
+    torch.testing.assert_close(found[..., :1], u[..., :1])  # commanded
+    torch.testing.assert_close(
+        found[..., [1, 2, 3, *range(10, 16)]], u[:, :1, [1, 2, 3, *range(10, 16)]].expand(3, 5, 9)
+    )
+    for k in range(5):
+        share = np.exp(-0.4 * k)
+        torch.testing.assert_close(found[:, k, 4:10], share * u[:, 0, 4:10] + (1 - share) * u[:, 0, 10:])
+    q, v, _ = states(robot)  # what lasts does not act by itself
+    rows = found[0]
+    silent = rows.clone()
+    silent[:, 10:] = 0.0
+    torch.testing.assert_close(system.dynamics(q, v, rows).Q_K, system.dynamics(q, v, silent).Q_K)
+    torch.autograd.gradcheck(lambda u: system.foreseen(u, 0.1), u[:1].clone().requires_grad_())
+
+
 def test_gradients(robot):
     system = MechanicalSystem(robot, (), (Actuation(), Thrusters("pod", PLACES, 2.0, 0.1, AXES, 2), RigidBodyBias()))
     q, v, u = states(robot, 1)
@@ -96,7 +117,7 @@ def test_files_carry_them(robot):
         (lambda: Thrusters("pod", PLACES, power=3), "1 for thrusts or 2"),
         (lambda: Thrusters("pod", PLACES, names=("a", "a")), "2 different ones"),
         (lambda: Thrusters("pod", PLACES, names=("tilt", "b")), "its own name"),
-        (lambda: ObservedWrench("pod", ("a", "b")), "three different ones, or six"),
+        (lambda: ObservedWrench("pod", ("a", "b")), "3, 6 or 12 different ones"),
     ],
 )
 def test_what_does_not_fit_is_refused(robot, make, words):

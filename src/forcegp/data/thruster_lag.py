@@ -24,12 +24,13 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
 
     For every T, the force that the base's acceleration needs is fitted by least squares to what thrusters, air and
-    joints can do: each thruster, velocity, speed times velocity, rates, their products, attitude, thrust times
-    velocity, and the torque regressor of bodies that joints move beside the base. With such bodies only forces count,
-    no torques: a load on an arm changes inertias far more than the mass, which looked like a lag (72 ms of none). All
-    columns lose their slow part first, for wind is slow and controllers answer it, which made lags up to a third too
-    short. The best T has the least sum of log residuals, by a parabola; its deviation comes from leaving out each
-    eighth of the time (block jackknife, as in `estimate_delay`). Raises InvalidInput without `Thrusters` on a base that
+    joints can do: each thruster, its speed times the velocity (Mahony et al. 2012), velocity, its square, rates, their
+    products, attitude, thrust times velocity, and the torque regressor of bodies that joints move beside the base.
+    With such bodies only forces count, no torques: a load on an arm changes inertias far more than the mass, which
+    looked like a lag (72 ms of none). All columns lose their slow part first, for wind is slow and controllers answer
+    it, which made lags up to a third too short. The best T has the least sum of log residuals, by a parabola; its
+    deviation comes from leaving out each eighth of the time (block jackknife, as in `estimate_delay`), and from half a step of time, by which a command that
+    holds until the next row is later than one that does not. Raises InvalidInput without `Thrusters` on a base that
     moves freely, and DatasetError where the recording is too short, or shows no lag below .3 s.
     """
     found = thruster_columns(dataset.system)
@@ -57,7 +58,8 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     lags = np.array([lowest(profile, TRIED) if np.argmin(profile) else 0.0 for profile in np.array(misfits).T])
     if not np.isfinite(lags).all():
         raise DatasetError("the recording shows no lag of the thrusters below .3 s; give the lag in s, or 0.")
-    return float(lags[0]), float(jackknife(lags[None, 1:])[0])
+    half = 0.5 * float(np.median(np.diff(episodes[0].time)))
+    return float(lags[0]), float(np.hypot(jackknife(lags[None, 1:])[0], half))
 
 
 def thruster_columns(system: forcegp.mechanics.MechanicalSystem | None) -> dict[int, int]:
@@ -80,9 +82,11 @@ def _causes(
     thrust = np.where(powers == 2, late * np.abs(late), late)
     v, w = part.v[:, group.rows][:, :3], part.v[:, group.rows][:, 3:]
     axes = Rotation.from_quat(part.q[:, group.places][:, group.motion.turn]).as_matrix().reshape(-1, 9)
-    speed = np.linalg.norm(v, axis=1, keepdims=True)
+    fast = np.linalg.norm(v, axis=1, keepdims=True)
+    spinning = np.where(powers == 2, late, np.sqrt(np.abs(late)))[..., None] * v[:, None]
     turning = [np.cross(w, v), w[:, [1, 2, 0]] * w[:, [2, 0, 1]]]
-    return np.concatenate([thrust, thrust.sum(1, keepdims=True) * v, v, speed * v, w, *turning, axes], axis=1)
+    parts = [thrust, thrust.sum(1, keepdims=True) * v, v, fast * v, w, *turning, axes, spinning.reshape(len(v), -1)]
+    return np.concatenate(parts, axis=1)
 
 
 def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:

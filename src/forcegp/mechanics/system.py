@@ -17,7 +17,7 @@ from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Co
 from forcegp.mechanics.known_forces import KNOWN_FORCES, Actuation, KnownForce, RigidBodyBias, known_force_to_dict
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
-from forcegp.mechanics.thrusters import OBSERVED, Thrusters
+from forcegp.mechanics.thrusters import FADES, OBSERVED, ObservedWrench, Thrusters
 from forcegp.mechanics.wheels import WHEEL, RollingContact
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import Inertials, JointValues, Positions
@@ -163,9 +163,23 @@ class MechanicalSystem(Summary):
 
     @property
     def held_inputs(self) -> tuple[int, ...]:
-        """Columns of u that are observed, not commanded: predicted motions keep those of their start."""
+        """Columns of u that are observed, not commanded: predicted motions follow from those of their start."""
         held = {name for force in self.known_forces if isinstance(force, OBSERVED) for name in force.names}
         return tuple(index for index, name in enumerate(self.inputs) if name in held)
+
+    def foreseen(self, u: Float[Tensor, "*batch rows nu"], dt: float) -> Float[Tensor, "*batch rows nu"]:
+        """u of a motion: what observers report stays as in its first row, or fades to what lasts (`ObservedWrench`)."""
+        if not (held := list(self.held_inputs)):
+            return u
+        u = u.clone()
+        u[..., held] = u[..., :1, held]
+        fade = torch.exp(-dt / FADES * torch.arange(u.shape[-2], dtype=u.dtype, device=u.device))[:, None]
+        for force in self.known_forces:
+            if isinstance(force, ObservedWrench) and len(force.names) == 12:
+                first = self.inputs.index(force.names[0])
+                now, lasting = u[..., first : first + 6], u[..., first + 6 : first + 12]
+                u[..., first : first + 6] = lasting + fade * (now - lasting)
+        return u
 
     @property
     def loops(self) -> tuple[LoopClosure, ...]:

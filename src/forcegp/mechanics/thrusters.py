@@ -15,6 +15,8 @@ from forcegp.mechanics.gauss_principle import State
 from forcegp.mechanics.known_forces import KNOWN_FORCES, KnownForce, as_numbers
 from forcegp.robots import Robot
 
+FADES = 0.25  # s
+
 
 class LinkForce(KnownForce):
     """A force and a torque on the link `frame` that follow from columns of u called `names`."""
@@ -92,7 +94,8 @@ class ObservedWrench(LinkForce):
 
     They are called `names`: a force [N] at the origin of the link in the axes of the world, and where six are named a
     torque [Nm]. `forcegp.models.observing` computes them from a recording. A prediction of motions keeps the
-    values of its start, since nobody can observe the future (`MechanicalSystem.held_inputs`).
+    values of its start. Where twelve are named, the last six are the wrench that lasts: the first six fade to it, with
+    a time constant of .25 s.
     """
 
     frame: str
@@ -101,14 +104,14 @@ class ObservedWrench(LinkForce):
     @override
     def bound_to(self, robot: Robot) -> "ObservedWrench":
         robot.frame(self.frame)
-        if len(self.names) not in (3, 6) or len(set(self.names)) < len(self.names):
-            raise InvalidInput(f"ObservedWrench names are {self.names}; give three different ones, or six.")
+        if len(self.names) not in (3, 6, 12) or len(set(self.names)) < len(self.names):
+            raise InvalidInput(f"ObservedWrench names are {self.names}; give 3, 6 or 12 different ones.")
         return ObservedWrench(self.frame, tuple(self.names))
 
     @override
     def wrench(self, state: State) -> Tensor:
         axes = state.kinematics.frame_pose(self.frame)[..., :3, :3]
-        world = self._inputs(state).unflatten(-1, (-1, 3))
+        world = self._inputs(state)[..., :6].unflatten(-1, (-1, 3))
         own = (axes.mT[..., None, :, :] @ world[..., None]).flatten(-3)
         return torch.cat([own, torch.zeros_like(own)], dim=-1) if len(self.names) == 3 else own
 

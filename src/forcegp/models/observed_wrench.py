@@ -13,12 +13,15 @@ from forcegp.data.filtering import episodes_in_order, sums_before
 from forcegp.data.wind import steady_forces
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import MechanicalSystem, ObservedWind, ObservedWrench
+from forcegp.mechanics.thrusters import FADES
 from forcegp.models.protocol import ROWS_PER_BLOCK, AnyPosterior, Posterior
 from forcegp.priors import AerodynamicForce, ForcePrior, SumPrior
 
 NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+LASTING = tuple(name.replace("observed", "lasting") for name in NAMES)
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
+SLOW, AHEAD, LEARNING = 4.0, 0.5, 10.0  # s: of the mean that stays, of what is foreseen, of how well it was
 
 
 def observing(
@@ -29,7 +32,7 @@ def observing(
     frame: str | None = None,
     whole: bool = False,
 ) -> tuple[AnyPosterior, Dataset]:
-    """The posterior and the recording with an `ObservedWrench` on link `frame`, in six more columns of u.
+    """The posterior and the recording with an `ObservedWrench` on link `frame`, in twelve more columns of u.
 
     Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
     that the rows before show (`AirLaw.wind_before`).
@@ -39,7 +42,9 @@ def observing(
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
     what follows, and rows with a past shorter than that time are left out unless `whole`. By default the prior's
     `AerodynamicForce` gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s
-    which missed least in the second before. Without such a prior, or where its time is 0, both come back as they are.
+    which missed least in the second before, and six more columns hold what will last of it: predicted motions fade to
+    that. With a time that is given, there are six columns, and motions hold them. Without such a prior, or where its
+    time is 0, both come back as they are.
 
     Calibrated intervals of motions go along where neither `seconds` nor `frame` is given.
 
@@ -61,8 +66,10 @@ def observing(
     frame = frame or (own or AerodynamicForce()).link(posterior.system.robot)
     posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
-    observed = _observed(unexplained, effect, dataset, times)
-    system = _with_wrench(posterior.system, frame)
+    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
+    observed = _observed(wrench, dataset, times)
+    names = NAMES if len(times) == 1 else NAMES + LASTING
+    system = _with_wrench(posterior.system, frame, names)
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
     posterior = posterior.with_system(system)
@@ -99,8 +106,8 @@ def in_air(
     return {"steady_forces": each}, prior, seen
 
 
-def _with_wrench(system: MechanicalSystem, frame: str) -> MechanicalSystem:
-    return replace(system, known_forces=(*system.known_forces, ObservedWrench(frame, NAMES)))
+def _with_wrench(system: MechanicalSystem, frame: str, names: tuple[str, ...] = NAMES) -> MechanicalSystem:
+    return replace(system, known_forces=(*system.known_forces, ObservedWrench(frame, names)))
 
 
 def _observes(system: MechanicalSystem) -> bool:
@@ -109,7 +116,7 @@ def _observes(system: MechanicalSystem) -> bool:
 
 def unobserved(system: MechanicalSystem) -> MechanicalSystem:
     """The system without the columns of u that :func:`in_air` gives it."""
-    own = ObservedWind.names, NAMES
+    own = ObservedWind.names, NAMES, NAMES + LASTING
     return replace(system, known_forces=tuple(x for x in system.known_forces if getattr(x, "names", ()) not in own))
 
 
@@ -202,23 +209,44 @@ def _unexplained(
 
 
 def _observed(
-    unexplained: Float[np.ndarray, "rows nv"],
-    effect: Float[np.ndarray, "rows nv 6"],
-    dataset: Dataset,
-    times: Sequence[float],
-) -> Float[np.ndarray, "rows 6"]:
-    """The wrench that the rows before each show; none at the first of an episode.
+    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float]
+) -> Float[np.ndarray, "rows columns"]:
+    """The wrench that the rows before each show, none at the first of an episode, and of several times what lasts.
 
     Of several times each component takes the one whose observer missed least in the rows before.
     """
-    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
-    observed = np.zeros_like(wrench)
+    observed = np.zeros((len(wrench), 6 if len(times) == 1 else 12))
     for number, rows, _ in episodes_in_order(dataset):
         own = np.flatnonzero(dataset.episode == number)
         means = np.stack([_past_mean(wrench[own], rows.time, time) for time in times])  # (times, rows, 6)
         missed = np.stack([_past_mean(np.square(wrench[own] - mean), rows.time, MEMORY) for mean in means])
-        observed[own] = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
+        now = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
+        observed[own] = now if len(times) == 1 else np.hstack([now, _lasting(wrench[own], now, rows.time)])
     return observed
+
+
+def _lasting(
+    wrench: Float[np.ndarray, "rows 6"], now: Float[np.ndarray, "rows 6"], time: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows 6"]:
+    """What stays of the wrench `now`: the mean of the last 4 s, and a share of how far it is from that.
+
+    The share is the one with which the mean of the coming .5 s would have been predicted best in the rows before (least
+    squares, drawn to one half), where the rest fades (`ObservedWrench`).
+    """
+    slow = _past_mean(wrench, time, SLOW)
+    count = max(1, round(AHEAD / float(np.median(np.diff(time))))) if len(time) > 1 else 1
+    fading = float(np.exp(-np.linspace(0.0, AHEAD, count, endpoint=False) / FADES).mean())
+    away = now - slow
+    explained = (1.0 - fading) * away
+    products = np.zeros((len(time), 12))
+    if (known := len(time) - count + 1) > 0:
+        total = np.cumsum(np.vstack([np.zeros(6), wrench]), axis=0)
+        coming = (total[count:] - total[:-count]) / count
+        missing = coming - (slow + fading * away)[:known]
+        products[count - 1 :] = np.hstack([missing * explained[:known], np.square(explained[:known])])
+    sums = sums_before(products, time, LEARNING)
+    drawn = count * _past_mean(np.square(explained), time, LEARNING) + 1e-300
+    return slow + np.clip((sums[:, :6] + 0.5 * drawn) / (sums[:, 6:] + drawn), 0.0, 1.0) * away
 
 
 def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.inference import Engine, LeaveOut, OptimizationResult
 from forcegp.integration import Feedback
+from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact, MechanicalSystem
 from forcegp.models.motion_models import MotionModel
 from forcegp.models.prediction import Inputs, Positions, Prediction, Rows, join_predictions
@@ -237,7 +238,7 @@ class Posterior(MotionModel, Summary, ABC):
         ----------
         q0, v0: initial states (..., nv) in rad and rad/s (m and m/s), any batch.
         u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast. An `ObservedWrench`
-            stays as in the first row.
+            follows from the first row.
         dt: time step in s.
         integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order),
             "implicit-midpoint" (second order, for stiff friction) or "projected" (second order; contacts hold exactly
@@ -258,9 +259,9 @@ class Posterior(MotionModel, Summary, ABC):
         `grad`, NumericalError where the initial state cannot be projected.
         """
         model = self.accelerations(baumgarte)
-        if held := list(self.system.held_inputs):
-            u = _tensor("u", u, self.system.sizes[2], self.system.robot.device).clone()
-            u[..., held] = u[..., :1, held]
+        if self.system.held_inputs:
+            check_time_step(dt)
+            u = self.system.foreseen(_tensor("u", u, self.system.sizes[2], self.system.robot.device), dt)
         how = {"integrator": integrator, "feedback": feedback, "samples": samples, "seed": seed, "grad": grad}
         return replace(roll_out(model, q0, v0, u, dt, **how, progress=progress), intervals=self.motion_intervals)
 
