@@ -27,7 +27,7 @@ from forcegp.cli.import_log import Import
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import MODEL_PARTS
 from forcegp.cli.terminal import Terminal, facts, findings_table
-from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
+from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit, NumericalError
 
 MOST_CORRECTIONS = 8
 MODELS = "the URDF, identified, with friction or air forces learned"
@@ -298,7 +298,7 @@ class Auto(Resuming, Import):
         try:
             with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
                 forcegp.export_c(cast(forcegp.models.StructuredPosterior, posterior), folder)
-        except (CompilerError, InvalidInput) as error:
+        except (CompilerError, InvalidInput, NumericalError) as error:
             terminal.note(f"no C program: {error}")
             return None
         return str(self.out / "c")
