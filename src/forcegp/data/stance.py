@@ -31,6 +31,9 @@ QUARTER = 0.3186
 FREE, LEAST, BEARS = 0.95, 0.02, 0.4
 """Quantile of the forces on feet that clearly move; shares of the force above and below which feet at rest carry half
 of all that they carry: nothing, and surely bearing."""
+FALLS, SURE = 0.2, 0.1
+"""Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
+to which its absence decides."""
 FEW = 10
 MANY_OPEN = 0.25
 """Share of open rows that more than changes of stance leave."""
@@ -103,6 +106,9 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     2. What rests stands if it bears, and is free if it bears nothing. Without forces, rest is stance.
     3. Up to 0.1 s in between follow the decided rows around them where both agree. All else is open (NaN), with 30 ms
        on either side and on those of a change, and where something clearly moves and bears.
+    4. Where nothing but these contacts holds a base against gravity: rows in which none of them stands although
+       something bears a fifth of the weight are open, and rows in which one stands although nothing does. Filters and
+       averages move feet in stance as short as their memory (a hop recorded at 50 Hz), and motion alone calls it swing.
 
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
@@ -138,6 +144,12 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     for rows in episodes:
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
+    weight, whole = _weight(system), np.sum(asked, axis=0)
+    sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
+    for rows, width in zip(episodes, widths, strict=True):
+        falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
+        stands = (flags[rows] == 1.0).any(axis=1)
+        flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
     return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
 
 
@@ -161,6 +173,15 @@ def _motion_and_force(
             motion[k].append(rates[:, rows].cpu().numpy())
             asked[k].append(forces[:, rows].sum(1).cpu().numpy())
     return [np.concatenate(own) for own in motion], [np.concatenate(own) for own in asked]
+
+
+def _weight(system: forcegp.mechanics.MechanicalSystem) -> float:
+    """What contacts with a switch must bear [N]; 0 where something else may hold the robot up."""
+    robot, alone = system.robot, all(contact.switch for contact in system.contacts)
+    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
+    if gravity is None or not alone:
+        return 0.0
+    return float(gravity.norm()) * sum(robot.link(name).mass for name in robot.link_names)
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:
