@@ -100,12 +100,16 @@ class NoiseLevels:
             free = ~(((x <= low) & (here[1] > 0.0)) | ((x >= high) & (here[1] < 0.0)))
             step = np.zeros_like(x)
             step[free] = -np.linalg.solve(here[2][np.ix_(free, free)], here[1][free])
-            there = (x + step).clip(low, high)
-            while -here[1] @ (there - x) > FOUND and not (trial := at(there))[0] < here[0]:
-                there = x + 0.25 * (there - x)
-            if not -here[1] @ (there - x) > FOUND:
+            step = (x + step).clip(low, high) - x
+            if -here[1] @ step <= FOUND:
                 break
-            x, here = there, trial
+            trial = at(x + step)
+            while trial[0] >= here[0] and -here[1] @ step > FOUND:
+                step = 0.25 * step
+                trial = at(x + step)
+            if trial[0] >= here[0]:
+                break
+            x, here = x + step, trial
         acceleration, force = whole.numpy() * np.exp(x).reshape(whole.shape)
         return cls(acceleration, force)
 

@@ -118,7 +118,7 @@ def gravity_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     """A robot in a vertical plane that was read without gravity in it."""
     found = missing_gravity(dataset, system)
     if found is not None:
-        yield wrong(subject="gravity", seen=f"{found[0]}.", remedy=f"Read the robot with its gravity: {found[1]}")
+        yield wrong(subject="gravity", seen=f"{found[0]}.", remedy=found[1])
 
 
 def unmeasured_base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:

@@ -130,7 +130,7 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
             "fixed_point('foot', switch='foot_stands')."
         )
     if (fall := missing_gravity(dataset, system)) is not None:
-        raise DatasetError(f"{fall[0]}, so forces show no stance; {fall[1]}")
+        raise DatasetError(f"{fall[0]}, so forces show no stance: {fall[1]}")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked = _motion_and_force(dataset, system, names)
@@ -232,8 +232,8 @@ def missing_gravity(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     return (
         f"in {often:.0%} of the rows the robot falls at ({fall[0]:.3g}, {fall[1]:.3g}) m/s^2 in its plane, in which it "
         "has no gravity",
-        f"give --gravity={x + 0.0:.4g},{y + 0.0:.4g},0 beside --robot, gravity=({x + 0.0:.4g}, {y + 0.0:.4g}, 0) in "
-        "Python.",
+        f"forcegp import --robot FILE --base planar --gravity={x + 0.0:.4g},{y + 0.0:.4g},0 reads it with gravity, as "
+        f"Robot.from_urdf(..., gravity=({x + 0.0:.4g}, {y + 0.0:.4g}, 0)) does.",
     )
 
 
