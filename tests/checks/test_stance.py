@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forcegp import check
+from forcegp import Dataset, MechanicalSystem, Preparation, Robot, check
 from forcegp.checks import quick_check
+from forcegp.data import estimate_stance
+from forcegp.errors import DatasetError, DataWarning
+from forcegp.mechanics import fixed_frame, fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -80,3 +83,86 @@ def test_a_base_that_nobody_measured_is_named(log):
     assert "not measured" in findings[0].seen
     assert "motion capture" in findings[0].remedy
     assert "base='fixed'" in findings[0].remedy
+
+
+def test_two_feet_of_one_flag_of_which_one_stands_are_named(log):
+    """Whether the flag is 1 where both stand or where one does; feet that stand together may share it."""
+    first, second = log.system.inputs[12:14]
+    flags = log.u[:, 12:14]
+    assert (flags.min(axis=1) < flags.max(axis=1)).mean() > 0.05
+    contacts = [replace(each, switch=first) if each.switch == second else each for each in log.system.contacts]
+    system = log.system.with_contacts(contacts)
+    for one in (flags.min(axis=1), flags.max(axis=1)):
+        u = np.column_stack([log.u[:, :12], one, log.u[:, 14:]])
+        (finding,) = of(replace(log, system=system, u=u, truth={}))
+        assert finding.severity == "wrong"
+        assert f"{first!r} is the flag of 'front_left_foot' and 'front_right_foot'" in finding.seen
+        row = int(finding.seen.split("row ")[1].split(" ")[0])
+        standing = [
+            f"'{leg}_foot'" for leg, flag in zip(("front_left", "front_right"), flags[row], strict=True) if flag
+        ]
+        assert finding.seen.endswith(f"{' and '.join(standing)} alone.")
+        assert "--feet front_left_foot,front_right_foot" in finding.remedy
+    together = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=5, noise=0.05, lift=False))
+    u = np.delete(together.u, 13, axis=1)
+    assert not of(replace(together, system=system, u=u, truth={}))
+
+
+def rocking(lean: float):
+    """A body of 2 kg on a flat foot, whose heel turns slowly by so many rad in the last 12 of 20 s, and back."""
+    body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
+    robot = Robot.from_urdf_text(f'<robot name="r"><link name="foot">{body}</link></robot>', base="floating")
+    time = np.arange(1000) / 50
+    w = np.pi / 12.0
+    s = np.where(time >= 8.0, time - 8.0, 0.0)
+    angle, rate = lean * np.sin(w * s) ** 2, lean * w * np.sin(2.0 * w * s)
+    spin = 2.0 * lean * w**2 * np.cos(2.0 * w * s) * (time >= 8.0)
+    q, v, a = np.zeros((1000, 7)), np.zeros((1000, 6)), np.zeros((1000, 6))
+    heel = np.array([-0.1, 0.0, 0.0])  # from which the origin turns about y
+    q[:, 0], q[:, 2] = heel[0] - np.cos(angle) * heel[0], np.sin(angle) * heel[0]
+    q[:, 4], q[:, 6] = np.sin(0.5 * angle), np.cos(0.5 * angle)
+    v[:, 2], v[:, 4], a[:, 2], a[:, 4] = rate * heel[0], rate, spin * heel[0], spin
+    system = MechanicalSystem(robot, fixed_frame("foot", switch="stands"))
+    return Dataset(q=q, v=v, u=np.ones((1000, 1)), a=a, time=time, system=system), angle
+
+
+def test_a_heel_that_turns_under_a_flat_foot_is_named_and_left_out():
+    log, angle = rocking(0.12)
+    assert abs(log.v[:, 2]).max() < 0.01  # slower than what counts as motion
+    (finding,) = of(log)
+    assert finding.severity == "wrong"
+    row = int(finding.seen.split("row ")[1].split(" ")[0])
+    assert 0.04 < angle[row] < 0.07
+    assert "--stance auto" in finding.remedy
+    with pytest.warns(DataWarning, match="stance open in 3.% of the rows"):
+        kept = Preparation(stance="auto").apply(log).dataset  # what the remedy does
+    assert not of(kept)
+    assert len(kept) > 0.5 * len(log)
+    assert not of(rocking(0.03)[0])
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
+def test_a_robot_in_a_vertical_plane_without_gravity_is_named(turn):
+    """A body that is thrown up and caught again; with the gravity that the finding states, nothing is found."""
+    body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = f'<robot name="r"><link name="foot">{body}</link></robot>'
+    time = np.arange(1600) / 200
+    flies = time % 0.8 < 0.5
+    down = np.array([np.sin(turn), -np.cos(turn)])
+    q, v, a = np.zeros((1600, 4)), np.zeros((1600, 3)), np.zeros((1600, 3))
+    q[:, 2] = 1.0
+    a[:, :2] = np.where(flies, 9.81, -9.81 * 5.0 / 3.0)[:, None] * down
+    v[:, :2] = np.cumsum(a[:, :2], axis=0) / 200
+
+    def rows(**gravity):
+        system = MechanicalSystem(Robot.from_urdf_text(text, base="planar", **gravity), fixed_point("foot", switch="s"))
+        return Dataset(q=q, v=v, u=1.0 - flies[:, None], a=a, time=time, system=system)
+
+    (finding,) = of(rows(), "gravity")
+    assert finding.severity == "wrong"
+    with pytest.raises(DatasetError, match="falls at"):
+        estimate_stance(rows())
+    stated = tuple(float(x) for x in finding.remedy.split("--gravity=")[1].split(" ")[0].split(","))
+    np.testing.assert_allclose(stated, (*(9.81 * down), 0.0), atol=0.06 * 9.81)
+    assert not of(rows(gravity=stated), "gravity")
+    assert not of(replace(rows(), a=0.5 * a), "gravity")  # a robot that drives, however fast

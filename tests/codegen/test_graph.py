@@ -199,6 +199,22 @@ def test_the_pseudo_inverse_is_that_of_torch(rows: int, case: str):
     assert float((found - expected).abs().max()) < 1e-13 * (1.0 + float(expected.abs().max()))
 
 
+@pytest.mark.parametrize("turn", [0.3, 1e-3, 1e-6, 1e-8])
+def test_the_pseudo_inverse_of_redundant_rows_that_nearly_depend_on_each_other(turn: float):
+    """Nine rows of a body held by three points, nearly along the axes of the world: six are independent."""
+    draw = torch.Generator().manual_seed(3)
+    axes = torch.linalg.matrix_exp(turn * torch.tensor([[0.0, -1.0, 0.4], [1.0, 0.0, -0.7], [-0.4, 0.7, 0.0]]).double())
+    x, y, z = (0.1 * axes[:, :2]).mT.unbind(-1)
+    arms = torch.stack(
+        [torch.stack([0 * x, -z, y], -1), torch.stack([z, 0 * x, -x], -1), torch.stack([-y, x, 0 * x], -1)], -1
+    )
+    one = torch.eye(3).double()
+    body = torch.cat([torch.cat([one, 0 * one], 1), *(torch.cat([one, arm], 1) for arm in arms)])
+    A = body @ torch.randn(5, 6, 12, generator=draw).double()
+    found, expected = pseudo_inverse(A, 1e-9), torch.linalg.pinv(A, rtol=1e-9)
+    assert float((found - expected).abs().max()) < 1e-11 * float(expected.abs().max())  # condition of A: some 1e3
+
+
 def test_derivatives_of_the_pseudo_inverse_hold_where_rows_are_orthogonal_and_equally_long():
     """There the rotations have none: those of what they leave must be right."""
     A = torch.eye(3, 7, dtype=torch.float64)

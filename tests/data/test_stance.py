@@ -67,6 +67,47 @@ def test_a_foot_that_swings_most_of_the_time():
     assert decided.mean() > 0.75
 
 
+LEG = """<joint name="leg" type="prismatic"><parent link="trunk"/><child link="foot"/><axis xyz="{}"/>
+<limit lower="0" upper="1" effort="500" velocity="20"/></joint>"""
+BODY = '<inertial><mass value="{}"/><inertia ixx=".05" iyy=".05" izz=".05" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+def hop(base: str, rate: float, stands: float, gravity=(0.0, 0.0, -9.81)):
+    """A trunk of 5 kg on a leg: half a second in the air, then so many seconds on the ground, in closed form."""
+    up = 2 if base == "floating" else 1
+    links = "".join(f'<link name="{name}">{BODY.format(m)}</link>' for name, m in (("trunk", 5.0), ("foot", 0.5)))
+    leg = LEG.format("0 0 -1" if base == "floating" else "0 -1 0")
+    robot = Robot.from_urdf_text(f'<robot name="hopper">{links}{leg}</robot>', base=base, gravity=gravity)
+    time = np.arange(0.0, 8.0, 1.0 / rate)
+    flies, speed = 0.5, 0.25 * 9.81
+    t = time % (flies + stands)
+    flags, w = (t >= flies).astype(float), np.pi / stands
+    in_air, on_ground = t, t - flies
+    deep = speed / w
+    z = np.where(flags, -deep * np.sin(w * on_ground), speed * in_air - 0.5 * 9.81 * in_air**2)
+    dz = np.where(flags, -speed * np.cos(w * on_ground), speed - 9.81 * in_air)
+    ddz = np.where(flags, speed * w * np.sin(w * on_ground), -9.81)
+    q = np.tile(robot.neutral().numpy(), (len(time), 1))
+    v, a = np.zeros((2, len(time), robot.nv))
+    q[:, up], v[:, up], a[:, up] = 0.5 + z, dz, ddz
+    q[:, -1], v[:, -1], a[:, -1] = 0.5 + flags * z, flags * dz, flags * ddz
+    u = np.stack([5.0 * (ddz + 9.81), 0.0 * flags], 1)
+    system = MechanicalSystem(robot, fixed_point("foot", switch="stands"))
+    return Dataset(q=q, v=v, u=u, a=a, time=time, system=system), flags
+
+
+@pytest.mark.parametrize("base", ["floating", "planar"])
+@pytest.mark.parametrize(("rate", "stands", "cutoff"), [(50.0, 0.1, 8.0), (50.0, 0.14, 10.0), (50.0, 0.12, 15.0)])
+def test_stance_as_short_as_what_a_filter_smears_is_never_called_swing(base, rate, stands, cutoff):
+    log, _ = hop(base, rate, stands, (0.0, 0.0, -9.81) if base == "floating" else (0.0, -9.81, 0.0))
+    rows = Preparation(cutoff=cutoff).apply(log).dataset
+    found = estimate_stance(rows).flags[:, 0]
+    decided = np.isfinite(found)
+    t = rows.time % (0.5 + stands)
+    assert (found == (t >= 0.5))[decided].all()
+    assert decided.mean() > 0.5
+
+
 def test_what_noise_hides_stays_open():
     """Velocities that are too noisy to show swing: rows of swing are open, not stance."""
     log, flags = walk(4, 0.1)

@@ -120,7 +120,9 @@ def identify_analytical(
         parameters = bodies.parameters(x[:split])
         if likely is not None:
             r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], likely.a, likely.regressor)
-            r = r + likely.offset
+            W, same = likely.whitening, in_parameters is likely.regressor
+            r, in_terms = (W @ (r + likely.offset)[..., None])[..., 0], W @ in_terms
+            in_parameters = likely.white_regressor if same else likely.white(in_parameters)
         elif likelihood == "torque":
             r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], a, regressor)
         else:
@@ -168,7 +170,7 @@ def identify_analytical(
             likely = recorded.likely(parameters, x[split:], a, regressor, noise, least, robust, rough)
             if not rough:
                 noise, least = likely.noise, likely.noise.scaled(LEAST) if least is None else least
-            fit = search(x, likely.whitening, likely, steps)
+            fit = search(x, likely=likely, steps=steps)
             evaluations += fit.evaluations
             steps, x = STEPS if (fit.x != x).any() else 2 * steps, fit.x
             if progress is not None:

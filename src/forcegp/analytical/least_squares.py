@@ -24,7 +24,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.optimize import minimize
 from torch import Tensor
 
 from forcegp.errors import NumericalError
@@ -34,6 +33,8 @@ ROWS = 2000
 LEAST, MOST = 1e-3, 1e2
 """Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
 of the search that goes further has a covariance that rounding makes singular."""
+FOUND = 1e-3
+"""Nats that a step has to promise, to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class NoiseLevels:
         near: "NoiseLevels | None" = None,
         robust: bool = False,
     ) -> "NoiseLevels":
-        """Those of largest likelihood, by L-BFGS on their logarithms, each between `LEAST` and `MOST` times the whole.
+        """Those of largest likelihood, each between `LEAST` and `MOST` times the whole: Fisher scoring of logarithms.
 
         `H` is that of Gauss' principle under constraints; None is M^-1. The search begins `near` others, if given.
         With `robust`, outliers are moved to `OUTLYING` standard deviations first.
@@ -66,27 +67,50 @@ class NoiseLevels:
         in_force = (torch.as_tensor(M[chosen]) @ r[..., None])[..., 0]
         whole = torch.stack([x.square().mean(0).sqrt().clamp_min(1e-12) for x in (r, in_force)])
         middle = np.full(whole.numel(), np.log(0.5))
-        bounds, start = (np.log(LEAST), np.log(MOST)), middle
+        low, high = np.log(LEAST), np.log(MOST)
+        x = middle
         if near is not None:
-            start = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(*bounds)
+            x = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(low, high)
 
-        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        def at(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+            """Cost, gradient and expected curvature tr(S^-1 dS S^-1 dS') / 2."""
             acceleration, force = whole * torch.as_tensor(x).exp().view_as(whole)
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
             precision = torch.cholesky_inverse(lower)
-            weighted = precision @ r[..., None]
+            weighted = (precision @ r[..., None])[..., 0]
             # a weak pull to the middle keeps a level that the residuals do not inform from running away
-            value = 0.5 * (r * weighted[..., 0]).sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum()
-            left = precision - weighted @ weighted.mT
-            in_logs = (
-                acceleration**2 * left.diagonal(dim1=-2, dim2=-1).sum(0),
-                force**2 * (inverse @ left * inverse).sum((0, -1)),
+            value = 0.5 * (r * weighted).sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum()
+            across = inverse @ precision
+            both = across @ inverse
+            left = torch.cat([precision.diagonal(dim1=-2, dim2=-1), both.diagonal(dim1=-2, dim2=-1)], -1).sum(0)
+            explained = torch.cat([weighted, (inverse @ weighted[..., None])[..., 0]], -1).square().sum(0)
+            squares = torch.cat([acceleration, force]).square()
+            curvature = torch.cat(
+                [
+                    torch.cat([precision.square().sum(0), across.square().sum(0).mT], 1),
+                    torch.cat([across.square().sum(0), both.square().sum(0)], 1),
+                ]
             )
-            return float(value) + 0.5 * ((x - middle) ** 2).sum(), torch.cat(in_logs).numpy() + x - middle
+            curvature = (2.0 * squares * squares[:, None] * curvature).numpy() + np.eye(len(x))
+            slope = (squares * (left - explained)).numpy() + x - middle
+            return float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature
 
-        # scipy's search, since the import of torch.optim takes seconds
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[bounds] * len(start))
-        acceleration, force = whole.numpy() * np.exp(found.x).reshape(whole.shape)
+        here = at(x)
+        for _ in range(MOST_EVALUATIONS):
+            free = ~(((x <= low) & (here[1] > 0.0)) | ((x >= high) & (here[1] < 0.0)))
+            step = np.zeros_like(x)
+            step[free] = -np.linalg.solve(here[2][np.ix_(free, free)], here[1][free])
+            step = (x + step).clip(low, high) - x
+            if -here[1] @ step <= FOUND:
+                break
+            trial = at(x + step)
+            while trial[0] >= here[0] and -here[1] @ step > FOUND:
+                step = 0.25 * step
+                trial = at(x + step)
+            if trial[0] >= here[0]:
+                break
+            x, here = x + step, trial
+        acceleration, force = whole.numpy() * np.exp(x).reshape(whole.shape)
         return cls(acceleration, force)
 
     def scaled(self, factor: float) -> "NoiseLevels":
@@ -305,7 +329,7 @@ def _point(
         white = without(r / noise, span)
         weight = _weights(white, robust)
         cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
-        flat = without(jacobian / noise[:, None], span)
+        flat = without(jacobian if (noise == 1.0).all() else jacobian / noise[:, None], span)
         flat = (flat * np.sqrt(weight)[..., None] if robust else flat).reshape(-1, len(x))
         gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
         curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian

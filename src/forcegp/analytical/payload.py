@@ -182,13 +182,18 @@ def identify_payload(
     split, known = bodies.size, len(stated)
     windows = _Windows([log.rows(at) for log, at in zip(logs, chosen, strict=True)])
 
+    def equations(forces: np.ndarray) -> np.ndarray:
+        return windows.mean(recorded.without_contacts(forces))
+
+    constant = equations(regressor[:, :, known:])
+
     def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parameters = np.concatenate([stated, bodies.parameters(x[:split])])
         r, in_parameters, in_terms = recorded.in_torque(parameters, x[split:], likely_a, regressor)
         r = r + from_noise
-        in_bodies = np.einsum("nibp,bpk->nibk", in_parameters[:, :, known:], bodies.derivatives(x[:split]))
-        jacobian = np.concatenate([in_bodies.reshape(*r.shape, -1), in_terms], axis=-1)
-        return windows.mean(recorded.without_contacts(r)), windows.mean(recorded.without_contacts(jacobian))
+        seen = constant if in_parameters is regressor else equations(in_parameters[:, :, known:])
+        in_bodies = np.einsum("nibp,bpk->nibk", seen, bodies.derivatives(x[:split]))
+        return equations(r), np.concatenate([in_bodies.reshape(*in_bodies.shape[:2], -1), equations(in_terms)], axis=-1)
 
     center, spread = terms.prior()
     weights = np.concatenate([np.ones(split - 10), np.full(10, WEAK**0.5)])

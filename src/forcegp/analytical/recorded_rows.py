@@ -32,6 +32,7 @@ its covariance are those under that condition.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -143,7 +144,7 @@ class RecordedRows:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`needed_torque`, its derivatives in z (rows, nv), the torque without load, and in x (rows, nv, k)."""
         torque, in_x = self.terms.torque(x, self.v, a, np.zeros_like(self.load))
-        rigid = np.einsum("nibp,bp->ni", regressor, parameters) + a @ (self.inertia + self._armature)
+        rigid = regressor.reshape(*a.shape, -1) @ parameters.ravel() + a @ (self.inertia + self._armature)
         if LoadJointFriction not in self.terms.kinds:
             return rigid + torque, np.ones_like(self.v), in_x
         loaded, loaded_in_x = self.terms.torque(x, self.v, a, np.ones_like(self.load))
@@ -181,7 +182,9 @@ class RecordedRows:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual (rows, nv) and its derivatives in the parameters (rows, nv, bodies, 10) and in x (rows, nv, k)."""
         needed, in_z, in_x = self._needed(parameters, x, a, regressor)
-        return needed - self.force, in_z[..., None, None] * regressor, in_x
+        if LoadJointFriction in self.terms.kinds:
+            regressor = in_z[..., None, None] * regressor
+        return needed - self.force, regressor, in_x
 
     def in_acceleration(
         self, parameters: np.ndarray, x: np.ndarray, a: np.ndarray
@@ -260,6 +263,15 @@ class LikelyAccelerations:
     offset: Rows
     whitening: Float[np.ndarray, "rows nv nv"]
     noise: NoiseLevels
+
+    @cached_property
+    def white_regressor(self) -> Float[np.ndarray, "rows nv bodies 10"]:
+        """`white` of the regressor; the same wherever a search is."""
+        return self.white(self.regressor)
+
+    def white(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
+        """Derivatives of forces as those of whitened residuals."""
+        return (self.whitening @ values.reshape(*self.a.shape, -1)).reshape(values.shape)
 
 
 def kept_forces(system: MechanicalSystem, terms: JointTerms) -> tuple[KnownForce, ...]:

@@ -14,7 +14,7 @@ from forcegp.checks.motion import motion_findings, sampling_findings
 from forcegp.checks.moving_base import base_findings, carried_findings
 from forcegp.checks.parameters import parameter_findings
 from forcegp.checks.signals import signal_findings
-from forcegp.checks.stance import stance_findings, unmeasured_base_findings
+from forcegp.checks.stance import gravity_findings, stance_findings, unmeasured_base_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
@@ -229,7 +229,7 @@ def _of_base(dataset: Dataset, system: MechanicalSystem) -> tuple[Finding, ...]:
     of_base = unmeasured or list(base_findings(dataset, system))
     if not unmeasured and worst(of_base) != "wrong":  # forces in wrong axes show nothing
         of_base += carried_findings(dataset, system)
-    return _sorted([*of_base, *stance_findings(dataset, system)])
+    return _sorted([*of_base, *gravity_findings(dataset, system), *stance_findings(dataset, system)])
 
 
 def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:

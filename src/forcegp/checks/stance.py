@@ -1,12 +1,14 @@
 """Contacts that act in some rows only: does the motion support what their flags say?"""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from forcegp.checks.check_input import Finding, look, ok, wrong
+from forcegp.checks.check_input import Finding, listed, look, ok, wrong
 from forcegp.data import Dataset, estimate_stance
+from forcegp.data.stance import TILTS, missing_gravity, tilting
 from forcegp.errors import ContactError
 from forcegp.mechanics import MechanicalSystem
 
@@ -29,11 +31,29 @@ def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Find
     names = dict.fromkeys(contact.switch for contact in system.contacts if contact.switch is not None)
     if not names:
         return
+    if missing_gravity(dataset, system) is not None:  # another finding, without which forces show nothing
+        return
     found = estimate_stance(dataset, system)
+    leans = tilting(dataset, system, found.names, dataset.u[:, [system.inputs.index(name) for name in found.names]])
+    shared = {name: finding for name in found.names for finding in _shared_flag(dataset, system, name, every)}
+    yield from shared.values()
     for k, name in enumerate(found.names):
+        if name in shared:
+            continue
         logged, shown, speed = dataset.u[:, system.inputs.index(name)], found.flags[:, k], found.speed[:, k]
         frame = next(contact.frame for contact in system.contacts if contact.switch == name)
         stands = logged > 0.5
+        leaning = float(leans[:, k].sum() / max(stands.sum(), 1))
+        if leaning > FEW:
+            yield wrong(
+                subject="contact flag",
+                seen=f"{frame!r}, which is held flat, leans by more than {TILTS:g} rad in {leaning:.0%} of the rows in "
+                f"which {name!r} is 1, row {every * int(np.flatnonzero(leans[:, k])[0])} for example: its heel or "
+                "toe turns.",
+                remedy="forcegp prepare log.h5 --stance auto --out data.h5 leaves these rows out; for a foot that is "
+                "never flat give the point that it stands on, --feet FRAME@x,y,z.",
+                numbers={"leaning": leaning},
+            )
         odd = int(((logged != 0.0) & (logged != 1.0)).sum())
         if odd:
             yield wrong(
@@ -67,6 +87,38 @@ def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Find
             )
         elif not odd:
             yield ok(subject="contact flag", seen=f"{name!r} agrees with motion and forces.", numbers=numbers)
+
+
+def _shared_flag(dataset: Dataset, system: MechanicalSystem, name: str, every: int) -> Iterator[Finding]:
+    """Feet of this flag of which only some stand, by flags of their own."""
+    frames = list(dict.fromkeys(contact.frame for contact in system.contacts if contact.switch == name))
+    if len(frames) < 2:
+        return
+    own = {frame: f"{name} {frame}" for frame in frames}
+    contacts = [replace(each, switch=own[each.frame]) if each.switch == name else each for each in system.contacts]
+    apart = system.with_contacts(contacts)
+    places = [system.inputs.index(x if x in system.inputs else name) for x in apart.inputs]
+    found = estimate_stance(replace(dataset, system=apart, u=dataset.u[:, places], truth={}))
+    flags = found.flags[:, [found.names.index(switch) for switch in own.values()]]
+    some = (flags == 1.0).any(axis=1) & (flags == 0.0).any(axis=1)
+    if some.mean() > FEW:
+        row = int(np.flatnonzero(some)[0])
+        standing = listed([repr(frame) for frame, flag in zip(frames, flags[row], strict=True) if flag == 1.0])
+        yield wrong(
+            subject="contact flag",
+            seen=f"{name!r} is the flag of {listed(list(map(repr, frames)))}, of which only some stand in "
+            f"{some.mean():.0%} of the rows, row {every * row} for example: {standing} alone.",
+            remedy=f"Give each foot a flag of its own, as forcegp import --feet {','.join(frames)} does (FRAME:flat "
+            "for flat feet): without columns for them, it finds the flags.",
+            numbers={"apart": float(some.mean())},
+        )
+
+
+def gravity_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
+    """A robot in a vertical plane that was read without gravity in it."""
+    found = missing_gravity(dataset, system)
+    if found is not None:
+        yield wrong(subject="gravity", seen=f"{found[0]}.", remedy=found[1])
 
 
 def unmeasured_base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:

@@ -23,11 +23,12 @@ from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_t
 from forcegp.cli.auto_answer import NAMES, answer_lines, best_sentence, default_models, identification, payload_text
 from forcegp.cli.command import CONFIG, URDF, Resuming, listed, unless_given
 from forcegp.cli.fit import calibrated_with_progress
+from forcegp.cli.identify import rounds_reported
 from forcegp.cli.import_log import Import
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import MODEL_PARTS
 from forcegp.cli.terminal import Terminal, facts, findings_table
-from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit
+from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit, NumericalError
 
 MOST_CORRECTIONS = 8
 MODELS = "the URDF, identified, with friction or air forces learned"
@@ -101,11 +102,14 @@ class Auto(Resuming, Import):
                 )
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
-        with terminal.progress("preparing and identifying"):
+        with terminal.progress("preparing"):
             timed = self._timed(terminal, preparation, dataset)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
-            identified = forcegp.identify_analytical(recording, friction=forcegp.analytical.LAWS)
+        with terminal.progress("identifying", may_end_early=True) as progress:
+            how: dict[str, Any] = {"friction": forcegp.analytical.LAWS, "progress": rounds_reported(progress)}
+            identified = forcegp.identify_analytical(recording, **how)
+        with terminal.progress("looking for a payload"):
             try:
                 payload = forcegp.analytical.identify_payload(recording, link=self.link, identified=identified)
                 why_not = ""
@@ -298,7 +302,7 @@ class Auto(Resuming, Import):
         try:
             with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
                 forcegp.export_c(cast(forcegp.models.StructuredPosterior, posterior), folder)
-        except (CompilerError, InvalidInput) as error:
+        except (CompilerError, InvalidInput, NumericalError) as error:
             terminal.note(f"no C program: {error}")
             return None
         return str(self.out / "c")

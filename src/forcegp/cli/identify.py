@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -23,7 +23,7 @@ from forcegp.cli.fit import fit_summary, fit_with_progress, motion_report, refin
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.learning_options import PARTS, friction_laws, parse_learn, with_learned_forces
 from forcegp.cli.model_choice import PRIORS, FitOptions, resolved_noise
-from forcegp.cli.terminal import NONE, Terminal, columns, with_option_names
+from forcegp.cli.terminal import NONE, ProgressCallback, Terminal, columns, with_option_names
 from forcegp.errors import InvalidInput, NonPhysicalInertia
 
 
@@ -77,6 +77,12 @@ INERTIAS = {"least-squares": "free", "consistent": "consistent"}
 """Names of models on the command line, and what `identify_analytical` calls their inertias."""
 
 
+def rounds_reported(report: ProgressCallback) -> Callable[[int, float], None]:
+    """What `identify_analytical` calls after each of its rounds."""
+    most = forcegp.analytical.ROUNDS
+    return lambda done, rms: report(min(done, most), most, f"rms of the residual {rms:.3g}")
+
+
 def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapping[str, Any]:
     """Identify, write the folder, and show how far the residuals fell."""
     # the silent neglect of options of the other models would be a surprise
@@ -105,9 +111,7 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
             likelihood=command.likelihood,
             prior_strength=1.0 if command.prior_strength is None else command.prior_strength,
             robust=command.robust,
-            progress=lambda done, rms: report(
-                min(done, forcegp.analytical.ROUNDS), forcegp.analytical.ROUNDS, f"rms of the residual {rms:.3g}"
-            ),
+            progress=rounds_reported(report),
         )
     content = {"model": command.model, **found.to_dict(), "cpu_seconds": time.process_time() - begin}
     for name, rows in (("training", dataset), ("test", test)):

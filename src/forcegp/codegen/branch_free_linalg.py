@@ -57,13 +57,13 @@ def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
 
     One-sided Jacobi rotations (Demmel & Veselic, SIAM J. Matrix Anal. Appl. 13, 1992): columns of A^T V become
     orthogonal, their lengths are the singular values, to high relative accuracy. What is left of their products is
-    zero but for its derivatives, and counted to first order. Of more than six rows an orthonormal basis is a fifth of
-    the work: A = L Q, where rows within the tolerance of those before have no row of Q, L^T = R U, A^+ = Q^T R^-T U.
+    zero but for its derivatives, and counted to first order. Of more than six rows an orthonormal basis Q is a fifth of
+    the work: A = L Q with L = A Q^T, L^T = R U, A^+ = Q^T R^-T U.
     """
     count = matrix.shape[-2]
     if count not in SWEEPS:
-        L, Q = _lower_and_orthonormal(matrix, tolerance)
-        R, U = _lower_and_orthonormal(L.mT, 0.0)
+        Q = _basis(matrix, tolerance)
+        R, U = _lower_and_orthonormal((matrix @ Q.mT).mT)
         R = R + torch.diag_embed(torch.where(R.diagonal(dim1=-2, dim2=-1) > 0.0, 0.0, 1.0))
         return (U.mT @ solve_lower(R, Q)).mT
     columns = list(matrix.unbind(-2))
@@ -89,31 +89,57 @@ def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
     return W @ inner @ V.mT
 
 
-def _lower_and_orthonormal(matrix: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+def _basis(matrix: Tensor, tolerance: float) -> Tensor:
+    """Orthonormal rows (..., m, n) that span those of the matrix; zeros in the place of what is within the tolerance.
+
+    The longest remainder comes first (pivoting: Golub & Van Loan, "Matrix Computations", 5.4). In the order of the
+    rows, one that nearly depends on those before gives a direction that is mostly rounding, and redundant rows after it
+    seem to be independent: of nine rows of a flat foot, some do wherever it stands nearly along the axes of the world.
+    """
+    rest, basis, largest = matrix, matrix[..., :0, :], None
+    for k in range(matrix.shape[-2]):
+        squares = (rest * rest).sum(-1)
+        row, square = rest[..., 0, :], squares[..., 0]
+        for i in range(1, matrix.shape[-2]):
+            longer = squares[..., i] > square
+            row, square = (
+                torch.where(longer[..., None], rest[..., i, :], row),
+                torch.where(longer, squares[..., i], square),
+            )
+        largest = square if largest is None else largest
+        if k:  # again, since rounding of the remainder is not orthogonal
+            row = row - ((basis @ row[..., None])[..., 0][..., None, :] @ basis)[..., 0, :]
+        unit = _unit(row, tolerance**2 * largest)[0]
+        basis = torch.cat([basis, unit[..., None, :]], dim=-2)
+        rest = rest - (rest @ unit[..., None]) * unit[..., None, :]
+    return basis
+
+
+def _lower_and_orthonormal(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """L (..., m, m) and Q (..., m, n) with L Q the matrix, its rows made orthogonal to those before, twice each.
 
-    What is then below the tolerance of the longest row is dropped: that row of Q is zero.
+    Rows are independent, or zero, of which those of Q are zero.
     """
     count, lower, basis = matrix.shape[-2], [], matrix[..., :0, :]
-    squares = (matrix * matrix).sum(-1)
-    largest = squares[..., 0]
-    for k in range(1, count):
-        largest = torch.where(squares[..., k] > largest, squares[..., k], largest)
     for k, row in enumerate(matrix.unbind(-2)):
         along = torch.zeros_like(matrix[..., :k, 0])
         for _ in range(2 if k else 0):
             share = (basis @ row[..., None])[..., 0]
             row, along = row - (share[..., None, :] @ basis)[..., 0, :], along + share
-        square = (row * row).sum(-1)
-        kept = square > tolerance**2 * largest
-        length = torch.where(kept, torch.where(kept, square, torch.ones_like(square)).sqrt(), torch.zeros_like(square))
-        unit = torch.where(
-            kept[..., None], row / torch.where(kept, length, torch.ones_like(length))[..., None], 0.0 * row
-        )
+        unit, length = _unit(row, torch.zeros_like(row[..., 0]))
         basis = torch.cat([basis, unit[..., None, :]], dim=-2)
         rest = torch.zeros_like(matrix[..., : count - k - 1, 0])
         lower.append(torch.cat([along, length[..., None], rest], dim=-1))
     return torch.stack(lower, dim=-2), basis
+
+
+def _unit(row: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+    """The row over its length, and that; zeros where its square is not above the least."""
+    square = (row * row).sum(-1)
+    kept = square > least
+    length = torch.where(kept, torch.where(kept, square, torch.ones_like(square)).sqrt(), torch.zeros_like(square))
+    unit = row / torch.where(kept, length, torch.ones_like(length))[..., None]
+    return torch.where(kept[..., None], unit, 0.0 * row), length
 
 
 def _rotation(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ clearly move show what friction, loads and noise make of zero; feet at rest show
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -31,6 +32,13 @@ QUARTER = 0.3186
 FREE, LEAST, BEARS = 0.95, 0.02, 0.4
 """Quantile of the forces on feet that clearly move; shares of the force above and below which feet at rest carry half
 of all that they carry: nothing, and surely bearing."""
+FALLS, SURE = 0.2, 0.1
+"""Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
+to which its absence decides."""
+TILTS = 0.05
+"""rad by which a foot held flat leans away from the median of its stretch of stance."""
+NEAR, OFTEN = 0.5, 0.1
+"""m/s^2 about free fall; share of the rows in which a robot falls so."""
 FEW = 10
 MANY_OPEN = 0.25
 """Share of open rows that more than changes of stance leave."""
@@ -82,8 +90,8 @@ class Stance:
         if len(decided) < (1.0 - MANY_OPEN) * len(u):
             warn(
                 f"motion and forces leave the stance open in {1.0 - len(decided) / len(u):.0%} of the rows, which are "
-                "left out: velocities are noisy (filter them: `cutoff='auto'`), feet slip, or touch at other "
-                "points than those given.",
+                "left out: velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a filter "
+                "smears, feet slip or lean, or touch at other points than those given.",
                 DataWarning,
                 stacklevel=3,
             )
@@ -103,11 +111,16 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     2. What rests stands if it bears, and is free if it bears nothing. Without forces, rest is stance.
     3. Up to 0.1 s in between follow the decided rows around them where both agree. All else is open (NaN), with 30 ms
        on either side and on those of a change, and where something clearly moves and bears.
+    4. Where nothing but these contacts holds a base against gravity: rows in which none of them stands although
+       something bears a fifth of the weight are open, and rows in which one stands although nothing does. Filters and
+       averages move feet in stance as short as their memory (a hop recorded at 50 Hz), and motion alone calls it swing.
+    5. Rows in which a foot held flat leans by .05 rad from the median of its stretch of stance are open.
 
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
     the median at rest, of rows weighted by their force. Forces decide nothing where moving feet show more than these
-    40 %. Raises ContactError without contacts that have a switch.
+    40 %. Raises ContactError without contacts that have a switch, DatasetError for a robot in a plane
+    that falls and has no gravity there.
     """
     system = dataset.system if system is None else system
     names = () if system is None else tuple(dict.fromkeys(each.switch for each in system.contacts if each.switch))
@@ -116,6 +129,8 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
             "no contact of the system has a switch, so there is no stance to find; give one, for example "
             "fixed_point('foot', switch='foot_stands')."
         )
+    if (fall := missing_gravity(dataset, system)) is not None:
+        raise DatasetError(f"{fall[0]}, so forces show no stance: {fall[1]}")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked = _motion_and_force(dataset, system, names)
@@ -138,6 +153,13 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     for rows in episodes:
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
+    weight, whole = _weight(system), np.sum(asked, axis=0)
+    sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
+    for rows, width in zip(episodes, widths, strict=True):
+        falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
+        stands = (flags[rows] == 1.0).any(axis=1)
+        flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
+    flags[tilting(dataset, system, names, flags)] = np.nan
     return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
 
 
@@ -161,6 +183,71 @@ def _motion_and_force(
             motion[k].append(rates[:, rows].cpu().numpy())
             asked[k].append(forces[:, rows].sum(1).cpu().numpy())
     return [np.concatenate(own) for own in motion], [np.concatenate(own) for own in asked]
+
+
+def tilting(
+    dataset: Dataset, system: forcegp.mechanics.MechanicalSystem, names: tuple[str, ...], flags: np.ndarray
+) -> Bool[np.ndarray, "rows switches"]:
+    """Where feet that are held flat lean, as a heel that turns, although these flags (rows, switches) are 1."""
+    found, g = np.zeros(flags.shape, bool), system.robot.gravity
+    held = {(c.frame, c.switch): {x.point for x in system.contacts if x.frame == c.frame} for c in system.contacts}
+    for (frame, switch), points in held.items():
+        if switch is None or len(points) < 3 or not g.any():
+            continue
+        k = names.index(switch)
+        pose = system.robot.kinematics(torch.tensor(dataset.q, device=g.device)).frame_pose(frame)
+        down = (
+            (pose[..., :3, :3].mT @ (g / g.norm())).cpu().numpy()
+        )  # turns about it are drift of an estimator, perhaps
+        order = np.lexsort((dataset.time, dataset.episode))
+        number, stands = dataset.episode[order], flags[order, k] == 1.0
+        ends = np.flatnonzero((np.diff(number) != 0) | (np.diff(stands) != 0)) + 1
+        for rows in np.split(order, ends):
+            if flags[rows[0], k] == 1.0:
+                away = np.linalg.norm(down[rows] - np.median(down[rows], axis=0), axis=1)
+                found[rows, k] |= away > TILTS
+    return found
+
+
+def missing_gravity(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem) -> tuple[str, str] | None:
+    """What shows that a robot in a plane falls in it although its gravity has no part there, and the remedy."""
+    robot = system.robot
+    if robot.base != "planar" or robot.gravity[:2].any():
+        return None
+    q, v, a = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.a))
+    force = robot.kinematics(q, v).inverse_dynamics(a)[:, :2].cpu().numpy() / _mass(robot)  # in the axes of the base
+    c, s = dataset.q[:, 2], dataset.q[:, 3]
+    motion = np.stack([c * force[:, 0] - s * force[:, 1], s * force[:, 0] + c * force[:, 1]], 1)
+    usual = 9.81
+    near = abs(np.linalg.norm(motion, axis=1) - usual) < NEAR
+    if not near.any():
+        return None
+    fall = np.median(motion[near], axis=0)
+    often, size = (np.linalg.norm(motion - fall, axis=1) < NEAR).mean(), np.linalg.norm(fall)
+    if often < OFTEN or abs(size - usual) > NEAR:
+        return None
+    direction = fall / size
+    direction = np.where(abs(direction) < TILTS, 0.0, direction)
+    x, y = usual * direction / np.linalg.norm(direction)
+    return (
+        f"in {often:.0%} of the rows the robot falls at ({fall[0]:.3g}, {fall[1]:.3g}) m/s^2 in its plane, in which it "
+        "has no gravity",
+        f"forcegp import --robot FILE --base planar --gravity={x + 0.0:.4g},{y + 0.0:.4g},0 reads it with gravity, as "
+        f"Robot.from_urdf(..., gravity=({x + 0.0:.4g}, {y + 0.0:.4g}, 0)) does.",
+    )
+
+
+def _mass(robot: Any) -> float:
+    return sum(robot.link(name).mass for name in robot.link_names)
+
+
+def _weight(system: forcegp.mechanics.MechanicalSystem) -> float:
+    """What contacts with a switch must bear [N]; 0 where something else may hold the robot up."""
+    robot, alone = system.robot, all(contact.switch for contact in system.contacts)
+    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
+    if gravity is None or not alone:
+        return 0.0
+    return float(gravity.norm()) * _mass(robot)
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:

@@ -347,11 +347,17 @@ def _statistics(
     crosses = kernels.crosses(parameters, points, features)
     phi = [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(lowers, crosses, strict=True)]
     diagonals = kernels.diagonals(parameters, features)
-    relevance = W.square().sum(1)
+    pairs, target = W.mT @ W, (W * y[..., None]).sum(1)  # of D equations that W weighs, once and not in each product
+    relevance = pairs.diagonal(dim1=-2, dim2=-1)
     prior = torch.stack([relevance[:, c] @ k for c, k in enumerate(diagonals)]).sum()
     shares = (relevance[:, c] @ (k - f.square().sum(0)) for c, (k, f) in enumerate(zip(diagonals, phi, strict=True)))
-    wide = torch.cat([f[:, None, :] * W[:, :, c].mT for c, f in enumerate(phi)]).flatten(1)
-    return wide @ wide.mT, wide @ y.mT.reshape(-1), sum(shares, torch.zeros_like(prior)), prior
+    columns = []
+    for c, f in enumerate(phi):  # the blocks below the diagonal and half of that on it
+        below = torch.cat([other * (0.5 if d == c else 1.0) * pairs[:, d, c] for d, other in enumerate(phi) if d >= c])
+        columns.append(torch.nn.functional.pad(below @ f.mT, (0, 0, sum(map(len, phi[:c])), 0)))
+    lower = torch.cat(columns, dim=1)
+    right = torch.cat([f @ target[:, c] for c, f in enumerate(phi)])
+    return lower + lower.mT, right, sum(shares, torch.zeros_like(prior)), prior
 
 
 def _lower(matrix: Float[Tensor, "n n"], jitter: float = JITTER) -> Float[Tensor, "n n"]:

@@ -21,7 +21,7 @@ from forcegp.robots.arguments import real_tensor, require_finite, whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
-"""Steps of some milliseconds each; fewer are done before a program is compiled."""
+"""Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
@@ -195,7 +195,8 @@ def roll_out(
 def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, seed: int) -> list[FusedLoop] | None:
     """Compiled loops, where motions are long enough to be worth compiling them."""
     space = model.system.robot.space
-    if model.compiled is None or integrator not in steps_of(space) or steps * max(1, samples) < STEPS_TO_COMPILE:
+    work = steps * max(1, samples) * (1 + len(model.system.contacts))
+    if model.compiled is None or integrator not in steps_of(space) or work < STEPS_TO_COMPILE:
         return None
     try:
         return model.compiled(integrator, samples, seed)
