@@ -10,7 +10,7 @@ import torch
 from scipy.linalg import block_diag
 
 from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies, thickened
-from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
+from forcegp.analytical.identifiability import body_pseudo_inertias
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares
 from forcegp.analytical.recorded_rows import LikelyAccelerations, RecordedRows, Rows
@@ -241,7 +241,7 @@ def _warn_of_what_holds_it_up(found: AnalyticalIdentification, rows: RecordedRow
     given = float(found.bodies.parameters(np.zeros(found.bodies.size))[:, 0].sum())
     if robot.base == "floating":
         residual = a - rows.acceleration(found.parameters, found.fit.x[found.bodies.size :])[0]
-        rotation = rows.kinematics.frame_pose(body_names(robot)[0])[:, :3, :3].cpu().numpy()
+        rotation = rows.kinematics.frame_pose(robot.layout.moving[0])[:, :3, :3].cpu().numpy()
         missing = float(np.linalg.norm((rotation @ residual[:, :3, None]).mean(0)))
     wrong = ""
     if not given / OTHER_ROBOT <= mass <= given * OTHER_ROBOT:

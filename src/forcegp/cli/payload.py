@@ -64,7 +64,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
             given = {"command": self.words("baseline", "link", "friction", "cutoff", "delay")}
             with self.folder(self.out, {"data": str(self.data), **given}) as folder:
                 write_json(folder / "payload.json", content)
-                found.system.robot.to_urdf(folder / "loaded.urdf")
+                found.system.to_urdf(folder / "loaded.urdf")
                 write_text(folder / SYSTEM_FILE, found.system.to_json() + "\n")
         for note in notes:
             terminal.note(note)

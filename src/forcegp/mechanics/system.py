@@ -14,7 +14,14 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
-from forcegp.mechanics.known_forces import KNOWN_FORCES, Actuation, KnownForce, RigidBodyBias, known_force_to_dict
+from forcegp.mechanics.known_forces import (
+    KNOWN_FORCES,
+    Actuation,
+    Armature,
+    KnownForce,
+    RigidBodyBias,
+    known_force_to_dict,
+)
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import OBSERVED, Thrusters
@@ -122,7 +129,16 @@ class MechanicalSystem(Summary):
             key = (loop.frame, loop.second_frame), (loop.point, loop.second_point)
             ends[key] = ends.get(key, False) or loop.turning
         named = enumerate(ends.items(), 1)
-        return self.robot.to_mjcf(path, [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named])
+        loops = [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named]
+        return self._with_rotors().to_mjcf(path, loops)
+
+    def to_urdf(self, path: str | Path | None = None) -> str:
+        """`Robot.to_urdf` with the rotor inertias of each `Armature` that is listed; other forces are left out."""
+        return self._with_rotors().to_urdf(path)
+
+    def _with_rotors(self) -> Robot:
+        listed = [torch.as_tensor(force.inertia) for force in self.known_forces if isinstance(force, Armature)]
+        return self.robot.with_armature((self.robot.armature + sum(listed)).tolist()) if listed else self.robot
 
     @classmethod
     @usable_arguments("MechanicalSystem.from_file")
