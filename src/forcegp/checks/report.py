@@ -249,8 +249,8 @@ def _of_base(dataset: Dataset, system: MechanicalSystem, preparation: Preparatio
 
 def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Finding]:
     """Times, and whether q, v and a of the joints of one degree of freedom belong together; quick without a filter."""
-    rows, before = robot.space.single_rows, robot.nv - len(robot.single_joint_names)
-    if not len(rows) or not dataset.time_ordered:
+    rows = robot.space.single_rows
+    if not rows or not dataset.time_ordered:
         return
     places = [robot.position_names.index(name) for name in robot.single_joint_names]
     each = {name: unit_of_each(name, dataset.units[name], dataset.nv) for name in ("q", "v", "u", "a")}
