@@ -248,7 +248,7 @@ def _of_base(dataset: Dataset, system: MechanicalSystem, preparation: Preparatio
 
 
 def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Finding]:
-    """Times, and whether q, v and a of the joints of one degree of freedom belong together; quick without a filter."""
+    """Whether q, v and a of the joints of one degree of freedom belong together; quick where there is no filter."""
     rows = robot.space.single_rows
     if not rows or not dataset.time_ordered:
         return
@@ -261,7 +261,7 @@ def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation |
     )  # fmt: skip
     with contextlib.suppress(InvalidInput):  # too short
         inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
-        for finding in [*sampling_findings(inputs), *motion_findings(inputs)]:
+        for finding in motion_findings(inputs):  # gaps may be rows whose feet are not known
             yield _for_all_columns(finding, rows, {"unit": each["v"], "sign": (1.0,) * dataset.nv})
 
 
