@@ -70,6 +70,8 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
             terminal.note(note)
         if not found.fit.settled:
             terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
+        if found.intervals["mass"][0] <= 0.0:
+            terminal.warn("the payload may weigh nothing by this log: its centre of mass and inertia mean nothing then.")
         terminal.show(*_tables(found))
         return content
 
