@@ -101,7 +101,7 @@ class MechanicalSystem(Summary):
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
         enter as known forces only where listed. By default u are joint forces; where motors act at sites of a free
-        body, such as rotors, u are the inputs of all motors.
+        body, such as rotors, or turn a ball joint, u are the inputs of all motors.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
         contacts = [
@@ -115,9 +115,10 @@ class MechanicalSystem(Summary):
         ]
         if known_forces is None:
             known_forces = (Actuation(), RigidBodyBias())
-            if found.thrusters and robot.base != "fixed":
-                moving = set(robot.joint_names)  # without those that are locked
-                names, columns = zip(*(x for x in found.thrusters if moving & set(x[1])), strict=True)
+            moving = set(robot.joint_names)  # without those that are locked
+            motors = [x for x in found.thrusters if moving & set(x[1])]
+            if any(moving & set(column) - set(robot.single_joint_names) for _, column in motors):
+                names, columns = zip(*motors, strict=True)
                 matrix = [[column.get(joint, 0.0) for column in columns] for joint in robot.joint_names]
                 known_forces = (Actuation(matrix, names), RigidBodyBias())
         return cls(robot, tuple(contacts), known_forces, baumgarte)
