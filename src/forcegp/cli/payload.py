@@ -71,7 +71,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
         if not found.fit.settled:
             terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
         if found.intervals["mass"][0] <= 0.0:
-            terminal.warn("the payload may weigh nothing by this log: its centre of mass and inertia mean nothing then.")
+            terminal.warn("the payload may weigh nothing by this log: centre of mass and inertia mean nothing then.")
         terminal.show(*_tables(found))
         return content
 
@@ -103,5 +103,7 @@ def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
     fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
     rows = [[joint, *(f"{found.joints[f'{field}.{joint}'][0]:.3g}" for field in fields)] for joint in joints]
     header = ["joint", *(field.replace("_", "\n") for field in fields)]
-    tables += [columns("joints, in Nm, rad/s and kg m²", header, rows)] if rows else []
+    slides = any(found.system.robot.joint(joint).type == "prismatic" for joint in joints)
+    units = "Nm or N, rad/s or m/s and kg m² or kg" if slides else "Nm, rad/s and kg m²"
+    tables += [columns(f"joints, in {units}", header, rows)] if rows else []
     return [*tables, f"{found.rows} rows."]

@@ -38,7 +38,7 @@ class Translation:
     locked: dict[str, float]
     loops: tuple[LoopDescription, ...] = ()
     thrusters: tuple[tuple[str, dict[str, float]], ...] = ()
-    """The motors, if some act on a free body or a ball joint: name, and joint forces per unit of input by joint name."""
+    """The motors, if some act on a free body or a ball joint: name, and joint forces per unit of input by joint."""
 
 
 class CompiledModel:
