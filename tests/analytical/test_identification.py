@@ -10,7 +10,7 @@ from tests.models.arm import arm_data, arm_system
 
 from forcegp.analytical import base_parameters, identify_analytical, motion_residuals, standard_parameters
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, NonPhysicalInertia
+from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotFileWarning
 from forcegp.mechanics import (
     Actuation,
     Armature,
@@ -20,6 +20,7 @@ from forcegp.mechanics import (
     RigidBodyBias,
     ViscousJointFriction,
 )
+from forcegp.robots import Robot
 
 TRUE_FORCES = (
     Actuation(),
@@ -208,3 +209,20 @@ def test_friction_under_load_does_not_explain_the_torque_by_itself():
     assert float(mu[2]) < 0.5
     force, _ = motion_residuals(log, found.system)
     assert force[:, 2].std() > 4.0  # of 5.8 that no model can know
+
+
+def test_rotor_inertias_are_whole_in_reports_and_in_files(tmp_path):
+    """The robot has a part of its rotors already; the estimate adds the rest."""
+    data, system = recorded(300, 40), arm_system(0)
+    system = system.with_robot(system.robot.with_armature([0.02, 0.0, 0.01]))
+    found = identify_analytical(data, system, friction=FRICTION)
+    for joint, (start, truth) in zip(system.robot.joint_names, ((0.02, 0.05), (0, 0.04), (0.01, 0.03)), strict=True):
+        assert found.start[f"armature.{joint}"] == pytest.approx(start)
+        assert found.values[f"armature.{joint}"] == pytest.approx(truth, rel=0.02)
+    with pytest.warns(RobotFileWarning, match="^found.urdf: URDF has no element for rotor inertias"):
+        found.system.to_urdf(tmp_path / "found.urdf")
+    written = Robot.from_urdf(tmp_path / "found.urdf")
+    np.testing.assert_allclose(written.armature, [0.05, 0.04, 0.03], rtol=0.02)
+    q, v, _ = (torch.tensor(np.array(x)) for x in (data.q, data.v, data.u))
+    kinematics = found.system.robot.kinematics(q, v)
+    torch.testing.assert_close(written.mass_matrix(q), found.system.mass_matrix(kinematics))

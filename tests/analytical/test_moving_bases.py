@@ -1,5 +1,6 @@
 """Regression on torques where the base moves: Pinocchio's regressor, dense algebra, and parameters found again."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -359,6 +360,30 @@ def test_feet_that_carry_and_are_flagged_as_swinging_are_named(walker):
     lifted[:, -2:] = 0.0
     with pytest.warns(DataWarning, match="9.* m/s.2 on average: what holds it up .* Check flags of stance"):
         identify_analytical(replace(log, u=lifted, a=0.0 * log.a))
+
+
+@pytest.mark.parametrize(("drag", "warned"), [(0.0, False), (2.0, True)])
+def test_ground_friction_of_a_base_in_a_plane_is_no_mass(drag, warned):
+    """Newton's law for a plate of 5 kg in its own axes, under forces on it and friction against its velocity."""
+    text = '<robot name="plate"><link name="plate"><inertial><mass value="4"/><inertia ixx=".1" iyy=".1" izz=".2"'
+    robot = Robot.from_urdf_text(f'{text} ixy="0" ixz="0" iyz="0"/></inertial></link></robot>', base="planar")
+    system = MechanicalSystem(robot, (), (Actuation(np.eye(3), ("x", "y", "turn")), RigidBodyBias()))
+    draw = np.random.default_rng(0).normal
+    v, u, angle = draw(size=(400, 3)), draw(size=(400, 3)), draw(size=400)
+    force = u - drag * v / np.linalg.norm(v, axis=1, keepdims=True)
+    a = force / [5.0, 5.0, 0.2] + v[:, 2:] * np.stack([v[:, 1], -v[:, 0], 0.0 * angle], axis=1)
+    q = np.column_stack([0.0 * v[:, :2], np.cos(angle), np.sin(angle)])
+    noisy = a + 0.01 * draw(size=a.shape)
+    log = Dataset(q=q, v=v, u=u, a=noisy, time=np.arange(400.0), system=system)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = identify_analytical(log)
+    assert [each.category for each in caught] == [DataWarning] * warned
+    if warned:
+        assert "ground friction or drag" in str(caught[0].message)
+        assert "identify --learn LINK:mass,com --prior joint,joint-friction" in str(caught[0].message)
+    else:
+        assert found.total_mass[0] == pytest.approx(5.0, rel=0.01)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tests.robots.pinocchio_oracle import Oracle
 
-from forcegp.analytical import PayloadEstimate, identify_payload
+from forcegp.analytical import PayloadEstimate, body_names, identify_analytical, identify_payload
 from forcegp.data import Dataset
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
@@ -127,3 +127,32 @@ def test_a_short_log_is_refused():
         identify_payload(short)
     with pytest.raises(InvalidInput, match="system"):
         identify_payload(replace(short, system=None))
+
+
+UNIVERSAL = """<mujoco><compiler angle="radian"/><worldbody><body name="upper"><joint name="x" axis="1 0 0"/>
+<joint name="y" axis="0 1 0"/><inertial pos="0 0 .2" mass="2" diaginertia=".03 .03 .01"/><body name="fore" pos="0 0 .4">
+<joint name="elbow" axis="0 1 0"/><inertial pos="{0} 0 .15" mass="{1}" diaginertia=".02 .02 .01"/>
+</body></body></worldbody></mujoco>"""
+
+
+def test_two_joints_in_one_body_have_no_mass_between_them():
+    """MuJoCo's inverse dynamics of a forearm with a payload of 0.5 kg, under a joint with two axes."""
+    mujoco = pytest.importorskip("mujoco")
+    file = UNIVERSAL.format(0, 1)
+    model = mujoco.MjModel.from_xml_string(UNIVERSAL.format(0.05 * 0.5 / 1.5, 1.5))
+    state, time = mujoco.MjData(model), np.arange(0.0, 10.0, 0.01)
+    at = np.array([0.9, 1.3, 1.7]) * time[:, None] + np.arange(3)
+    rows = np.sin(at), np.array([0.9, 1.3, 1.7]) * np.cos(at), -(np.array([0.9, 1.3, 1.7]) ** 2) * np.sin(at)
+    u = np.empty_like(at)
+    for row, (q, v, a) in enumerate(zip(*rows, strict=True)):
+        state.qpos, state.qvel, state.qacc = q, v, a
+        mujoco.mj_inverse(model, state)
+        u[row] = state.qfrc_inverse
+    system = MechanicalSystem(Robot.from_mjcf_text(file))
+    data = Dataset(q=rows[0], v=rows[1], u=u, a=rows[2], time=time, system=system)
+    held = identify_payload(data, link="fore")
+    assert held.mass == pytest.approx(0.5, rel=1e-3)
+    assert held.center_of_mass[:2] == pytest.approx([0.05, 0.0], abs=1e-3)
+    found = identify_analytical(data, prior_strength=1e-6)
+    assert body_names(system.robot) == ("upper", "fore")
+    np.testing.assert_allclose(found.torque_residual(data), 0.0, atol=1e-3)

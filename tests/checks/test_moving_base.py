@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from forcegp import Dataset, MechanicalSystem, Robot, check, excitation
+from forcegp import ColumnMapping, Dataset, MechanicalSystem, Robot, check, excitation, import_recordings
 from forcegp.checks import quick_check
 from forcegp.data.configurations import rates
 from forcegp.errors import DatasetError, InvalidInput
@@ -117,9 +117,39 @@ def test_check_reports_the_base(log):
     report = check(log)
     assert [(each.subject, each.severity) for each in report.findings] == [
         ("base", "ok"),
+        ("velocity", "ok"),
         *[("contact flag", "ok")] * 4,
     ]
     assert [each["joint"] for each in report.to_dict()["joints"]] == list(log.joint_names)
+
+
+@pytest.mark.parametrize("what", ["deg/s", "sign"])
+def test_velocities_of_the_joints_are_compared_beside_a_base(log, what, tmp_path):
+    """The mistake is named, flags of feet are not blamed for it, and its correction leaves the base as it was."""
+    mistaken = np.ones(log.nv)
+    mistaken[6:] = 180.0 / np.pi if what == "deg/s" else 1.0
+    mistaken[8] *= 1.0 if what == "deg/s" else -1.0
+    columns = {"t": log.time} | {
+        f"{name}{k}": x[:, k]
+        for name, x in (("q", log.q), ("v", log.v * mistaken), ("u", log.u))
+        for k in range(x.shape[1])
+    }
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(tmp_path / "log.csv", table, "%.12g", ",", header=",".join(columns), comments="")
+    signals = {name: (f"{name}{{0..{getattr(log, name).shape[1] - 1}}}",) for name in "qvu"}
+    mapping = ColumnMapping(time="t", **signals)
+    import_recordings([tmp_path / "log.csv"], tmp_path / "log.h5", mapping, system=log.system)
+    wrong = Dataset.load(tmp_path / "log.h5")
+    (finding,) = quick_check(wrong)
+    assert (finding.severity, finding.subject) == ("wrong", "velocity")
+    assert [each.subject for each in check(wrong).findings if each.severity == "wrong"] == ["velocity"]
+    units = ["m/s"] * 3 + ["rad/s"] * 3 + ["deg/s"] * 12
+    assert (f"--unit v={','.join(units)};" if what == "deg/s" else "--sign v=1,1,1,1,1,1,1,1,-1,1,") in finding.remedy
+    corrected = mapping.corrected_by(finding.correction, log.joint_names, {})
+    import_recordings([tmp_path / "log.csv"], tmp_path / "right.h5", corrected, system=log.system)
+    right = Dataset.load(tmp_path / "right.h5")
+    np.testing.assert_allclose(right.v, log.v, atol=1e-9)
+    assert not [each for each in quick_check(right) if each.severity == "wrong"]
 
 
 def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):

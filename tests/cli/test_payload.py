@@ -48,6 +48,16 @@ def test_people_see_mass_and_millimetres(folder, forcegp):
     assert float(place[1]) == pytest.approx(1e3 * CENTER[2], abs=2.0)
 
 
+def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
+    """Its mass is a positive number with an interval around 0; the warning stands with that alone."""
+    nothing = forcegp("payload", "empty.h5", "--cutoff", "none", "--delay", 0, "--json", folder=folder)
+    low, high = json.loads(nothing.stdout)["payload"]["mass"]["interval_95"]
+    assert low <= 0.0 < high
+    assert "centre of mass and inertia mean nothing" in " ".join(nothing.stderr.split())
+    held = forcegp("payload", "loaded.h5", "--cutoff", "none", "--delay", 0, "--json", folder=folder)
+    assert "mean nothing" not in " ".join(held.stderr.split())
+
+
 def test_the_check_names_it(folder, forcegp):
     found = json.loads(forcegp("check", "loaded.h5", "--cutoff", "none", "--json", folder=folder).stdout)["findings"]
     (payload,) = [each for each in found if each["subject"] == "payload"]

@@ -205,6 +205,30 @@ def test_motors_at_sites_of_a_free_body_are_inputs(tmp_path):
     assert MechanicalSystem.from_json(system.to_json()).inputs == system.inputs
 
 
+def test_motors_that_turn_a_ball_joint_are_inputs(tmp_path):
+    """MuJoCo's joint forces of an arm on a rail; a motor whose axes are those of the parent is left out by name."""
+    mass = '<inertial pos="0 0 -.1" mass="1" diaginertia=".01 .02 .03"/>'
+    arm = (
+        '<mujoco><worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1"/>'
+        f'<body name="upper"><joint name="shoulder" type="ball"/>{mass}<body pos="0 0 -.3"><joint name="elbow"/>{mass}'
+        '</body></body></body></worldbody><actuator><motor name="push" joint="rail" gear="3"/>'
+        '<motor name="roll" joint="shoulder" gear="2 0 0"/><motor name="yaw" joint="shoulder" gear="0 .5 1"/>'
+        '<motor name="bend" joint="elbow"/></actuator></mujoco>'
+    )
+    system, model = system_of(arm, tmp_path), mujoco.MjModel.from_xml_string(arm)
+    assert system.inputs == ("push", "roll", "yaw", "bend")
+    oracle = MujocoOracle(model)
+    generator = torch.Generator().manual_seed(0)
+    q, v = system.robot.random(generator, 1), torch.zeros(1, 5, dtype=torch.float64)
+    u = torch.tensor([[1.0, 3.0, -2.0, 0.5]], dtype=torch.float64)
+    oracle.data.ctrl[:] = u[0].numpy()
+    oracle.at(q[0].numpy(), v[0].numpy())
+    np.testing.assert_allclose(system.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
+    with pytest.warns(RobotFileWarning, match=r"drive no single joint \(yaw\)|drive no single joint \(roll, yaw\)"):
+        other = system_of(arm.replace('"yaw" joint', '"yaw" jointinparent'), tmp_path)
+    assert other.inputs == ("rail", "elbow")
+
+
 def test_a_servo_and_a_tendon_leave_the_rotors_of_a_drone(tmp_path):
     """Of a joint with a law of its own u holds the force, once; what drives no single joint is left out by name."""
     arm = '<site name="r2" pos="-.1 .1 0"/><body><joint name="tilt" axis="0 1 0"/><geom size=".03" mass=".1"/></body>'

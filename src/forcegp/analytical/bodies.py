@@ -24,7 +24,7 @@ from scipy.linalg import block_diag
 from typing_extensions import override
 
 from forcegp.analytical.identifiability import body_names, body_pseudo_inertias, carrying
-from forcegp.errors import InvalidInput, NonPhysicalInertia
+from forcegp.errors import NonPhysicalInertia
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia, standard_basis
 from forcegp.robots.urdf_file import replace_dynamics, replace_inertial
@@ -163,17 +163,12 @@ THICKNESS = 0.05
 def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
     """The robot with bodies of some thickness, since only they have coordinates; and the links that were changed.
 
-    Points, rods and plates (ideal ones, as simple URDFs have them) get an isotropic second moment. Raises InvalidInput
-    for a body without mass.
+    Points, rods and plates (ideal ones, as simple URDFs have them) get an isotropic second moment.
     """
     text, changed = robot.urdf_text, []
     for body, pseudo in zip(carrying(robot), body_pseudo_inertias(robot).numpy(), strict=True):
         joint = robot.layout.bodies[body]
-        mass, center = pseudo[3, 3], pseudo[:3, 3] / (pseudo[3, 3] or 1.0)
-        if mass == 0.0:
-            raise InvalidInput(
-                f"link {joint.child!r} moves with {joint.name!r} and has no mass to estimate; lock that joint."
-            )
+        mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
         about_center = pseudo[:3, :3] - mass * np.outer(center, center)
         size = max(np.trace(pseudo[:3, :3]), 1e-8 * mass)
         if np.linalg.eigvalsh(about_center)[0] > THIN * size:

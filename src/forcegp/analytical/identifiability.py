@@ -5,7 +5,7 @@
 (Atkeson, An & Hollerbach, "Estimation of inertial parameters of manipulator loads and links", IJRR 1986). A *body* is
 what one joint moves as one: its child link with every link fixed to it; only their sum shows in joint forces. ``pi``
 has the `PARAMETERS` of body after body, about the origin and in the axes of the child link (Pinocchio's order). A base
-that moves is one body, whose joint forces are the wrench that the world puts on it.
+that moves is one body, whose joint forces are the wrench that the world puts on it. Bodies without mass have none.
 
 The columns of the torque regressor are linearly dependent for every motion: a link's mass shows only together with
 others. QR with column pivoting takes independent columns first, ``W P = Q [R1 R2; 0 0]``; the base parameters are
@@ -47,8 +47,8 @@ def torque_regressor(
 
 
 def carrying(robot: Robot) -> list[int]:
-    """Numbers of the bodies that carry links: of a joint of several degrees of freedom the last one."""
-    return [body for body in range(len(robot.layout.bodies)) if body not in robot.layout.empty]
+    """Numbers of the bodies with mass: what lies between the joints of a universal joint has no parameters."""
+    return robot.tree.inertias[:, 3, 3, 0].nonzero()[:, 0].tolist()
 
 
 def standard_parameters(robot: Robot) -> Float[Tensor, "columns"]:

@@ -10,12 +10,12 @@ import torch
 from scipy.linalg import block_diag
 
 from forcegp.analytical.bodies import BodyCoordinates, ConsistentBodies, FreeBodies, thickened
-from forcegp.analytical.identifiability import body_names, body_pseudo_inertias
+from forcegp.analytical.identifiability import body_pseudo_inertias
 from forcegp.analytical.joint_terms import JointTerms
 from forcegp.analytical.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares
 from forcegp.analytical.recorded_rows import LikelyAccelerations, RecordedRows, Rows
 from forcegp.analytical.result import AnalyticalIdentification
-from forcegp.data import Dataset
+from forcegp.data import Dataset, thruster_columns
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
@@ -233,17 +233,20 @@ def joint_terms(
     return JointTerms(system, friction, rotors, torque=torque, velocity=velocity, mass=mass)
 
 
+BRAKED = 0.4
+"""Correlation of missing accelerations of a base with its velocity: below .2 in logs of feet, wheels and rotors without
+drag, .45 to .83 with drag or ground friction."""
 OTHER_ROBOT = 2.0
 """Factor between the masses of log and file, or of what holds the robot up, from which on one of them is wrong."""
 
 
 def _warn_of_what_holds_it_up(found: AnalyticalIdentification, rows: RecordedRows, a: Rows) -> None:
-    """Where log and file have different masses, or the base lacks a force of the size of gravity."""
+    """Where log and file have different masses, the base lacks a force of the size of gravity, or something brakes."""
     robot, mass, missing = found.given.robot, found.total_mass[0], 0.0
     given = float(found.bodies.parameters(np.zeros(found.bodies.size))[:, 0].sum())
+    residual = a - rows.acceleration(found.parameters, found.fit.x[found.bodies.size :])[0]
     if robot.base == "floating":
-        residual = a - rows.acceleration(found.parameters, found.fit.x[found.bodies.size :])[0]
-        rotation = rows.kinematics.frame_pose(body_names(robot)[0])[:, :3, :3].cpu().numpy()
+        rotation = rows.kinematics.frame_pose(robot.layout.moving[0])[:, :3, :3].cpu().numpy()
         missing = float(np.linalg.norm((rotation @ residual[:, :3, None]).mean(0)))
     wrong = ""
     if not given / OTHER_ROBOT <= mass <= given * OTHER_ROBOT:
@@ -254,6 +257,19 @@ def _warn_of_what_holds_it_up(found: AnalyticalIdentification, rows: RecordedRow
         warn(
             f"{wrong}: what holds it up is not what the log states. Check flags of stance, thrust coefficients and the "
             "unit of u.",
+            DataWarning,
+            stacklevel=3,
+        )
+    linear = {"floating": 3, "planar": 2}.get(robot.base, 0)
+    missed, v = residual[:, :linear], rows.v[:, :linear]
+    braked = -float((missed * v).sum()) / max(float(np.linalg.norm(missed) * np.linalg.norm(v)), 1e-300)
+    if not wrong and braked > BRAKED:
+        remedy = "weigh it, since thrust and mass look alike, and let forcegp fit learn the forces"
+        if not thruster_columns(found.given):
+            remedy = "forcegp identify --learn LINK:mass,com --prior joint,joint-friction learns both"
+        warn(
+            f"what the model lacks brakes the base (correlation {braked:.2g} with its velocity): ground friction or "
+            f"drag, which this regression takes for mass; {remedy}.",
             DataWarning,
             stacklevel=3,
         )

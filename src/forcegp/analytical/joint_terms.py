@@ -213,6 +213,13 @@ class JointTerms:
         x = x.reshape(self._sizes.shape)
         return np.where(self._logarithms, np.exp(np.where(self._logarithms, x, 0.0)), x) * self._sizes
 
+    def totals(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields joints"]:
+        """`values`, rotor inertias with those that the robot has already."""
+        values = self.values(x)
+        if self.inertia == "armature":
+            values[-1] += self.robot.armature.cpu().numpy()[self.rows]
+        return values
+
     def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "fields joints"]:
         """Derivative of each number in its own coordinate."""
         return np.where(self._logarithms, self.values(x), self._sizes)

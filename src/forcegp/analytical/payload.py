@@ -176,9 +176,8 @@ def identify_payload(
         ]
         likely = [_likely(own, *rows) for own, rows in zip(found, states, strict=True)]
         likely_a, from_noise = (np.concatenate(x) for x in zip(*likely, strict=True))
-    regressor = recorded.regressor(likely_a)
-    held = regressor[:, :, [terms.bodies.index(placement.body)]] * holds[:, None, None, None]
-    regressor = np.concatenate([regressor, held], axis=2)
+    regressor = recorded.regressor(likely_a, (*terms.bodies, placement.body))
+    regressor[:, :, -1] *= holds[:, None, None]
     split, known = bodies.size, len(stated)
     windows = _Windows([log.rows(at) for log, at in zip(logs, chosen, strict=True)])
 
@@ -220,9 +219,7 @@ def identify_payload(
     found, there = bodies.pseudo_inertias(fit.x[:split]), np.linalg.inv(offset)
     payload = there @ found[-1] @ there.T
     bare = robot if baseline is None else with_bodies(robot, found[:-1])
-    values = terms.values(fit.x[split:])
-    if terms.inertia == "armature":
-        values[-1] += robot.armature.cpu().numpy()[terms.rows]  # which the equations hold already
+    values = terms.totals(fit.x[split:])
     return PayloadEstimate(
         link=link,
         pseudo_inertia=payload,

@@ -126,10 +126,10 @@ class RecordedRows:
             self.inertia = self.inertia + (0.0 if added is None else added.detach().cpu().numpy())
         self._armature = np.diag(robot.armature.cpu().numpy())
 
-    def regressor(self, a: Rows) -> Float[np.ndarray, "rows nv bodies 10"]:
-        """Y at these states and accelerations."""
+    def regressor(self, a: Rows, bodies: Sequence[int] = ()) -> Float[np.ndarray, "rows nv bodies 10"]:
+        """Y at these states and accelerations, of the bodies with mass or of these."""
         at = torch.as_tensor(np.array(a), device=self.kinematics.robot.device)
-        return self.kinematics.torque_regressor(at).cpu().numpy()[:, :, self.terms.bodies]
+        return self.kinematics.torque_regressor(at).cpu().numpy()[:, :, bodies or self.terms.bodies]
 
     def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
         """The part of joint forces (first axis after the rows) that no lambda can explain."""

@@ -88,8 +88,8 @@ class AnalyticalIdentification(Summary):
 
     @property
     def values(self) -> dict[str, float]:
-        """By name, in SI units."""
-        numbers = np.concatenate([self.parameters.ravel(), self.terms.values(self._in_terms).ravel()])
+        """By name, in SI units; rotor inertias with those that the robot had."""
+        numbers = np.concatenate([self.parameters.ravel(), self.terms.totals(self._in_terms).ravel()])
         return dict(zip(self.names, numbers.tolist(), strict=True))
 
     @property
@@ -97,7 +97,7 @@ class AnalyticalIdentification(Summary):
         """The same numbers of the system that was given; 0 where it lists no such force."""
         zero = self.bodies.parameters(np.zeros(self.bodies.size))
         center, _ = self.terms.prior()
-        return dict(zip(self.names, np.concatenate([zero.ravel(), self.terms.values(center).ravel()]), strict=True))
+        return dict(zip(self.names, np.concatenate([zero.ravel(), self.terms.totals(center).ravel()]), strict=True))
 
     @cached_property
     def standard_errors(self) -> dict[str, float]:

@@ -82,7 +82,7 @@ class _Windows:
 
 
 def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """What is seen of the bases of a log; the joints of one degree of freedom are not looked at."""
+    """What is seen of the bases of a log."""
     if not dataset.time_ordered or consecutive(dataset).sum() < 10:
         yield look(subject="base", seen="too few successive rows to compare positions and velocities of the base.")
         return

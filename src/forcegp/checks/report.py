@@ -1,12 +1,23 @@
 """`check`: one log against itself and its robot, as a list of findings that a person acts on."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import SEVERITIES, CheckInput, Finding, Severity, listed, look, numbers_of, worst
+from forcegp.checks.check_input import (
+    SEVERITIES,
+    CheckInput,
+    Finding,
+    Severity,
+    import_flags,
+    listed,
+    look,
+    numbers_of,
+    worst,
+)
 from forcegp.checks.dynamics import dynamics_findings
 from forcegp.checks.excitation import excitation_findings, noise_findings, stated_noise_findings, torque_noise
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
@@ -18,8 +29,9 @@ from forcegp.checks.stance import gravity_findings, stance_findings, unmeasured_
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.preparation import plain
-from forcegp.errors import require_type
+from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.summary import Summary
@@ -160,15 +172,16 @@ def check(
     Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
     """
     require_type("dataset", dataset, Dataset)
+    preparation = Preparation(cutoff="auto") if preparation is None else preparation
+    require_type("preparation", preparation, Preparation)
     system = dataset.system if system is None else system
     if system is not None:
         robot = require_type("system", system, MechanicalSystem).robot
         require_rows("dataset", dataset, robot.joint_names, robot.name)
         if robot.layout.groups:  # torques and filters are not looked at
             inputs = CheckInput.as_recorded(dataset, system)
-            return CheckReport(findings=_of_base(dataset, system), inputs=inputs, comparison=None)
-    preparation = Preparation(cutoff="auto") if preparation is None else preparation
-    inputs = CheckInput.of(dataset, system, require_type("preparation", preparation, Preparation))
+            return CheckReport(findings=_of_base(dataset, system, preparation), inputs=inputs, comparison=None)
+    inputs = CheckInput.of(dataset, system, preparation)
     findings, comparison = _findings(inputs, system)
     if comparison is not None and "torque unit" not in {each.subject for each in findings if each.severity == "wrong"}:
         shown = list(dynamics_findings(inputs, comparison))
@@ -223,13 +236,44 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
     return findings, comparison
 
 
-def _of_base(dataset: Dataset, system: MechanicalSystem) -> tuple[Finding, ...]:
-    """What is seen of a base that moves and of what holds it; torques and filters are not looked at."""
+def _of_base(dataset: Dataset, system: MechanicalSystem, preparation: Preparation | None = None) -> tuple[Finding, ...]:
+    """What is seen of a base that moves, of the joints and of what holds it; torques are not looked at."""
     unmeasured = list(unmeasured_base_findings(dataset, system))
+    of_joints = list(_of_single_joints(dataset, system.robot, preparation))
     of_base = unmeasured or list(base_findings(dataset, system))
     if not unmeasured and worst(of_base) != "wrong":  # forces in wrong axes show nothing
         of_base += carried_findings(dataset, system)
-    return _sorted([*of_base, *gravity_findings(dataset, system), *stance_findings(dataset, system)])
+    flags = stance_findings(dataset, system) if worst(of_joints) != "wrong" else ()  # wrong v contradict any flag
+    return _sorted([*of_base, *of_joints, *gravity_findings(dataset, system), *flags])
+
+
+def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Finding]:
+    """Whether q, v and a of the joints of one degree of freedom belong together; quick where there is no filter."""
+    rows = robot.space.single_rows
+    if not rows or not dataset.time_ordered:
+        return
+    places = [robot.position_names.index(name) for name in robot.single_joint_names]
+    each = {name: unit_of_each(name, dataset.units[name], dataset.nv) for name in ("q", "v", "u", "a")}
+    alone = Dataset(
+        q=dataset.q[:, places], v=dataset.v[:, rows], a=dataset.a[:, rows], u=np.zeros((len(dataset), len(rows))),
+        time=dataset.time, episode=dataset.episode, joint_names=robot.single_joint_names, metadata=dataset.metadata,
+        units={name: tuple(units[row] for row in rows) for name, units in each.items()} | {"time": "s"},
+    )  # fmt: skip
+    with contextlib.suppress(InvalidInput):  # too short
+        inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
+        for finding in motion_findings(inputs):  # gaps may be rows whose feet are not known
+            yield _for_all_columns(finding, rows, {"unit": each["v"], "sign": (1.0,) * dataset.nv})
+
+
+def _for_all_columns(finding: Finding, rows: list[int], columns: Mapping[str, Sequence[Any]]) -> Finding:
+    """The finding with a correction for the joints in these rows as one for all columns, those of the base as now."""
+    correction: dict[str, dict[str, tuple[Any, ...]]] = {}
+    for what, of_signal in finding.correction.items():
+        for signal, own in of_signal.items():
+            whole = dict(enumerate(columns[what])) | dict(zip(rows, own * (len(rows) // len(own)), strict=True))
+            correction[what] = {signal: tuple(whole.values())}
+    remedy = finding.remedy.replace(import_flags(finding.correction) or " ", import_flags(correction) or " ")
+    return replace(finding, remedy=remedy, correction=correction)
 
 
 def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:

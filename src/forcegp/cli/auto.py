@@ -137,7 +137,7 @@ class Auto(Resuming, Import):
         content |= {"cpu_seconds": time.process_time() - begin}
         write_json(self.out / "payload.json", {} if payload is None else payload.to_dict())
         write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
-        identified.system.robot.to_urdf(self.out / "identified.urdf")
+        identified.system.to_urdf(self.out / "identified.urdf")
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
         terminal.show(facts("", dict(answer)), best)
         return content

@@ -133,11 +133,12 @@ def identify_by_regression(command: IdentifyOptions, terminal: Terminal) -> Mapp
         write_json(folder / "identification.json", content)
         if identified is not None:
             (folder / SYSTEM_FILE).write_text(identified.to_json() + "\n", encoding="utf-8")
-            robot = identified.robot
+            written = identified
             if found.weak_directions:  # a URDF has no place for standard errors
                 held = "; ".join(f"{link}: {count:.0f}" for link, count in found.weak_directions)
-                robot = robot.with_note(f"of each body's ten inertial directions the log holds nothing of: {held}")
-            robot.to_urdf(folder / "identified.urdf")
+                note = f"of each body's ten inertial directions the log holds nothing of: {held}"
+                written = identified.with_robot(identified.robot.with_note(note))
+            written.to_urdf(folder / "identified.urdf")
     if why_not is not None:
         terminal.warn(f"{why_not} No identified.urdf was written; --model consistent finds a robot.")
     terminal.show(*tables, *_report_of_regression(command, found, content, identified))
@@ -188,7 +189,7 @@ def _report_of_regression(
     rows = []
     for field in dict.fromkeys(name.partition(".")[0] for name in found.terms.names):
         names = [name for name in found.terms.names if name.startswith(f"{field}.")]
-        rows.append([f"{field.replace('_', ' ')} [{units[names[0]]}]"])
+        rows.append([f"{field.replace('_', ' ')} [{', '.join(dict.fromkeys(units[name] for name in names))}]"])
         for name in names:
             rows.append([f"  {name.partition('.')[2]}", f"{values[name]:.4g}", f"{errors[name]:.2g}"])
     if rows:

@@ -46,7 +46,7 @@ class FitOptions(LearningOptions):
             forcegp.save_posterior(posterior, folder)
             if identification is not None:
                 write_json(folder / "identification.json", identification)
-                posterior.system.robot.to_urdf(folder / "identified.urdf")
+                posterior.system.to_urdf(folder / "identified.urdf")
 
 
 @dataclass(frozen=True, kw_only=True)

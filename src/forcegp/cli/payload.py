@@ -64,12 +64,14 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
             given = {"command": self.words("baseline", "link", "friction", "cutoff", "delay")}
             with self.folder(self.out, {"data": str(self.data), **given}) as folder:
                 write_json(folder / "payload.json", content)
-                found.system.robot.to_urdf(folder / "loaded.urdf")
+                found.system.to_urdf(folder / "loaded.urdf")
                 write_text(folder / SYSTEM_FILE, found.system.to_json() + "\n")
         for note in notes:
             terminal.note(note)
         if not found.fit.settled:
             terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
+        if found.intervals["mass"][0] <= 0.0:
+            terminal.warn("the payload may weigh nothing by this log: centre of mass and inertia mean nothing then.")
         terminal.show(*_tables(found))
         return content
 
@@ -101,5 +103,7 @@ def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
     fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
     rows = [[joint, *(f"{found.joints[f'{field}.{joint}'][0]:.3g}" for field in fields)] for joint in joints]
     header = ["joint", *(field.replace("_", "\n") for field in fields)]
-    tables += [columns("joints, in Nm, rad/s and kg m²", header, rows)] if rows else []
+    slides = any(found.system.robot.joint(joint).type == "prismatic" for joint in joints)
+    units = "Nm or N, rad/s or m/s and kg m² or kg" if slides else "Nm, rad/s and kg m²"
+    tables += [columns(f"joints, in {units}", header, rows)] if rows else []
     return [*tables, f"{found.rows} rows."]

@@ -29,9 +29,10 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     With such bodies only forces count, no torques: a load on an arm changes inertias far more than the mass, which
     looked like a lag (72 ms of none). All columns lose their slow part first, for wind is slow and controllers answer
     it, which made lags up to a third too short. The best T has the least sum of log residuals, by a parabola; its
-    deviation comes from leaving out each eighth of the time (block jackknife, as in `estimate_delay`), and from half a step of time, by which a command that
-    holds until the next row is later than one that does not. Raises InvalidInput without `Thrusters` on a base that
-    moves freely, and DatasetError where the recording is too short, or shows no lag below .3 s.
+    deviation comes from leaving out each eighth of the time (block jackknife, as in `estimate_delay`), and from half a
+    step of time, by which a command that holds until the next row is later than one that does not. Raises InvalidInput
+    without `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag
+    below .3 s.
     """
     found = thruster_columns(dataset.system)
     if dataset.system is None or not found:

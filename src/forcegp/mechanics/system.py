@@ -14,7 +14,14 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
-from forcegp.mechanics.known_forces import KNOWN_FORCES, Actuation, KnownForce, RigidBodyBias, known_force_to_dict
+from forcegp.mechanics.known_forces import (
+    KNOWN_FORCES,
+    Actuation,
+    Armature,
+    KnownForce,
+    RigidBodyBias,
+    known_force_to_dict,
+)
 from forcegp.mechanics.loops import SECOND, LoopClosure, loop_frame, loop_point
 from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
 from forcegp.mechanics.thrusters import FADES, OBSERVED, ObservedWrench, Thrusters
@@ -94,7 +101,7 @@ class MechanicalSystem(Summary):
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
         enter as known forces only where listed. By default u are joint forces; where motors act at sites of a free
-        body, such as rotors, u are the inputs of all motors.
+        body, such as rotors, or turn a ball joint, u are the inputs of all motors.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
         contacts = [
@@ -108,9 +115,10 @@ class MechanicalSystem(Summary):
         ]
         if known_forces is None:
             known_forces = (Actuation(), RigidBodyBias())
-            if found.thrusters and robot.base != "fixed":
-                moving = set(robot.joint_names)  # without those that are locked
-                names, columns = zip(*(x for x in found.thrusters if moving & set(x[1])), strict=True)
+            moving = set(robot.joint_names)  # without those that are locked
+            motors = [x for x in found.thrusters if moving & set(x[1])]
+            if any(moving & set(column) - set(robot.single_joint_names) for _, column in motors):
+                names, columns = zip(*motors, strict=True)
                 matrix = [[column.get(joint, 0.0) for column in columns] for joint in robot.joint_names]
                 known_forces = (Actuation(matrix, names), RigidBodyBias())
         return cls(robot, tuple(contacts), known_forces, baumgarte)
@@ -122,7 +130,16 @@ class MechanicalSystem(Summary):
             key = (loop.frame, loop.second_frame), (loop.point, loop.second_point)
             ends[key] = ends.get(key, False) or loop.turning
         named = enumerate(ends.items(), 1)
-        return self.robot.to_mjcf(path, [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named])
+        loops = [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in named]
+        return self._with_rotors().to_mjcf(path, loops)
+
+    def to_urdf(self, path: str | Path | None = None) -> str:
+        """`Robot.to_urdf` with the rotor inertias of each `Armature` that is listed; other forces are left out."""
+        return self._with_rotors().to_urdf(path)
+
+    def _with_rotors(self) -> Robot:
+        listed = [torch.as_tensor(force.inertia) for force in self.known_forces if isinstance(force, Armature)]
+        return self.robot.with_armature((self.robot.armature + sum(listed)).tolist()) if listed else self.robot
 
     @classmethod
     @usable_arguments("MechanicalSystem.from_file")

@@ -38,7 +38,7 @@ class Translation:
     locked: dict[str, float]
     loops: tuple[LoopDescription, ...] = ()
     thrusters: tuple[tuple[str, dict[str, float]], ...] = ()
-    """The motors, if some of them act on a free body: name, and joint forces per unit of input by joint name."""
+    """The motors, if some act on a free body or a ball joint: name, and joint forces per unit of input by joint."""
 
 
 class CompiledModel:
@@ -192,12 +192,12 @@ class CompiledModel:
         return not any(kinds)
 
     def _thrusters(self) -> tuple[tuple[str, dict[str, float]], ...]:
-        """Motors whose joint forces no posture changes, where some act at sites of a free body; else none.
+        """Motors whose joint forces no posture changes, where some act at sites of a free body or turn a ball joint.
 
         Of an actuator with a law of its own, such as a servo, the input is the force on its joint, under the joint's
         name. What drives no single joint, such as a tendon, is left out.
         """
-        model, found, taken, at_sites = self.model, [], set[str](), False
+        model, found, taken, needed = self.model, [], set[str](), False
         for k in range(model.nu):
             gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])
             name, motor = model.actuator(k).name or f"actuator_{k + 1}", self._is_motor(k)
@@ -220,13 +220,21 @@ class CompiledModel:
                 force = pose[:3, :3] @ gear[:3]
                 wrench = [*force, *(pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force))]
                 names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
-                column, at_sites = dict(zip(names, (gain * float(x) for x in wrench), strict=True)), True
+                column, needed = dict(zip(names, (gain * float(x) for x in wrench), strict=True)), True
+            elif motor and joints and self._turns_ball(k):  # about axes of the body, as its velocity
+                names = [f"{self.joints[joints[0]]}.{each}" for each in MOTIONS["spherical"].velocities]
+                column, needed = dict(zip(names, (gain * float(x) for x in gear[:3]), strict=True)), True
             elif joints or at_site:
                 return ()
             else:
                 continue
             found.append((self._named(name, taken), column))
-        return tuple(found) if at_sites else ()
+        return tuple(found) if needed else ()
+
+    def _turns_ball(self, k: int) -> bool:
+        model = self.model
+        by_joint = model.actuator_trntype[k] == int(self.mujoco.mjtTrn.mjTRN_JOINT)
+        return bool(by_joint and model.jnt_type[model.actuator_trnid[k][0]] == 1)
 
     def _couple(self) -> None:
         """Linear couplings of two joints, and joints that one holds."""
@@ -337,7 +345,8 @@ class CompiledModel:
             if not self._is_motor(k):
                 self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
             elif not (thrusters and model.actuator_trntype[k] == site) and not any(
-                k in self._actuators_of(joint) for joint in range(model.njnt)
+                k in self._actuators_of(joint) and (model.jnt_type[joint] >= 2 or (thrusters and self._turns_ball(k)))
+                for joint in range(model.njnt)
             ):
                 self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")
         if model.nflex:

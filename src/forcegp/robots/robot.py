@@ -326,7 +326,8 @@ class Robot(RobotStructure):
         RobotFileWarning says so.
         """
         armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True))
-        text = with_comment(self.urdf_text, armature, source=str(path or self.source), stacklevel=3)
+        source = self.source if path is None else Path(path).name
+        text = with_comment(self.urdf_text, armature, source=source, stacklevel=3)
         if path is not None:
             write_robot_file(Path(path), text, armature)
         return text
