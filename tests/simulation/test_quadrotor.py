@@ -163,22 +163,22 @@ def test_predicted_motions_keep_the_wind_of_their_start(posterior, test):
     assert after < 0.3 * np.linalg.norm(blind.q[-1, :3].numpy() - seen.q[300 + len(first.q) - 1, :3])
 
 
-def test_motions_fade_to_what_lasts(posterior, test):
-    """In all twelve columns; of a given time there are six, which are held as they are."""
-    seeing, seen = observing(posterior, acting(test))
-    usual, held = observing(posterior, acting(test), seconds=0.02)
-    assert [len(each.system.inputs) for each in (seen, held)] == [19, 13]
+def test_motions_fade_to_what_lasts_where_no_wind_is_observed(posterior, test):
+    """In twelve columns; beside an observed wind, and with a time that is given, there are six, which are held."""
+    still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
+    seeing, seen = observing(still, acting(test))
+    usual, held = observing(still, acting(test), seconds=0.02)
+    assert [len(each.system.inputs) for each in (seen, held)] == [16, 10]
+    assert len(observing(posterior, acting(test))[1].system.inputs) == 13
     u = torch.tensor(seen.u[300:330])
     moved = seeing.rollout(seen.q[300], seen.v[300], u, 1 / 240).q
     other = u.clone()
-    other[0, 13:] = other[0, 7:13]  # what lasts is all
-    assert float((seeing.rollout(seen.q[300], seen.v[300], other, 1 / 240).q - moved).abs().max()) > 1e-6
-    row = 300 + len(held) - len(seen)
-    start = torch.tensor(held.u[row : row + 30])
-    start[:, 4:7] = other[0, 4:7]  # the same wind
-    start[:, 7:13] = other[0, 7:13]
-    expected = usual.rollout(held.q[row], held.v[row], start, 1 / 240).q
-    torch.testing.assert_close(seeing.rollout(seen.q[300], seen.v[300], other, 1 / 240).q, expected)
+    other[0, 10:] = other[0, 4:10]  # all of it lasts
+    stays = seeing.rollout(seen.q[300], seen.v[300], other, 1 / 240).q
+    assert float((stays - moved).abs().max()) > 1e-6
+    start = other[:, :10].clone()
+    expected = usual.rollout(seen.q[300], seen.v[300], start, 1 / 240).q
+    torch.testing.assert_close(stays, expected)
 
 
 def test_what_lasts_is_foreseen_from_the_past():

@@ -32,7 +32,7 @@ def observing(
     frame: str | None = None,
     whole: bool = False,
 ) -> tuple[AnyPosterior, Dataset]:
-    """The posterior and the recording with an `ObservedWrench` on link `frame`, in twelve more columns of u.
+    """The posterior and the recording with an `ObservedWrench` on link `frame`, in six or twelve more columns of u.
 
     Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
     that the rows before show (`AirLaw.wind_before`).
@@ -42,9 +42,9 @@ def observing(
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
     what follows, and rows with a past shorter than that time are left out unless `whole`. By default the prior's
     `AerodynamicForce` gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s
-    which missed least in the second before, and six more columns hold what will last of it: predicted motions fade to
-    that. With a time that is given, there are six columns, and motions hold them. Without such a prior, or where its
-    time is 0, both come back as they are.
+    which missed least in the second before; and where no wind is observed, six more columns hold what will last of it,
+    to which predicted motions fade. Otherwise they hold it: what is left of gusts beside an observed wind stays longer.
+    Without such a prior, or where its time is 0, both come back as they are.
 
     Calibrated intervals of motions go along where neither `seconds` nor `frame` is given.
 
@@ -67,9 +67,9 @@ def observing(
     posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
     wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
-    observed = _observed(wrench, dataset, times)
-    names = NAMES if len(times) == 1 else NAMES + LASTING
-    system = _with_wrench(posterior.system, frame, names)
+    held = len(times) == 1 or _observes(posterior.system)
+    observed = _observed(wrench, dataset, times, held)
+    system = _with_wrench(posterior.system, frame, NAMES if held else NAMES + LASTING)
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), system=system, truth=truth)
     posterior = posterior.with_system(system)
@@ -209,19 +209,19 @@ def _unexplained(
 
 
 def _observed(
-    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float]
+    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float], held: bool
 ) -> Float[np.ndarray, "rows columns"]:
-    """The wrench that the rows before each show, none at the first of an episode, and of several times what lasts.
+    """The wrench that the rows before each show, none at the first of an episode, and what lasts unless it is held.
 
     Of several times each component takes the one whose observer missed least in the rows before.
     """
-    observed = np.zeros((len(wrench), 6 if len(times) == 1 else 12))
+    observed = np.zeros((len(wrench), 6 if held else 12))
     for number, rows, _ in episodes_in_order(dataset):
         own = np.flatnonzero(dataset.episode == number)
         means = np.stack([_past_mean(wrench[own], rows.time, time) for time in times])  # (times, rows, 6)
         missed = np.stack([_past_mean(np.square(wrench[own] - mean), rows.time, MEMORY) for mean in means])
         now = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
-        observed[own] = now if len(times) == 1 else np.hstack([now, _lasting(wrench[own], now, rows.time)])
+        observed[own] = now if held else np.hstack([now, _lasting(wrench[own], now, rows.time)])
     return observed
 
 
