@@ -9,6 +9,9 @@ position after .5 s, in m. Accelerations are differences of the logged velocity 
 rows), so their differences are not used. Models have the observers of `benchmarks.quadrotor`.
 
     python -m benchmarks.real_drone FLIGHT.csv FLIGHT.csv [FLIGHT.csv ...] [--rows 200] [--mass 2.6]
+
+FLIGHT.csv@FIRST takes 200 rows from that one on. The table in docs/how-to/moving-bases.md is from baseline_nowind@459,
+baseline_35wind@459, baseline_70wind@460 and custom_figure8_baseline_100wind@0, with numbers of six digits.
 """
 
 import argparse
@@ -28,6 +31,7 @@ from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters
 from forcegp.models import IndependentGP, Posterior, observing
 
 GRAVITY, HORIZON, STRIDE, BEGUN = 9.81, 25, 5, 10  # m/s^2, rows: of .5 s, between starts, of the observer's begin
+STRETCH = 200  # rows
 
 
 def system_of(mass: float) -> MechanicalSystem:
@@ -38,9 +42,12 @@ def system_of(mass: float) -> MechanicalSystem:
     return MechanicalSystem(robot, (), (Actuation(), push, RigidBodyBias()))
 
 
-def flight(path: Path, system: MechanicalSystem, cutoff: float) -> Dataset:
-    with path.open() as file:
+def flight(given: str, system: MechanicalSystem, cutoff: float) -> Dataset:
+    path, at, first = given.partition("@")
+    with Path(path).open() as file:
         lines = list(csv.DictReader(file))
+    if at:
+        lines = lines[int(first) : int(first) + STRETCH]
 
     def column(name: str) -> np.ndarray:
         return np.array([json.loads(line[name]) for line in lines], dtype=float).reshape(len(lines), -1)
@@ -92,7 +99,7 @@ def compared(system: MechanicalSystem, train: Dataset, test: Dataset, points: in
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("flights", type=Path, nargs="+")
+    parser.add_argument("flights", nargs="+")
     parser.add_argument("--rows", type=int, default=200, help="points of force prior and independent GP")
     parser.add_argument("--mass", type=float, default=2.6, help="of the drone in kg; forces scale with it")
     parser.add_argument("--cutoff", type=float, default=6.0, help="of the filter in Hz")
@@ -106,7 +113,7 @@ def main() -> None:
         found = compared(system, train, test, options.rows)
         results.append(found)
         for name, (share, away) in found.items():
-            print(f"{options.flights[k].stem:32} {name:30} {share:.3f} {away:.3f} m", flush=True)
+            print(f"{Path(options.flights[k]).stem:32} {name:30} {share:.3f} {away:.3f} m", flush=True)
     for name in list(results[0])[1:]:
         ours, other = (np.square([found[each] for found in results]).mean(0) for each in ("force prior", name))
         print(f"force prior over {name}: accelerations, position: {np.sqrt(ours / other).round(3)}")

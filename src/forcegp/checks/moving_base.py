@@ -120,7 +120,7 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
 def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
     """A base that floats and does not fall, although no foot, thruster or known force of the system carries it."""
     robot, groups = system.robot, system.robot.layout.groups
-    weight = float(torch.linalg.vector_norm(robot.gravity)) * sum(robot.link(name).mass for name in robot.layout.moving)
+    weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
     if not groups or groups[0].kind != "floating" or not weight:
         return
     complete, feet = dataset.u.shape[1] == len(system.inputs), {contact.switch for contact in system.touching}

@@ -11,7 +11,6 @@ clearly move show what friction, loads and noise make of zero; feet at rest show
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -37,8 +36,8 @@ FALLS, SURE = 0.2, 0.1
 to which its absence decides."""
 TILTS = 0.05
 """rad by which a foot held flat leans away from the median of its stretch of stance."""
-NEAR, OFTEN = 0.5, 0.1
-"""m/s^2 about free fall; share of the rows in which a robot falls so."""
+EARTH, NEAR, OFTEN = 9.81, 0.5, 0.1
+"""m/s^2: of free fall, and about it; share of the rows in which a robot falls so."""
 FEW = 10
 MANY_OPEN = 0.25
 """Share of open rows that more than changes of stance leave."""
@@ -196,9 +195,8 @@ def tilting(
             continue
         k = names.index(switch)
         pose = system.robot.kinematics(torch.tensor(dataset.q, device=g.device)).frame_pose(frame)
-        down = (
-            (pose[..., :3, :3].mT @ (g / g.norm())).cpu().numpy()
-        )  # turns about it are drift of an estimator, perhaps
+        # turns about gravity may be drift of an estimator
+        down = (pose[..., :3, :3].mT @ (g / g.norm())).cpu().numpy()
         order = np.lexsort((dataset.time, dataset.episode))
         number, stands = dataset.episode[order], flags[order, k] == 1.0
         ends = np.flatnonzero((np.diff(number) != 0) | (np.diff(stands) != 0)) + 1
@@ -215,20 +213,19 @@ def missing_gravity(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     if robot.base != "planar" or robot.gravity[:2].any():
         return None
     q, v, a = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.a))
-    force = robot.kinematics(q, v).inverse_dynamics(a)[:, :2].cpu().numpy() / _mass(robot)  # in the axes of the base
+    force = robot.kinematics(q, v).inverse_dynamics(a)[:, :2].cpu().numpy() / robot.mass  # in the axes of the base
     c, s = dataset.q[:, 2], dataset.q[:, 3]
     motion = np.stack([c * force[:, 0] - s * force[:, 1], s * force[:, 0] + c * force[:, 1]], 1)
-    usual = 9.81
-    near = abs(np.linalg.norm(motion, axis=1) - usual) < NEAR
+    near = abs(np.linalg.norm(motion, axis=1) - EARTH) < NEAR
     if not near.any():
         return None
     fall = np.median(motion[near], axis=0)
     often, size = (np.linalg.norm(motion - fall, axis=1) < NEAR).mean(), np.linalg.norm(fall)
-    if often < OFTEN or abs(size - usual) > NEAR:
+    if often < OFTEN or abs(size - EARTH) > NEAR:
         return None
     direction = fall / size
     direction = np.where(abs(direction) < TILTS, 0.0, direction)
-    x, y = usual * direction / np.linalg.norm(direction)
+    x, y = EARTH * direction / np.linalg.norm(direction)
     return (
         f"in {often:.0%} of the rows the robot falls at ({fall[0]:.3g}, {fall[1]:.3g}) m/s^2 in its plane, in which it "
         "has no gravity",
@@ -237,17 +234,13 @@ def missing_gravity(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     )
 
 
-def _mass(robot: Any) -> float:
-    return sum(robot.link(name).mass for name in robot.link_names)
-
-
 def _weight(system: forcegp.mechanics.MechanicalSystem) -> float:
     """What contacts with a switch must bear [N]; 0 where something else may hold the robot up."""
     robot, alone = system.robot, all(contact.switch for contact in system.contacts)
     gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
     if gravity is None or not alone:
         return 0.0
-    return float(gravity.norm()) * _mass(robot)
+    return float(gravity.norm()) * robot.mass
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:

@@ -188,6 +188,11 @@ class RobotStructure(Summary):
         """Device that inputs must be on."""
         return self.tree.rest.device
 
+    @property
+    def mass(self) -> float:
+        """Of all links, in kg."""
+        return sum(self.link(name).mass for name in self.link_names)
+
     def link(self, name: str) -> Link:
         """One link by name."""
         require_known("link", name, self.name, self.layout.links, UnknownLink)

@@ -107,7 +107,7 @@ def _episode(
         Q_U[:, 6:] = -dry * torch.tanh(w / SMOOTH) - VISCOUS * w
     needed = robot.inverse_dynamics(q, v, a) - Q_U
     A = (J * stands[..., None, None]).flatten(1, 2)
-    weight = -float(robot.gravity[2]) * sum(robot.link(name).mass for name in robot.link_names)
+    weight = -float(robot.gravity[2]) * robot.mass
     even = torch.zeros(steps, len(LEGS), 3, dtype=torch.float64)
     even[..., 2] = weight * stands / stands.sum(-1, keepdim=True)
     even = even.flatten(1)
