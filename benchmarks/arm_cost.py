@@ -2,17 +2,23 @@
 
     git worktree add /tmp/before COMMIT
     python benchmarks/arm_cost.py /tmp/before .
+    python benchmarks/arm_cost.py /tmp/before . --count
 
 The commit before bases could move is f1fc32b^. Each version runs in a process of its own, and the two take turns in
 short slices, so that both see the same load of the machine. Processes differ by some percent for no reason of the code,
 such as the layout of memory: so there are several pairs of them. Printed are the median ratio of successive slices (its
 median and range over the pairs) and the ratio of the least times (its median). The same tree given twice shows what
 noise remains. It uses only what both versions have.
+
+`--count` prints what no load changes: operations of torch, entries of the tensors that they return, calls of Python.
+Compiled programs have few of either.
 """
 
 import argparse
+import cProfile
 import json
 import os
+import pstats
 import subprocess
 import sys
 import time
@@ -60,7 +66,29 @@ def prepared() -> tuple[dict[str, Callable[[], object]], list[float]]:
     return jobs, [posterior.result.evaluations, posterior.result.value]
 
 
-def work() -> None:
+def counted(job: Callable[[], object]) -> tuple[int, int, int]:
+    """Operations of torch, entries of their results, and calls of Python in one run of that job."""
+    import torch
+    from torch.utils._python_dispatch import TorchDispatchMode
+    from torch.utils._pytree import tree_leaves
+
+    class Operations(TorchDispatchMode):
+        number = entries = 0
+
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            result = func(*args, **(kwargs or {}))
+            self.number += 1
+            self.entries += sum(x.numel() for x in tree_leaves(result) if isinstance(x, torch.Tensor))
+            return result
+
+    with Operations() as operations:
+        job()
+    with cProfile.Profile() as profile:
+        job()
+    return operations.number, operations.entries, pstats.Stats(profile).total_calls  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def work(count: bool) -> None:
     """Run the jobs whose names come in, and print the CPU seconds of each."""
     warnings.simplefilter("ignore")
     jobs, found = prepared()
@@ -68,6 +96,9 @@ def work() -> None:
         job()
     print(json.dumps([list(jobs), found]), flush=True)
     for name in sys.stdin:
+        if count:
+            print(json.dumps(counted(jobs[name.strip()])), flush=True)
+            continue
         begun = time.process_time()
         jobs[name.strip()]()
         print(time.process_time() - begun, flush=True)
@@ -76,13 +107,13 @@ def work() -> None:
 class Worker:
     """A process of the version in `tree`, which waits for names of jobs."""
 
-    def __init__(self, tree: str) -> None:
+    def __init__(self, tree: str, *options: str) -> None:
         environment = os.environ | {"PYTHONPATH": str(Path(tree).resolve() / "src"), "OMP_NUM_THREADS": "1"}
-        call, pipe = [sys.executable, __file__, "--work"], subprocess.PIPE
+        call, pipe = [sys.executable, __file__, "--work", *options], subprocess.PIPE
         self.process = subprocess.Popen(call, env=environment, text=True, stdin=pipe, stdout=pipe)
 
     def answer(self, name: str | None = None) -> Any:
-        """CPU seconds of that job; without a name what the process prints once it is prepared."""
+        """CPU seconds or counts of that job; without a name what the process prints once it is prepared."""
         assert self.process.stdin is not None, "a pipe"
         assert self.process.stdout is not None, "a pipe"
         if name is not None:
@@ -112,15 +143,31 @@ def main(trees: list[str], pairs: int, turns: int) -> None:
         print(f"{name:30} median {middle:.3f} ({low:.3f} to {high:.3f}), least times {least:.3f}")
 
 
+def compare_counts(trees: list[str]) -> None:
+    """Print what each version counts, and the ratio, the second over the first."""
+    workers = [Worker(tree, "--count") for tree in trees]
+    (names, _), _ = (worker.answer() for worker in workers)
+    print(f"{'':30} {'operations of torch':>28} {'entries of results':>32} {'calls of Python':>28}")
+    for name in names:
+        pairs = zip(*(worker.answer(name) for worker in workers), strict=True)
+        columns = zip(pairs, (9, 11, 9), strict=True)
+        print(f"{name:30} " + " ".join(f"{a:{w}d} {b:{w}d} {b / a if a else 1:7.4f}" for (a, b), w in columns))
+    for worker in workers:
+        worker.process.communicate()
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("trees", nargs="*", help="two checkouts: the ratio is the second over the first")
     parser.add_argument("--pairs", type=int, default=5, help="pairs of processes (default: %(default)s)")
     parser.add_argument("--turns", type=int, default=10, help="slices of each job and process (default: %(default)s)")
+    parser.add_argument("--count", action="store_true", help="count operations and calls instead of seconds")
     parser.add_argument("--work", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.work:
-        work()
+        work(given.count)
+    elif len(given.trees) == 2 and given.count:
+        compare_counts(given.trees)
     elif len(given.trees) == 2:
         main(given.trees, given.pairs, given.turns)
     else:
