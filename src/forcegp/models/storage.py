@@ -85,8 +85,8 @@ KINDS = {
 RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
 """What is stored of a search."""
 FORMAT_VERSION = 7
-WITH_DIGESTS = 7
-"""The first format whose files have digests."""
+BEFORE_DIGESTS = 6
+"""The oldest format that is read, of version 0.2: its files have no digests."""
 FEATURES = {
     "target": "it was carried to another system, for which it predicts",
     "reference": "its rows are standardised by others than those that it is conditioned on",
@@ -96,8 +96,6 @@ FEATURES = {
 """What a stored model may hold beyond rows and parameters: a program that ignored one of these would predict wrongly,
 so each is declared in `model.json`, and a program refuses those that it cannot read.
 """
-FEATURES_BEFORE = {1: set(), 2: {"target"}, 3: {"reference"}, 4: {"windows"}, 5: {"measured-torque"}}
-"""Formats 1 to 5 declared one feature by their number; other features could be there as well."""
 STATES = ("q", "v", "u", "a")
 NOISE, WEIGHTS = "noise_std", "weights"
 SOLUTION = "latent.solution"
@@ -181,7 +179,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     document = _document(path)
     declared = _declared(path / "model.json", document)
     # whatever the version says: a flipped bit could make it one of those that had no digests
-    if not require_unchanged(path, "fit the model again") and document["format_version"] >= WITH_DIGESTS:
+    if not require_unchanged(path, "fit the model again") and document["format_version"] > BEFORE_DIGESTS:
         raise FileFormatError(f"{path} is incomplete: it has no {SUMS}; fit the model again")
     try:
         urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
@@ -194,11 +192,8 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
         settings = dict(document["settings"])
-        if settings.get("noise_from_data"):  # where formats 1 to 5 kept it
-            document["model"]["noise"]["from_data"] = True
         model = KINDS[document["kind"]].from_dict(system, document["model"])
-        stored_engine = document.get("engine", settings.get("engine"))  # formats 1 to 5 kept it among the settings
-        engine = None if stored_engine is None else engine_from_dict(stored_engine)
+        engine = None if document["engine"] is None else engine_from_dict(document["engine"])
         target = None
         if moved_to is not None:
             target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
@@ -244,7 +239,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         except ForceGPError as error:
             raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
     held = set(_features(posterior))
-    if not declared <= held or ("features" in document and declared != held):
+    if declared != held:
         raise FileFormatError(
             f"{path} is damaged: it declares {_listed(declared)} and holds {_listed(held)}; fit the model again"
         )
@@ -264,8 +259,6 @@ def _features(posterior: Posterior) -> list[str]:
 
 def _declared(file: Path, document: Mapping[str, Any]) -> set[str]:
     """The features that `model.json` declares. Raises FileFormatError for those that this version cannot read."""
-    if document["format_version"] in FEATURES_BEFORE:
-        return FEATURES_BEFORE[document["format_version"]]
     features = document.get("features")
     if not isinstance(features, list) or not all(isinstance(name, str) for name in features):
         raise FileFormatError(f"{file} is damaged: its features are {features!r}, not a list of names")
@@ -332,10 +325,10 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in [*KINDS]:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in range(1, FORMAT_VERSION + 1):
+    if version not in (BEFORE_DIGESTS, FORMAT_VERSION):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads 1 to {FORMAT_VERSION}; use "
-            f"the version that wrote it ({document.get('forcegp_version')}) or fit again"
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {BEFORE_DIGESTS} and "
+            f"{FORMAT_VERSION}; use the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document
 

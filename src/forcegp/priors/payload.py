@@ -33,8 +33,6 @@ class Payload(ForcePrior):
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
             raise InvalidInput(f"Payload frame is {self.frame!r}; give the name of the link that carries the load.")
-        if isinstance(self.moments, tuple | list):  # as models hold it that were stored before it was checked
-            object.__setattr__(self, "moments", bool(self.moments))
         require_type("moments", self.moments, bool)
 
     @override
