@@ -17,11 +17,12 @@ The last line follows from S~^-1 = U T^-1 U^T + (I - U U^T), so nothing is diffe
 in one buffer of (rN)^2 doubles that becomes its own factor L and L^-1; it is written and read in panels of rows, lower
 triangle only. With V_c = L^-1 C_c, its rows numbered by r,
 
-    dNLL/dk_c = 1/2 (V_c^T V_c - beta_c beta_c^T)       sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] = sum_r L^-1_r(ia) (V_c k_c)_ri
+    dNLL/dk_c = 1/2 (V_c^T V_c - beta_c beta_c^T)
+    sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] = sum_r L^-1_r(ia) (V_c k_c)_ri
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -51,23 +52,13 @@ class Deflation:
         """The largest rank of W_i over the points (r)."""
         return self.C.shape[-2]
 
-    def columns(self, index: int, cross: Float[Tensor, "n N"]) -> Float[Tensor, "Nr n"]:
-        """Covariance of t with one latent at n points, from its kernel function `cross` between these and all rows."""
-        return (cross.mT[:, None, :] * self.C[:, :, index, None]).flatten(0, 1)
+    def through(self, index: int, K: Float[Tensor, "N _"]) -> Float[Tensor, "Nr _"]:
+        """What t is of one latent whose values at the points are columns of K."""
+        return (K[:, None, :] * self.C[:, :, index, None]).flatten(0, 1)
 
-    def drawn_weights(
-        self,
-        prior: Sequence[Float[Tensor, "S N"]],
-        generator: torch.Generator,
-        solve: Callable[[Tensor], Tensor],
-        jitter: float = 0.0,
-    ) -> tuple[Float[Tensor, "S N"], ...]:
-        """Matheron's rule: C^T T^-1 (t - C g_s - eps_s) with eps_s ~ N(0, 1 + jitter) and `solve` for T^-1."""
-        residual = self.t - torch.einsum("jac,csj->sja", self.C, torch.stack(list(prior)))
-        noise = torch.randn(residual.shape, generator=generator, dtype=self.C.dtype, device=self.C.device)
-        residual = residual - math.sqrt(1.0 + jitter) * noise
-        alpha = solve(residual.flatten(1).mT.contiguous()).mT.reshape(residual.shape)
-        return torch.einsum("jac,sja->csj", self.C, alpha).unbind(0)
+    def back(self, index: int, alpha: Float[Tensor, "Nr _"]) -> Float[Tensor, "N _"]:
+        """The transpose of `through`."""
+        return (self.C[:, :, index, None] * alpha.unflatten(0, self.t.shape)).sum(1)
 
 
 def whiten(

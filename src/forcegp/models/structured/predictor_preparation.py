@@ -179,7 +179,7 @@ def _numbers(latent: LatentPosterior, training: TrainingData, physics: Predictor
     found = [training.q, training.v, training.u, *latent.features, *latent.weights]
     found += [*latent.kernels.state_dict().values(), *physics.standardization.shift, *physics.standardization.scale]
     found += (physics.inertials or {}).values()
-    return [*found, latent.data_factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
+    return [*found, latent.system.factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
 
 
 def _compressed(
