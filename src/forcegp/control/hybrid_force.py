@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.control.tracking import CLOSE, ROUNDS, TrackingController
+from forcegp.control.tracking import TrackingController, torques_for
 from forcegp.errors import InvalidInput, require_type
 from forcegp.models.predictor import Predictor
 from forcegp.models.structured.components import require_actuated
@@ -59,14 +59,6 @@ class HybridForce(TrackingController):
         free = a_d + self.feedback(e, e_v)
         towards = torch.linalg.solve(at.M, at.A.mT)  # M^-1 A^T
         a = free + towards @ torch.linalg.lstsq(at.A @ towards, at.b - at.A @ free, driver="gelsd").solution
-        needed, u = at.M @ a - at.A.mT @ self.wanted, self.last
-        for _ in range(ROUNDS):
-            missing = needed - at.Q
-            if float(missing.abs().max()) <= CLOSE * (1.0 + float(needed.abs().max())):
-                return u
-            step, singular = torch.linalg.solve_ex(at.dQ_du, missing)
-            if int(singular) or not bool(step.isfinite().all()):
-                break
-            u = u + step
-            at = self.predictor.joint_forces(q, v_d, u)
-        return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean  # with shorter steps, or its error
+        u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at)
+        # where that finds none with shorter steps, or its error
+        return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean if u is None else u

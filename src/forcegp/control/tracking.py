@@ -13,13 +13,18 @@ from forcegp.control.controller import Controller, OnFailure, per_joint
 from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models.prediction import JointForces
 from forcegp.models.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.compiled import CompiledRobot
 
 Model = MechanicalSystem | Predictor
 ROUNDS = 20  # of Newton's method; one where no force depends on u
-CLOSE = 1e-9  # relative to the acceleration
+CLOSE = 1e-9  # relative to the forces
+NO_TORQUES = (
+    "no torques give the wanted acceleration: it is not finite, friction takes as much as they add, or a joint is not "
+    "actuated; check the reference, the gains and the model's friction."
+)
 
 
 class TrackingController(Controller):
@@ -142,10 +147,14 @@ class ComputedTorque(TrackingController):
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at, factor = v_d if self.forces_at == "desired" else v, 1.0
+        at_v, factor = v_d if self.forces_at == "desired" else v, 1.0
         if self.gain_factor is not None and isinstance(self.model, Predictor):
-            factor = self.gain_factor(self.model(q, at, self.last)[1].diagonal().sqrt())
-        return torques_for(self.model, q, at, a_d + self.feedback(e, e_v, factor), self.last)
+            factor = self.gain_factor(self.model(q, at_v, self.last)[1].diagonal().sqrt())
+        at = joint_forces(self.model, q, at_v, self.last)
+        u = torques_for(self.model, q, at_v, at.M @ (a_d + self.feedback(e, e_v, factor)), self.last, at)
+        if u is None:
+            raise NumericalError(NO_TORQUES)
+        return u
 
 
 def system_of(model: Model) -> MechanicalSystem:
@@ -157,26 +166,30 @@ def system_of(model: Model) -> MechanicalSystem:
     raise InvalidInput(f"model is a {type(model).__name__}; give posterior.predictor() or a MechanicalSystem.")
 
 
-def torques_for(model: Model, q: Tensor, v: Tensor, a: Tensor, start: Tensor) -> Float[Tensor, " nv"]:
-    """The u (nv,) whose acceleration at q, v (nv,) is a, by Newton's method from `start`: friction may depend on u.
+def joint_forces(model: Model, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
+    """Known and learned forces at a state (nv,) or states (n, nv) and what they act on."""
+    if isinstance(model, Predictor):
+        return model.joint_forces(q, v, u)
+    at = model.dynamics(q, v, u)
+    return JointForces(at.Q_K, torch.eye(u.shape[-1], dtype=u.dtype), at.M, at.A, at.b)
 
-    Raises NumericalError where there is none.
+
+def torques_for(
+    model: Model, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
+) -> Float[Tensor, " nv"] | None:
+    """The u (nv,) under which known and learned forces at q, v are those `needed`, by Newton's method; None if none is.
+
+    It begins at u, where they are `at`: friction may depend on u. Raises NumericalError for forces that are not finite.
     """
-    u = start
-    for _ in range(ROUNDS if bool(a.isfinite().all()) else 0):
-        if isinstance(model, Predictor):
-            found = model.linearize(q, v, u)
-            missing, response = a - found.a, found.da_du
-        else:
-            offset, response = model.dynamics(q, v, u).acceleration_map()
-            missing = a - offset
-        if float(missing.abs().max()) <= CLOSE * (1.0 + float(a.abs().max())):
+    if not bool(needed.isfinite().all()):
+        raise NumericalError(NO_TORQUES)
+    for _ in range(ROUNDS):
+        missing = needed - at.Q
+        if float(missing.abs().max()) <= CLOSE * (1.0 + float(needed.abs().max())):
             return u
-        try:
-            u = u + torch.linalg.solve(response, missing)
-        except torch.linalg.LinAlgError:
-            break
-    raise NumericalError(
-        "no torques give the wanted acceleration: it is not finite, friction takes as much as they add, or a joint is "
-        "not actuated; check the reference, the gains and the model's friction."
-    )
+        step, singular = torch.linalg.solve_ex(at.dQ_du, missing)
+        if int(singular) or not bool(step.isfinite().all()):
+            return None
+        u = u + step
+        at = joint_forces(model, q, v, u)
+    return None
