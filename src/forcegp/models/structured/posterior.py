@@ -38,7 +38,7 @@ from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
-from forcegp.models.structured.components import Components, Curve, Latents, components_of, term_slices
+from forcegp.models.structured.components import Components, Curve, components_of, term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
@@ -143,19 +143,19 @@ class StructuredPosterior(Posterior):
             return affine, None
         return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
-    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
-        """All processes at a batch of states."""
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:
+        """All processes at a batch of states: mean (..., C), and their joint covariance (..., C, C) where asked for."""
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.model.prior.features(dynamics))
         features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
         latents = len(features)
         if not latents:
             nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
-            return Latents(nothing.flatten(-2), nothing if covariance else None)
-        mean = self.latent.mean(features).reshape(*batch, latents)
-        if not covariance:
-            return Latents(mean, None)
-        return Latents(mean, self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents))
+            return Gaussian(nothing.flatten(-2), nothing if covariance else None)
+        mean, spread = self.latent.mean(features).reshape(*batch, latents), None
+        if covariance:
+            spread = self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents)
+        return Gaussian(mean, spread)
 
     @property
     def widening(self) -> float:
