@@ -100,6 +100,22 @@ class IndependentLikelihood:
         return torch.cat([states[name] for name in self.inputs], dim=-1)
 
 
+@dataclass(frozen=True, eq=False)
+class JointLikelihood:
+    """That of one joint, as a search calls it."""
+
+    whole: IndependentLikelihood
+    joint: int
+
+    @property
+    def training(self) -> TrainingData:
+        """Of all joints."""
+        return self.whole.training
+
+    def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Tensor:
+        return self.whole(self.joint, kernels, parameters)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class IndependentPosterior(Posterior):
     """An `IndependentGP` conditioned on training data; made by `IndependentGP.fit` or `load_posterior`.
