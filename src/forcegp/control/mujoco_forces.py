@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from forcegp.codegen.c_text import filled
+from forcegp.codegen.c_text import c_text, filled
 from forcegp.codegen.library import Purpose, aligned, default_folder, load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.models.predictor import Predictor
@@ -21,30 +21,6 @@ from forcegp.robots.arguments import whole_number
 from forcegp.summary import Summary
 
 mujoco: Any = untyped
-CALLBACK = """
-#include <mujoco/mujoco.h>
-static const double *const *tables;
-static int failed;
-void passive(const mjModel *m, mjData *d) {
-  enum {N = @JOINTS@};
-  static const int position[N] = {@POSITIONS@}, velocity[N] = {@VELOCITIES@};
-  double x[3 * N], y[N];
-  (void)m;
-  for (int j = 0; j < N; j++) {
-    x[j] = d->qpos[position[j]]; x[N + j] = d->qvel[velocity[j]]; x[2 * N + j] = 0.0;
-  }
-  program(tables, 1, x, y);
-  for (int j = 0; j < N; j++) {
-    if (!(y[j] - y[j] == 0.0)) failed = 1;
-    d->qfrc_passive[velocity[j]] += y[j];
-  }
-}
-int evaluate(const double *const *t) { /* take these tables, and report whether a force was not finite until now */
-  const int before = failed;
-  tables = t; failed = 0;
-  return before;
-}
-"""
 PURPOSE = Purpose("a passive force for MuJoCo", "the environment variable XDG_CACHE_HOME", "use predictor.rollouts")
 STATES = 5  # random ones, at which robots are compared
 ALIKE = 1e-6  # relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF
@@ -92,7 +68,7 @@ class MujocoForces(Summary):
             raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
         words = {"JOINTS": code.nv, "POSITIONS": positions, "VELOCITIES": velocities}
-        source = codes[0].c_source("passive", 1, filled(CALLBACK, words))
+        source = codes[0].c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
         include = f"-I{Path(mujoco.__file__).parent / 'include'}"
         key = json.dumps([source, mujoco.mj_versionString()])
         self._library = load_library("mujoco", key, lambda _: source, default_folder(), PURPOSE, (include,))[0]

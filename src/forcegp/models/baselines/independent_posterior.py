@@ -112,7 +112,8 @@ class JointLikelihood:
         """Of all joints."""
         return self.whole.training
 
-    def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Tensor:
+    def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """In nats."""
         return self.whole(self.joint, kernels, parameters)
 
 
