@@ -50,6 +50,10 @@ class Gaussian(Summary):
             covariance = 0.5 * (covariance + covariance.mT)
         return Gaussian(mean if offset is None else offset + mean, covariance)
 
+    def entries(self, which: slice) -> "Gaussian":
+        """The distribution of some entries."""
+        return Gaussian(self.mean[..., which], None if self.covariance is None else self.covariance[..., which, which])
+
     def __getitem__(self: AnyGaussian, index: Any) -> AnyGaussian:
         """The same for some of the states: `prediction[i]`, `prediction[:10]`, `prediction[mask]`.
 

@@ -26,7 +26,7 @@ from forcegp.models.search import FitProgress
 from forcegp.models.structured.components import Components, Curve
 from forcegp.models.training_data import TrainingData
 from forcegp.robots import Robot
-from forcegp.robots.arguments import real_tensor, require_finite
+from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, rounded
 
 ROWS_PER_BLOCK = 4096
@@ -47,6 +47,8 @@ class Posterior(MotionModel, Summary, ABC):
     """
 
     model: Any  # the Model, of which every subclass names its own
+    training: TrainingData
+    """The rows that the model was trained on."""
     parameters: Mapping[str, Tensor]
     settings: Mapping[str, Any]
     result: OptimizationResult
@@ -59,11 +61,6 @@ class Posterior(MotionModel, Summary, ABC):
     def system(self) -> MechanicalSystem:
         """The robot, contacts and known forces."""
         return self.model.system
-
-    @property
-    @abstractmethod
-    def training(self) -> TrainingData:
-        """The rows that the model was trained on."""
 
     @property
     @abstractmethod
@@ -186,13 +183,7 @@ class Posterior(MotionModel, Summary, ABC):
         device = self.system.robot.device
         named = zip("qvu", (q, v, u), sizes, strict=True)
         given = [_tensor(name, values, size, device) for name, values, size in named]
-        try:
-            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given))
-        except RuntimeError:
-            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", given, strict=True))
-            raise InvalidInput(
-                f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state."
-            ) from None
+        batch = broadcast_batch(dict(zip("qvu", (x.shape[:-1] for x in given), strict=True)))
         return [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]) for x in given], batch
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:

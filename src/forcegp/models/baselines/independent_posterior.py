@@ -136,7 +136,7 @@ class IndependentPosterior(Posterior):
 
     @property
     @override
-    def training(self) -> TrainingData:
+    def training(self) -> TrainingData:  # type: ignore[override]  # a field there, read only
         return self.likelihood.training
 
     @property

@@ -77,8 +77,7 @@ def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Gau
     B = prior.mixing(dynamics)
     parts = {}
     for name, term, which in term_slices(prior, robot):
-        covariance = None if latents.covariance is None else latents.covariance[..., which, which]
-        own, mixing = Gaussian(latents.mean[..., which], covariance), B[..., which]
+        own, mixing = latents.entries(which), B[..., which]
         point = term.point_force(dynamics)
         parts[name] = ForceComponent(
             name,
