@@ -21,7 +21,7 @@ from forcegp.inference import (
     leave_blocks_out,
     negative_log_likelihood,
 )
-from forcegp.inference.pathwise import StackedFunctions, draw_functions
+from forcegp.inference.pathwise import draw_functions, mean_function
 from forcegp.mechanics import Baumgarte
 from forcegp.models.prediction import Inputs, Positions, Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
@@ -161,8 +161,7 @@ class IndependentPosterior(Posterior):
             each = zip(self.latents, seeds, strict=True)
             return through([draw_functions(latent, samples, int(own)) for latent, own in each])
 
-        stacked = StackedFunctions.mean_of
-        return AccelerationModel(base.system, None, lambda: through([*map(stacked, self.latents)]), sampled)
+        return AccelerationModel(base.system, None, lambda: through([*map(mean_function, self.latents)]), sampled)
 
     @property
     @override

@@ -24,7 +24,7 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
-from forcegp.inference.pathwise import StackedFunctions, draw_functions
+from forcegp.inference.pathwise import draw_functions, mean_function
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop
@@ -337,7 +337,7 @@ class StructuredPosterior(Posterior):
             return acceleration
 
         def mean() -> AccelerationFunction:
-            return through(StackedFunctions.mean_of(self.latent))
+            return through(mean_function(self.latent))
 
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             if not len(self.kernels.kernels):  # no unknown force: all functions are the same
