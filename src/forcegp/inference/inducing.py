@@ -254,14 +254,6 @@ class InducingPosterior(LatentPosterior):
         return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
 
     @override
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        phi = self.space.column(index, z)
-        wide = phi.new_zeros(self.space.count, len(z))
-        wide[self.space.slices[index]] = phi
-        remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
-        return remainder + self.space.precision.solve_lower(wide).square().sum(0)
-
-    @override
     def function_weights(
         self, prior: Sequence[Float[Tensor, "S _"]], generator: torch.Generator
     ) -> tuple[Float[Tensor, "S _"], ...]:

@@ -67,10 +67,6 @@ class OneInputFunctions:
     high: float = sys.float_info.max
     error: float = 0.0
 
-    def evaluate(self, s: Float[Tensor, " n"]) -> tuple[Float[Tensor, "n R"], Float[Tensor, "n R"]]:
-        """The functions and their derivatives; at a kink that to the right."""
-        return value_and_slope(self.values, s)
-
     def values(self, s: Float[Tensor, " n"]) -> Float[Tensor, "n R"]:
         """The functions, differentiable in s."""
         segment, first = torch.searchsorted(self.knots, s.detach().contiguous(), right=True), 0
@@ -212,12 +208,10 @@ def one_input_form(
     latent: LatentPosterior,
     index: int,
     coefficients: Float[Tensor, "N R"] | None = None,
-    *,
-    tolerance: float = TOLERANCE,
 ) -> OneInputFunctions | None:
     """sum_j k(z, z_j) c_jr of one latent in the form that suits its kernel; without coefficients, its posterior mean.
 
-    A table is at most `tolerance` of the largest value from the sum and reaches `MARGIN` beyond the centres. None for
+    A table is at most `TOLERANCE` of the largest value from the sum and reaches `MARGIN` beyond the centres. None for
     several inputs and where `MOST_INTERVALS` do not suffice.
     """
     centers, kernel = latent.features[index].detach(), latent.kernels.dense[index]
@@ -227,7 +221,7 @@ def one_input_form(
     exact = markov_functions(latent.kernels[index], centers[:, 0], weights)
     if exact is not None:
         return exact
-    return cubic_table(lambda s: kernel.cross(s[:, None], centers) @ weights, centers[:, 0], MARGIN, tolerance)
+    return cubic_table(lambda s: kernel.cross(s[:, None], centers) @ weights, centers[:, 0], MARGIN, TOLERANCE)
 
 
 def drawn_form(

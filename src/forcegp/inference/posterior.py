@@ -41,10 +41,6 @@ class LatentPosterior(ABC):
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         """Cov(f_c, f_d) at the same point, for n points."""
 
-    @abstractmethod
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        """Variance of one latent at points of its own features."""
-
     def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
         """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
 
@@ -73,7 +69,8 @@ class LatentPosterior(ABC):
 
     def one(self, index: int, z: Float[Tensor, "n _"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Mean and variance of one latent at points of its own features."""
-        return self._mean_of(index, z), self.variance_of(index, z)
+        points = [z if c == index else z.new_zeros(len(z), own.shape[-1]) for c, own in enumerate(self.features)]
+        return self._mean_of(index, z), self.covariance(points)[:, index, index]
 
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
@@ -114,10 +111,6 @@ class FactorizedPosterior(LatentPosterior):
     @override
     def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
         return self.system.factor.solve_lower(self.data_covariance(index, z))
-
-    @override
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
 
     @override
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:

@@ -7,7 +7,7 @@ parameters; loading runs the same conditioning as fitting, so predictions are th
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +21,7 @@ from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_uncha
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import OptimizationResult, engine_from_dict
-from forcegp.mechanics import Contact, MechanicalSystem
+from forcegp.mechanics import MechanicalSystem
 from forcegp.models.baselines.independent_gp import IndependentGP
 from forcegp.models.baselines.network_ensemble import NetworkEnsemble
 from forcegp.models.baselines.neural_network import NeuralNetwork
@@ -166,10 +166,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
 
 
 @usable_arguments("load_posterior")
-def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
+def load_posterior(path: str | Path) -> Posterior:
     """Read a folder that `save_posterior` wrote; it predicts without the training file.
-
-    `contacts` replaces those that the model was trained with; the system that it was carried to stays.
 
     Raises
     ------
@@ -190,7 +188,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     except (OSError, SafetensorError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
     try:
-        system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
+        system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf})
         settings = dict(document["settings"])
         model = KINDS[document["kind"]].from_dict(system, document["model"])
         engine = None if document["engine"] is None else engine_from_dict(document["engine"])
