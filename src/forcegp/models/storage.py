@@ -99,7 +99,7 @@ so each is declared in `model.json`, and a program refuses those that it cannot 
 STATES = ("q", "v", "u", "a")
 NOISE, WEIGHTS = "noise_std", "weights"
 SOLUTION = "latent.solution"
-TRAINING, REFERENCE = "training.", "reference."
+TRAINING, REFERENCE, PARAMETERS = "training.", "reference.", "parameters."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
 
 
@@ -149,10 +149,9 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     tensors = _row_tensors(TRAINING, training)
     if training.reference is not None:
         tensors |= _row_tensors(REFERENCE, training.reference)
-    tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
+    tensors |= {f"{PARAMETERS}{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
 
-    solution = posterior.solution
-    if solution is not None:
+    if (solution := posterior.solution) is not None:
         tensors[SOLUTION] = solution.detach().cpu().contiguous()
 
     with atomic_folder(path, overwrite=overwrite) as folder:
@@ -192,14 +191,13 @@ def load_posterior(path: str | Path) -> Posterior:
         settings = dict(document["settings"])
         model = KINDS[document["kind"]].from_dict(system, document["model"])
         engine = None if document["engine"] is None else engine_from_dict(document["engine"])
-        target = None
-        if moved_to is not None:
-            target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
+        target = moved_to and MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
         training = _rows(TRAINING, tensors)
         if "reference" in declared or any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors))
-        prefix = "parameters."
-        parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+        parameters = {
+            name.removeprefix(PARAMETERS): value for name, value in tensors.items() if name.startswith(PARAMETERS)
+        }
         found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
         optimization = OptimizationResult(parameters, **found)
         names = document["joint_names"]
@@ -216,19 +214,18 @@ def load_posterior(path: str | Path) -> Posterior:
         raise FileFormatError(
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
-    file, solution = path / "tensors.safetensors", tensors.get(SOLUTION)
+    file = path / "tensors.safetensors"
+    for name, value in tensors.items():
+        if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
+            raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
     for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
         if rows is not None:
             _check_rows(file, model, prefix, rows)
-    for name, value in parameters.items():
-        _check_numbers(file, name, value)
     given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
     if given != model.parameter_shapes(training):
         raise FileFormatError(f"{file} does not hold the parameters of its model")
-    if solution is not None:
-        _check_numbers(file, SOLUTION, solution)
     try:
-        posterior = model.condition(training, parameters, optimization, settings, engine, solution)
+        posterior = model.condition(training, parameters, optimization, settings, engine, tensors.get(SOLUTION))
     except (InvalidInput, RuntimeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
     if target is not None:
@@ -293,18 +290,10 @@ def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> No
     sizes = dict(zip("qvu", model.system.sizes, strict=True))
     count = rows.q.shape[0] if rows.q.dim() == 2 else -1
     for name, value in states.items():
-        _check_numbers(file, prefix + name, value)
         if value.shape != (count, sizes.get(name, model.system.robot.nv)):
             raise FileFormatError(f"{file} is damaged: {prefix}{name} has shape {tuple(value.shape)}")
-    if rows.weights is not None:
-        _check_numbers(file, prefix + WEIGHTS, rows.weights)
-        if rows.weights.dim() != 2 or rows.weights.numel() != len(rows.q):
-            raise FileFormatError(f"{file} is damaged: {prefix}{WEIGHTS} has shape {tuple(rows.weights.shape)}")
-
-
-def _check_numbers(file: Path, name: str, value: torch.Tensor) -> None:
-    if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
-        raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
+    if rows.weights is not None and (rows.weights.dim() != 2 or rows.weights.numel() != len(rows.q)):
+        raise FileFormatError(f"{file} is damaged: {prefix}{WEIGHTS} has shape {tuple(rows.weights.shape)}")
 
 
 def _document(path: Path) -> dict[str, Any]:
