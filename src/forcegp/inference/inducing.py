@@ -153,7 +153,9 @@ class WeightSpace:
         right = factor.solve((d * self.mean)[:, None])[:, 0].contiguous()
         parts = zip(self.kernels.dense, terms.features, phis, strict=True)
         left_out = torch.stack([kernel.diagonal(z) - phi.square().sum(0) for kernel, z, phi in parts], dim=-1)
-        precision = with_left_out(deflation.C, left_out.clamp_min(0.0))
+        C = deflation.C
+        D = (C * left_out.clamp_min(0.0)[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(D))
         given = self.kernels, terms.features, self.points, deflation.C, deflation.t, precision
         return WeightSpace.of(*given, (factor.into_inverse(), right))
 
@@ -183,12 +185,6 @@ class WeightSpace:
             torch.linalg.solve_triangular(lower.mT, weights[part], upper=True)
             for lower, part in zip(self.lowers, self.slices, strict=True)
         ]
-
-
-def with_left_out(C: Float[Tensor, "N r C"], left_out: Float[Tensor, "N C"]) -> Float[Tensor, "N r r"]:
-    """D^-1 where the prior variances that the weights leave out of each latent count as noise of the rows."""
-    D = (C * left_out[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
-    return torch.cholesky_inverse(torch.linalg.cholesky(D))
 
 
 CANDIDATES = 20_000

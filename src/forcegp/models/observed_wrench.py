@@ -192,9 +192,8 @@ def _unexplained(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv 6"]]:
     """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
     device, parts = posterior.system.robot.device, []
-    for start in range(0, len(dataset), ROWS_PER_BLOCK):
-        block = slice(start, start + ROWS_PER_BLOCK)
-        q, v, u, a = (torch.tensor(x[block], device=device) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
+    rows = (torch.tensor(x, device=device).split(ROWS_PER_BLOCK) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
+    for q, v, u, a in zip(*rows, strict=True):
         with torch.no_grad():
             dynamics = posterior.dynamics(q, v, u)
             effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT

@@ -123,12 +123,8 @@ class Posterior(MotionModel, Summary, ABC):
         """
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
-        q, v, u = states
-        blocks = [
-            self.predict_rows(q[block], v[block], u[block], covariance)
-            for start in range(0, max(len(q), 1), ROWS_PER_BLOCK)
-            for block in [slice(start, start + ROWS_PER_BLOCK)]
-        ]
+        parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
+        blocks = [self.predict_rows(*part, covariance) for part in parts]
         predicted = join_predictions(blocks, batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance

@@ -8,9 +8,9 @@ parameters; loading runs the same conditioning as fitting, so predictions are th
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -31,29 +31,11 @@ from forcegp.models.training_data import Noise, TrainingData
 from forcegp.priors import prior_from_dict, prior_to_dict
 
 
-@dataclass(frozen=True)
-class StoredKind:
+class StoredKind(NamedTuple):
     """One kind of model, whose constructor takes the system and these fields."""
 
-    model: type[Model]
+    model: Callable[..., Model]
     fields: tuple[str, ...]
-
-    def to_dict(self, given: Any) -> dict[str, Any]:
-        """The fields as plain JSON values."""
-        return {name: _write(name, getattr(given, name)) for name in self.fields}
-
-    def from_dict(self, system: MechanicalSystem, stored: Mapping[str, Any]) -> Model:
-        """The model that `to_dict` stored."""
-        make = cast("Callable[..., Model]", self.model)
-        return make(system, **{name: _read(name, stored[name]) for name in self.fields})
-
-
-def kind_of(model: Model) -> str:
-    """The name in `KINDS` of a model. Raises FileFormatError for a model that is not registered there."""
-    for name, kind in KINDS.items():
-        if type(model) is kind.model:
-            return name
-    raise FileFormatError(f"a {type(model).__name__} cannot be stored: it has no entry in KINDS ({', '.join(KINDS)})")
 
 
 def _write(name: str, value: Any) -> Any:
@@ -117,15 +99,22 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         if not overwrite:
             raise FileFormatError(f"{path} exists already; choose another name or pass overwrite=True")
-        if not _is_model_folder(path):
-            raise FileFormatError(f"{path} exists and is not a folder written by forcegp, so it is not overwritten")
+        try:
+            _document(path)
+        except FileFormatError:
+            what = "exists and is not a folder written by forcegp, so it is not overwritten"
+            raise FileFormatError(f"{path} {what}") from None
         others = added_files(path, ("model.json", "tensors.safetensors", ROBOT, TARGET))
         if others:
             raise FileFormatError(
                 f"{path} holds files that forcegp did not write there ({', '.join(others[:3])}), so it is not "
                 "overwritten; move them away or choose another name"
             )
-    kind = kind_of(posterior.model)
+    model = posterior.model
+    kind = next((name for name, stored in KINDS.items() if type(model) is stored.model), None)
+    if kind is None:
+        kinds = ", ".join(KINDS)
+        raise FileFormatError(f"a {type(model).__name__} cannot be stored: it has no entry in KINDS ({kinds})")
     system = posterior.model.system.to_dict()
     target = None if posterior.target is None else posterior.target.to_dict()
     robots = {ROBOT: system.pop("urdf")} | ({} if target is None else {TARGET: target.pop("urdf")})
@@ -140,7 +129,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         "urdf_sha256": _sha256(robots[ROBOT]),
         "system": system,
         **({} if target is None else {"target": target, "target_urdf_sha256": _sha256(robots[TARGET])}),
-        "model": KINDS[kind].to_dict(posterior.model),
+        "model": {name: _write(name, getattr(model, name)) for name in KINDS[kind].fields},
         "result": {name: getattr(posterior.result, name) for name in RESULT},
         "engine": None if posterior.engine is None else posterior.engine.to_dict(),
         "settings": dict(posterior.settings),
@@ -189,7 +178,8 @@ def load_posterior(path: str | Path) -> Posterior:
     try:
         system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf})
         settings = dict(document["settings"])
-        model = KINDS[document["kind"]].from_dict(system, document["model"])
+        stored, make = document["model"], KINDS[document["kind"]]
+        model = make.model(system, **{name: _read(name, stored[name]) for name in make.fields})
         engine = None if document["engine"] is None else engine_from_dict(document["engine"])
         target = moved_to and MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
         training = _rows(TRAINING, tensors)
@@ -327,13 +317,6 @@ def _robot(path: Path, name: str, sha256: str | None) -> str:
         what = "that the model was trained with" if name == ROBOT else "that the model was carried to"
         raise FileFormatError(f"{path / name} is not the robot {what} (its hash differs)")
     return urdf
-
-
-def _is_model_folder(path: Path) -> bool:
-    try:
-        return bool(_document(path))
-    except FileFormatError:
-        return False
 
 
 def _sha256(text: str) -> str:

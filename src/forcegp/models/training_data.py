@@ -143,11 +143,10 @@ class Noise:
     def __post_init__(self) -> None:
         for name in ("learn", "measured_torque", "from_data"):
             require_type(name, getattr(self, name), bool)
-        if self.acceleration is not None:
-            object.__setattr__(self, "acceleration", _positive("acceleration", self.acceleration))
-        if self.force is not None:
-            object.__setattr__(self, "force", _positive("force", self.force))
-        elif self.measured_torque:
+        for name in ("acceleration", "force"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _positive(name, getattr(self, name)))
+        if self.measured_torque and self.force is None:
             raise InvalidInput(
                 "Noise(measured_torque=True) needs the noise of the torque sensor; give force=SIGMA in Nm or N."
             )

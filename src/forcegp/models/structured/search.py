@@ -169,7 +169,8 @@ class Search:
         restarts, options = self.resolved(len(objective.likelihood.training))
         if objective.physical is not None and options is SMALL:
             options = OptimizerOptions()  # standard errors are those of the optimum itself
-        one = _OneStart(objective, starts, replace(options, keep_iterates=keep_iterates or options.keep_iterates))
+        kept = replace(options, keep_iterates=keep_iterates or options.keep_iterates)
+        one = partial(_one_start, objective, starts, kept)
         with blas_threads(objective.likelihood.training.q.numel()):
             results = run_restarts(one, restarts, options.patience, self.backend, self.progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
@@ -197,20 +198,17 @@ def _start(moments: Mapping[str, Tensor], first: Mapping[str, Tensor], seed: int
     return perturbed(moments, seed, index) if index else first
 
 
-@dataclass(frozen=True, eq=False)
-class _OneStart:
-    """The search from start `index`. A class, so that processes receive it."""
-
-    objective: FitObjective
-    starts: Starts
-    options: OptimizerOptions
-
-    def __call__(
-        self, index: int, before: Sequence[OptimizationResult | FitError], progress: FitProgress | None
-    ) -> OptimizationResult | FitError:
-        """Where it ended, or why it could not begin."""
-        note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
-        try:
-            return minimize_objective(self.objective, self.starts(index), self.options, note, best_value(before))
-        except FitError as error:
-            return error
+def _one_start(
+    objective: FitObjective,
+    starts: Starts,
+    options: OptimizerOptions,
+    index: int,
+    before: Sequence[OptimizationResult | FitError],
+    progress: FitProgress | None,
+) -> OptimizationResult | FitError:
+    """Where the search from start `index` ended, or why it could not begin."""
+    note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
+    try:
+        return minimize_objective(objective, starts(index), options, note, best_value(before))
+    except FitError as error:
+        return error
