@@ -15,6 +15,7 @@ from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, ch
 from forcegp.models.training_data import CONSTANT, TrainingData
 from forcegp.priors import BaseWrench, ForcePrior
 from forcegp.robots.structure import LinkInertia
+from forcegp.summary import listed
 
 INVISIBLE = 1e-9
 """|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
@@ -81,10 +82,9 @@ def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], featur
         if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
             idle.setdefault(which, []).append(name)
     for which, latents in idle.items():
-        some = f"{', '.join(which[:4])}{' ...' if len(which) > 4 else ''}"
         _warn(
-            f"{some} never changes in the training rows, so nothing is learned of how {_few(latents)} depends on it; "
-            "leave that input out (inputs=...), or give data in which it changes"
+            f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} depends "
+            "on it; leave that input out (inputs=...), or give data in which it changes"
         )
 
 
@@ -157,7 +157,7 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
 
 
 def _few(names: Sequence[str]) -> str:
-    return f"{', '.join(map(repr, names[:4]))}{f' and {len(names) - 4} more' if len(names) > 4 else ''}"
+    return listed(map(repr, names))
 
 
 FAR_FROM_SURFACE = 0.01
