@@ -17,17 +17,7 @@ from operator import add, mul
 from typing import Any, cast
 
 import torch
-from gpytorch.kernels import (
-    AdditiveKernel,
-    ConstantKernel,
-    Kernel,
-    LinearKernel,
-    MaternKernel,
-    PeriodicKernel,
-    ProductKernel,
-    RBFKernel,
-    ScaleKernel,
-)
+from gpytorch.kernels import AdditiveKernel, Kernel, MaternKernel, ProductKernel, RBFKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
@@ -44,17 +34,8 @@ from forcegp.inference.kernel_matrices import (
     weight_features,
 )
 
-KNOWN = (
-    AdditiveKernel,
-    ProductKernel,
-    ScaleKernel,
-    RBFKernel,
-    MaternKernel,
-    PeriodicKernel,
-    LinearKernel,
-    ConstantKernel,
-)
-"""GPyTorch classes whose formulas are evaluated here; subclasses may have other formulas and are called."""
+COMBINED = (AdditiveKernel, ProductKernel)
+"""Of GPyTorch, of which subclasses may have other formulas and are called."""
 
 
 class DenseKernel(ABC):
@@ -86,7 +67,7 @@ def _inner(kernel: Kernel) -> DenseKernel:
     """The kernel on the features that it looks at."""
     if not _is_known(kernel):
         return _Called(kernel)
-    if isinstance(kernel, AdditiveKernel | ProductKernel) and type(kernel) in KNOWN:
+    if isinstance(kernel, AdditiveKernel | ProductKernel) and type(kernel) in COMBINED:
         parts = [taken_apart(cast(Kernel, part)) for part in kernel.kernels]
         return _Composed(parts, add if type(kernel) is AdditiveKernel else mul)
     if type(kernel) is ScaleKernel:
@@ -212,7 +193,7 @@ def _is_known(kernel: Kernel) -> bool:
         # It takes over the `active_dims` of its base, which then does not select again.
         base = kernel.base_kernel
         return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
-    return type(kernel) in KNOWN or embedding(kernel) is not None or weight_features(kernel) is not None
+    return type(kernel) in COMBINED or embedding(kernel) is not None or weight_features(kernel) is not None
 
 
 def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:

@@ -393,12 +393,8 @@ class StructuredPosterior(Posterior):
         model = self.model
         if z is not None and self.identification is not None:
             model = replace(model, system=self.identification.physical.system_at(z))
-        likelihood = model.likelihood(self.training)
-        kernels = likelihood.kernels(beyond=bool(self.settings.get("beyond_visited")))
-        latent = likelihood.condition(kernels, point, self.engine)
-        return StructuredPosterior(
-            model, likelihood, kernels, point, self.result, self.settings, latent, self.engine, target=self.target
-        )
+        moved: StructuredPosterior = model.condition(self.training, point, self.result, self.settings, self.engine)
+        return replace(moved, target=self.target)
 
     @override
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:

@@ -115,13 +115,12 @@ def on_all_rows(
 
     `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
     """
-    reference = fitted.training
-    training = reference
+    reference = training = fitted.training
+    likelihood, latent = fitted.likelihood, fitted.latent
     if len(rows) != len(reference.q):
         training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
-    likelihood = replace(fitted.likelihood, training=training)
-    fitted.model.system.check_states(training.q, training.v, training.u)
-    if training is not reference:
+        likelihood = replace(likelihood, training=training)
+        fitted.model.system.check_states(training.q, training.v, training.u)
         check_distance(fitted.model.system, training)
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms(fitted.parameters))
@@ -129,18 +128,16 @@ def on_all_rows(
         choice = choose_engine(size, training.q.device)
     else:
         choice = Choice(engine, f"{engine.name}: as asked for")
-    settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
-    if isinstance(choice.engine, Exact) and training is reference:
-        settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
-        return replace(fitted, settings=settings)
     with blas_threads(training.q.numel()):
-        latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
+        if training is not reference or not isinstance(choice.engine, Exact):
+            latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
         left_out = latent.left_out if isinstance(latent, InducingPosterior) else 0.0
         if engine is None and isinstance(choice.engine, Inducing) and left_out > choice.engine.tolerance:
             choice = choose_engine(size, training.q.device, inducing=False)
             short = f"fewer inducing points leave out {left_out:.2g} of the noise variance of a row"
             choice = Choice(choice.engine, f"{choice.reason}; {short}")
             latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
+        settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
         return refined(posterior, hyperprior, report)
