@@ -22,9 +22,8 @@ from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
 from forcegp.models.fused_rollouts import FusedLoop, Motions, fused, steps_of
 from forcegp.models.kept_code import KeptCode
-from forcegp.models.mean_with_gradient import MeanWithGradient
 from forcegp.models.prediction import Gaussian, JointForces, Linearization
-from forcegp.models.predictor_code import TermsFunction
+from forcegp.models.predictor_code import MeanWithGradient, TermsFunction
 from forcegp.models.rollout import (
     StepLinearization,
     by_sample,
@@ -378,7 +377,7 @@ class Predictor(Summary):
 
     def _linearize(self, states: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         nq, nv, nu = self.sizes
-        a, jacobian = rows_jacobian(lambda x: self._mean(*x.split(self.sizes, dim=-1))[0], torch.cat(states, dim=-1))
+        a, jacobian = rows_jacobian(lambda x: self._mean(*x.split(self.sizes, dim=-1))[0], torch.cat([*states], dim=-1))
         if self.space.is_vector_space:
             return a, jacobian
         in_q, rest = jacobian.split([nq, nv + nu], dim=-1)

@@ -124,7 +124,7 @@ class Posterior(MotionModel, Summary, ABC):
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
         parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
-        blocks = [self.predict_rows(*part, covariance) for part in parts]
+        blocks = [self.predict_rows(q, v, u, covariance) for q, v, u in parts]
         predicted = join_predictions(blocks, batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance

@@ -15,7 +15,7 @@ from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integ
 from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop, fused, steps_of
-from forcegp.models.motion_intervals import MotionIntervals
+from forcegp.models.motion_models import MotionIntervals
 from forcegp.models.search import blas_threads
 from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite, whole_number
 from forcegp.robots.manifold import ConfigurationSpace

@@ -181,7 +181,8 @@ def load_posterior(path: str | Path) -> Posterior:
         stored, make = document["model"], KINDS[document["kind"]]
         model = make.model(system, **{name: _read(name, stored[name]) for name in make.fields})
         engine = None if document["engine"] is None else engine_from_dict(document["engine"])
-        target = moved_to and MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
+        moved = None if moved_to is None else {**document["target"], "urdf": moved_to}
+        target = None if moved is None else MechanicalSystem.from_dict(moved)
         training = _rows(TRAINING, tensors)
         if "reference" in declared or any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors))

@@ -30,7 +30,7 @@ from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Mechani
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
-from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
+from forcegp.models.motion_models import HORIZONS, MotionIntervals
 from forcegp.models.observed_wrench import rows_of_own_system
 from forcegp.models.prediction import Gaussian, Inputs, Positions, Prediction, Rows
 from forcegp.models.predictor import Predictor
@@ -393,7 +393,7 @@ class StructuredPosterior(Posterior):
         model = self.model
         if z is not None and self.identification is not None:
             model = replace(model, system=self.identification.physical.system_at(z))
-        moved: StructuredPosterior = model.condition(self.training, point, self.result, self.settings, self.engine)
+        moved: Any = model.condition(self.training, point, self.result, self.settings, self.engine)
         return replace(moved, target=self.target)
 
     @override

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 from forcegp.inference import LatentPosterior
-from forcegp.models.motion_intervals import DEVIATIONS
+from forcegp.models.motion_models import DEVIATIONS
 from forcegp.models.search import MOST_POINTS_FOR_RESTARTS, blas_threads
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.search import FitObjective
