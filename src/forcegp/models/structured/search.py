@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from gpytorch.kernels import ScaleKernel
-from gpytorch.priors import NormalPrior
 from jaxtyping import Float
 from torch import Tensor
 
@@ -29,6 +28,7 @@ from forcegp.models.search import (
 )
 from forcegp.models.training_data import Noise
 from forcegp.parallel import Backend
+from forcegp.priors.basic_kernels import register_log_normal_prior
 from forcegp.robots import pseudo_inertia_from_parameters
 
 LOG_VARIANCE_SPREAD = 2.0
@@ -91,14 +91,8 @@ def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
     out = deepcopy(kernels)
     for module in out.modules():
         if isinstance(module, ScaleKernel) and "outputscale_prior" not in [name for name, *_ in module.named_priors()]:
-            center = _log_variance(module).detach()
-            prior = NormalPrior(center, torch.full_like(center, LOG_VARIANCE_SPREAD))
-            module.register_prior("outputscale_prior", prior, _log_variance)
+            register_log_normal_prior(module, "outputscale", torch.as_tensor(module.outputscale), LOG_VARIANCE_SPREAD)
     return out
-
-
-def _log_variance(kernel: ScaleKernel) -> Tensor:
-    return torch.as_tensor(kernel.outputscale).log()
 
 
 def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "10"]) -> Float[Tensor, ""]:
