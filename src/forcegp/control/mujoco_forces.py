@@ -57,9 +57,9 @@ class MujocoForces(Summary):
             raise InvalidInput("the predictor was made with compile=False; MuJoCo needs the C program.")
         places = _joints(model, system.robot.joint_names)
         _require_alike(predictor, model, places)
-        code = predictor.code.traced
+        code, nv = predictor.code.traced, predictor.nv
         program = code.program("passive")
-        if set(program.graph.inputs[2 * code.nv :]) & set(program.graph.needed(program.nodes)):
+        if set(program.graph.inputs[2 * nv :]) & set(program.graph.needed(program.nodes)):
             raise InvalidInput(
                 "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
             )
@@ -67,7 +67,7 @@ class MujocoForces(Summary):
         if codes is None:
             raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
-        words = {"JOINTS": code.nv, "POSITIONS": positions, "VELOCITIES": velocities}
+        words = {"JOINTS": nv, "POSITIONS": positions, "VELOCITIES": velocities}
         source = codes[0].c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
         include = f"-I{Path(mujoco.__file__).parent / 'include'}"
         key = json.dumps([source, mujoco.mj_versionString()])

@@ -172,12 +172,8 @@ class WeightSpace:
 
     def columns(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "_ n"]]:
         """phi_c at points, one column each."""
-        return [self.column(c, z) for c, z in enumerate(features)]
-
-    def column(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "m n"]:
-        """phi_c of one latent at points of its own features."""
-        cross = self.kernels.dense[index].cross(self.points[index], z)
-        return torch.linalg.solve_triangular(self.lowers[index], cross, upper=False)
+        crosses = (k.cross(p, z) for k, p, z in zip(self.kernels.dense, self.points, features, strict=True))
+        return [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(self.lowers, crosses, strict=True)]
 
     def center_weights(self, weights: Float[Tensor, "P S"]) -> list[Float[Tensor, "_ S"]]:
         """Weights w_c of the features phi_c as those of the kernel functions about the points p_c: L_c^-T w_c."""

@@ -92,11 +92,6 @@ class PredictorCode:
         return cls(space, (nq, nv, nu), sums, graph, a, W, features, Q, flat, passive, held, compressed, widening)
 
     @property
-    def nv(self) -> int:
-        """Number of degrees of freedom."""
-        return self.sizes[1]
-
-    @property
     def _latents(self) -> list[int]:
         """All processes in the order of the sums."""
         return [c for part in self.sums for c in part.latents]
@@ -174,7 +169,7 @@ class PredictorCode:
         finish = None
         if kind == "covariance":
             text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self._covariance_source()]
-            finish = {"covariance": ("covariance", self.nv**2)}
+            finish = {"covariance": ("covariance", self.sizes[1] ** 2)}
         text.append(write_function("program", program.graph, program.nodes, lanes, names))
         if loop:
             text += self.motion_source(lanes)
@@ -186,18 +181,18 @@ class PredictorCode:
         """C functions that steps on a manifold call: q after a step, and the rate of a step under a velocity."""
         if self.space.is_vector_space:
             return []
-        q, step = self.space.neutral(), torch.zeros(self.nv, dtype=torch.float64)
+        q, step = self.space.neutral(), torch.zeros(self.sizes[1], dtype=torch.float64)
         made = {"moved": trace(lambda q, step: [self.space.integrate(q, step)], [q, step])}
         made["step_rate"] = trace(lambda step, v: [self.space.chart_velocity(step, v)], [step, step])
         return [write_function(name, graph, x.tolist(), lanes) for name, (graph, (x,)) in made.items()]
 
     def _covariance_source(self) -> str:
         calls, C = [], len(self._latents)
-        first, place = 0, self.nv * C + C
+        first, place = 0, self.sizes[1] * C + C
         for k, part in enumerate(self.sums):
             calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
             first, place = first + len(part.latents), place + len(part.operands)
-        words = {"JOINTS": self.nv, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
+        words = {"JOINTS": self.sizes[1], "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
         return filled(c_text(__name__, "covariance.c"), words | {"ROOTS": "\n  ".join(calls)})
 
     @property
