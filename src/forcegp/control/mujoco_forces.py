@@ -74,7 +74,7 @@ class MujocoForces(Summary):
         self._library = load_library("mujoco", key, lambda _: source, default_folder(), PURPOSE, (include,))[0]
         self._held = [[aligned(part.table()) for part in each.sums] for each in codes]
         self._tables = [(ctypes.c_void_p * max(1, len(held)))(*(x.data_ptr() for x in held)) for held in self._held]
-        self.use(0)
+        self._chosen, self._active, self._failed = self._tables[0], False, False
 
     @override
     def facts(self) -> Mapping[str, object]:
@@ -86,12 +86,14 @@ class MujocoForces(Summary):
         if not whole_number("number", number, 0) < len(self._tables):
             raise InvalidInput(f"function {number} is asked for, of {len(self._tables)}; make more by draw.")
         self._chosen = self._tables[number]
-        self._library.evaluate(self._chosen)
+        if self._active:  # one library serves all with equal programs: it takes the tables of whom it acts for
+            self._failed |= bool(self._library.evaluate(self._chosen))
 
     def __enter__(self) -> "MujocoForces":
         if mujoco.get_mjcb_passive() is not None:
             raise InvalidInput("MuJoCo has a passive callback already; leave its context, or set_mjcb_passive(None).")
         self._library.evaluate(self._chosen)
+        self._active, self._failed = True, False
         mujoco.set_mjcb_passive(
             ctypes.cast(self._library.passive, ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p))
         )
@@ -101,7 +103,8 @@ class MujocoForces(Summary):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         mujoco.set_mjcb_passive(None)
-        if self._library.evaluate(self._chosen) and kind is None:
+        self._active = False
+        if (self._library.evaluate(self._chosen) or self._failed) and kind is None:
             raise NumericalError("a learned force was not finite: a state left what its tables hold, or diverged.")
 
 
