@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Callable
 from functools import partial
-from operator import attrgetter
 from typing import Any
 
 import torch
@@ -116,10 +115,10 @@ class NetworkKernel(Kernel):
         self.change = torch.nn.Parameter(torch.full((UNITS,), CHANGE, dtype=torch.float64))
         zero, one = float64(0.0), float64(1.0)
         self.register_prior("slope_prior", NormalPrior(zero, STEEPNESS_LOG_SPREAD * one), _log_steepness)
-        self.register_prior("bias_prior", NormalPrior(zero, one), attrgetter("bias"))
+        self.register_prior("bias_prior", NormalPrior(zero, one), partial(_parameter, "bias"))
         degrees = 2.0 * COST_PER_PARAMETER * (dimension + 2) - 1.0
         sparse = StudentTPrior(degrees * one, zero, SPARSE_SCALE / math.sqrt(degrees) * one)
-        self.register_prior("change_prior", sparse, attrgetter("change"))
+        self.register_prior("change_prior", sparse, partial(_parameter, "change"))
 
     def units(self, z: Tensor) -> Tensor:
         """h(z) (n, 2)."""
@@ -146,6 +145,10 @@ class StudentTPrior(Prior, StudentT):  # type: ignore[misc]  # the bases name th
         StudentT.__init__(self, df, loc, scale, validate_args=False)
         _bufferize_attributes(self, ("df", "loc", "scale"))
         self._transform = None
+
+
+def _parameter(name: str, kernel: NetworkKernel) -> Tensor:
+    return getattr(kernel, name)
 
 
 def _log_steepness(kernel: NetworkKernel) -> Tensor:
