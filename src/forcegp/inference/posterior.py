@@ -41,19 +41,6 @@ class LatentPosterior(ABC):
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         """Cov(f_c, f_d) at the same point, for n points."""
 
-    def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
-        """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
-
-        Rasmussen & Williams 2006, eq. 2.26. Raises InvalidInput for engines that do not factorise the covariance.
-        """
-        V = torch.cat([self.seen(index, z) for index, z in enumerate(features)], dim=-1)
-        prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
-        return prior - V.mT @ V
-
-    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        """L^-1 Cov(data, f(z)), L L^T that of the (whitened) data. Raises InvalidInput where nothing is factorised."""
-        raise InvalidInput(f"a {type(self).__name__} does not factorise the covariance of all rows; {self.remedy}.")
-
     @abstractmethod
     def function_weights(
         self, prior: Sequence[Float[Tensor, "S _"]], generator: torch.Generator
@@ -108,9 +95,15 @@ class FactorizedPosterior(LatentPosterior):
         """Cov(data, f(z)) of one latent."""
         return self.system.deflation.through(index, self.kernels.dense[index].cross(z, self.features[index]).mT)
 
-    @override
-    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        return self.system.factor.solve_lower(self.data_covariance(index, z))
+    def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
+        """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
+
+        Rasmussen & Williams 2006, eq. 2.26.
+        """
+        C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=-1)
+        V = self.system.factor.solve_lower(C)
+        prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
+        return prior - V.mT @ V
 
     @override
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
