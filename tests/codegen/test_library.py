@@ -1,12 +1,13 @@
 """What all machine code shares: compilers, and tensors that carry no derivatives which the code would lose."""
 
 import ctypes
+from pathlib import Path
 
 import pytest
 import torch
 from torch.autograd import forward_ad
 
-from forcegp.codegen.library import COMMANDS, PACKAGES, Purpose, compile_library, require_plain
+from forcegp.codegen.library import COMMANDS, PACKAGES, Purpose, code_digest, compile_library, require_plain
 from forcegp.errors import CompilerError, InvalidInput
 
 SOURCE = "double twice(double x) { return x + x; }"
@@ -94,3 +95,10 @@ def test_only_tensors_with_hidden_derivatives_are_refused():
     for transform in (torch.func.vmap, torch.func.jacrev, torch.func.jacfwd):
         with pytest.raises(InvalidInput, match=r"does not support transforms of torch\.func .*; do without"):
             transform(through_code)(x)
+
+
+@pytest.mark.parametrize("kind", [".py", ".c"])
+def test_kept_programs_are_made_again_where_a_text_has_changed(kind, monkeypatch):
+    before, read = code_digest.__wrapped__(), Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + (b"/**/" if path.suffix == kind else b""))
+    assert code_digest.__wrapped__() != before

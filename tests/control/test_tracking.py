@@ -236,6 +236,13 @@ def test_it_raises_or_holds_but_never_gives_nan():
     assert "held: 1" in repr(control)
 
 
+def test_motion_along_a_surface_raises_where_the_feedback_is_not_finite(touching):
+    q, v = state(touching)
+    control = HybridForce(touching.predictor(covariance="none"), stiffness=1e308, damping=0.0, torque_limits=1e6)
+    with pytest.raises(NumericalError, match="it is not finite"):
+        control(q, v, np.clip(q + 4.0, -2.9, 2.9), v, 0.0 * v, 5.0)
+
+
 def test_a_broken_sensor_is_held_and_leaves_the_integral_alone():
     control = ComputedTorque(URDF_ALONE, **GAINS, integral=10.0, dt=0.01, torque_limits=0.5, on_failure="hold")
     q_d = [0.1, -0.1]

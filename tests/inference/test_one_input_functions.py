@@ -147,14 +147,14 @@ def test_slopes_are_those_of_the_sums(expression):
     form = one_input_form(given, 0)
     s = torch.linspace(-2, 2, 101, dtype=torch.float64)  # no centres: kinks have no slope
     expected = value_and_slope(lambda s: summed(given, s)[:, None], s)[1]
-    close(form.evaluate(s)[1], expected, 1e-11 if form.error == 0.0 else 1e-5)
+    close(value_and_slope(form.values, s)[1], expected, 1e-11 if form.error == 0.0 else 1e-5)
 
 
 @pytest.mark.parametrize("expression", ["matern-3/2", "matern-5/2", *TABLES])
 def test_slopes_are_continuous_where_the_kernel_is_smooth(expression):
     form = one_input_form(latents(expression, normal(30, seed=3)), 0)
     inner = form.knots[1:-1]
-    left, right = form.evaluate(inner - 1e-12)[1], form.evaluate(inner)[1]
+    left, right = value_and_slope(form.values, inner - 1e-12)[1], value_and_slope(form.values, inner)[1]
     close(left, right, 1e-9)
 
 
@@ -180,7 +180,7 @@ def test_a_table_holds_a_margin_beyond_its_centers_and_is_nan_elsewhere():
     centers = torch.tensor([-1.0, 3.0], dtype=torch.float64)
     form = one_input_form(latents("squared-exponential", centers), 0)
     assert (form.low, form.high) == (-2.0, 4.0)
-    f, slope = form.evaluate(torch.tensor([-2.0, 4.0, -2.001, 4.001, math.nan], dtype=torch.float64))
+    f, slope = value_and_slope(form.values, torch.tensor([-2.0, 4.0, -2.001, 4.001, math.nan], dtype=torch.float64))
     assert f[:, 0].isnan().tolist() == slope[:, 0].isnan().tolist() == [False, False, True, True, True]
     one = one_input_form(latents("squared-exponential", centers[1:]), 0)
     assert (one.low, one.high) == (2.25, 3.75)
@@ -299,7 +299,7 @@ def test_the_c_code_computes_the_same(expression, head, options, tmp_path):
     f, slope = run(library, form, s.numpy())
     known = ~np.isnan(f)
     assert (known == ~form.values(s).isnan().numpy()).all()
-    for found, expected in zip((f, slope), form.evaluate(s), strict=True):
+    for found, expected in zip((f, slope), value_and_slope(form.values, s), strict=True):
         np.testing.assert_allclose(
             found[known], expected.numpy()[known], rtol=0, atol=1e-13 * float(expected[known].abs().max())
         )

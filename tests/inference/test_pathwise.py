@@ -9,7 +9,7 @@ from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from forcegp.errors import InvalidInput
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
-from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, StackedFunctions, draw_functions
+from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, draw_functions, mean_function
 from forcegp.priors.kernels import kernel_of
 
 POINTS, OUTPUTS = 9, 3
@@ -54,12 +54,12 @@ def points(latent) -> list[torch.Tensor]:
 
 
 def test_the_stacked_mean_is_the_mean(latent, points):
-    torch.testing.assert_close(StackedFunctions.mean_of(latent)(points), latent.mean(points), rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(mean_function(latent)(points), latent.mean(points), rtol=1e-10, atol=1e-12)
 
 
 def test_kernels_that_cannot_be_stacked_have_the_same_mean(points):
     latent = conditioned([ScaleKernel(MaternKernel(nu=2.5)), scaled_rbf(1, 0.9, 1.4)], (3, 1))
-    torch.testing.assert_close(StackedFunctions.mean_of(latent)(points[:2]), latent.mean(points[:2]))
+    torch.testing.assert_close(mean_function(latent)(points[:2]), latent.mean(points[:2]))
     assert isinstance(draw_functions(latent, 2, seed=0), ComposedSamples)
 
 

@@ -12,7 +12,7 @@ from forcegp import JointAccelerations, JointFriction, NoForces, StructuredGP, l
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalWarning
 from forcegp.inference import Exact, Inducing, OptimizerOptions, ProblemSize, choose_engine
 from forcegp.inference import memory as memory_module
-from forcegp.models.structured.refinement import _moved_to
+from forcegp.models.structured import refinement
 
 QUICK = OptimizerOptions(iterations=5)
 
@@ -182,10 +182,12 @@ def test_too_few_inducing_points_are_said(data):
     assert "refined" not in posterior.settings
 
 
-def test_the_time_of_refining_is_added(data):
-    posterior = fit(data, points=15)
-    result = replace(posterior.result, parameters={}, cpu_seconds=3.0)
-    assert _moved_to(posterior, result).result.cpu_seconds == posterior.result.cpu_seconds + 3.0
+def test_the_time_of_refining_is_added(data, monkeypatch):
+    posterior = fit(data, Inducing(points=60, refine=0))
+    found = replace(posterior.result, parameters={}, cpu_seconds=3.0)
+    monkeypatch.setattr(refinement, "minimize_objective", lambda *_: found)
+    again = refinement.refined(replace(posterior, engine=Inducing(points=60)), True)
+    assert again.result.cpu_seconds == posterior.result.cpu_seconds + 3.0
 
 
 def test_far_rows_beyond_the_learning_rows_are_said(data):

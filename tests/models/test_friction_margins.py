@@ -117,6 +117,20 @@ def test_friction_of_the_prior_counts_and_surfaces_have_their_normals(log):
     assert float(across.max()) > 0.0
 
 
+def test_two_feet_of_one_link_have_names_and_forces_of_their_own(dog, log):
+    height = float(log.system.robot.frame_pose(torch.tensor(log.q[0]), "front_left_foot")[2, 3])
+    places = {"heel": (0.0, 0.0, 0.0), "toe": (0.05, 0.0, 0.0)}
+    ground = [Contact("front_left_foot", at, Plane((0.0, 0.0, 1.0), height), name) for name, at in places.items()]
+    rows = log.rows(slice(0, 3))
+    u = np.concatenate([rows.u[:, :12], np.ones((3, 2))], axis=1)
+    posterior = dog.with_contacts(ground)
+    found = friction_margins(posterior, rows.q, rows.v, u, 0.5)
+    assert found.names == ("front_left_foot (heel)", "front_left_foot (toe)")
+    each = posterior.predict(rows.q, rows.v, u).contact_force.mean.unflatten(-1, (2, 3))
+    for k, name in enumerate(found.names):
+        torch.testing.assert_close(found.force[name].mean[:, 2], each[:, k, 2], rtol=1e-9, atol=1e-9)
+
+
 def test_what_margins_need_is_named(dog, log):
     row = (log.q[:1], log.v[:1], log.u[:1])
     for wrong in (-0.1, "ice", float("nan")):

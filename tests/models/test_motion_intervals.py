@@ -12,7 +12,7 @@ from forcegp import JointFriction, NeuralNetwork, NoForces, StructuredGP, load_p
 from forcegp.data.motion_records import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.rollout_scores import interval_about, rollout_errors
-from forcegp.models.motion_intervals import DEVIATIONS, MotionIntervals
+from forcegp.models.motion_models import DEVIATIONS, MotionIntervals
 
 HORIZONS = (0.1, 0.25, 0.5)
 

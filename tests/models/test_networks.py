@@ -17,9 +17,10 @@ from forcegp.models.baselines.neural_network import (
     Batches,
     NeuralNetwork,
     ResidualLayers,
-    SigmoidLayer,
     held_out_rows,
     initial_weights,
+    mean_and_variance,
+    sigmoid_layer,
 )
 
 SMALL = {"members": 3, "width": 16, "depth": 2, "steps": 90, "batch": 20}
@@ -82,7 +83,7 @@ def ensemble(train):
 
 
 def test_one_layer_is_that_of_torch():
-    shapes = SigmoidLayer(5).shapes(1, 4, 2)
+    shapes = sigmoid_layer(5).shapes(1, 4, 2)
     weights = initial_weights(shapes, torch.Generator().manual_seed(0))
     twin = torch.nn.Sequential(torch.nn.Linear(4, 5), torch.nn.Sigmoid(), torch.nn.Linear(5, 2)).double()
     with torch.no_grad():
@@ -90,14 +91,14 @@ def test_one_layer_is_that_of_torch():
             twin[place].weight.copy_(weights[f"{layer}.weight"][0].mT)
             twin[place].bias.copy_(weights[f"{layer}.bias"][0, 0])
     x = torch.linspace(-1.0, 1.0, 12, dtype=torch.float64).reshape(3, 4)
-    torch.testing.assert_close(SigmoidLayer(5)(weights, x[None])[0], twin(x), rtol=1e-14, atol=1e-14)
+    torch.testing.assert_close(sigmoid_layer(5)(weights, x[None])[0], twin(x), rtol=1e-14, atol=1e-14)
 
 
 def test_residual_layers_are_those_written_plainly_member_by_member():
     layers = ResidualLayers(width=6, depth=2)
     weights = initial_weights(layers.shapes(3, 4, 2), torch.Generator().manual_seed(0))
     x = torch.linspace(-1.0, 1.0, 20, dtype=torch.float64).reshape(5, 4)
-    means, variances = layers(weights, x[None])
+    means, variances = mean_and_variance(layers(weights, x[None]))
     for member in range(3):
         w = {name: value[member] for name, value in weights.items()}
         h = x @ w["input.weight"] + w["input.bias"]
@@ -177,7 +178,7 @@ def test_the_ensemble_is_the_mixture_of_its_members(ensemble, test):
     seen = torch.cat([ensemble.training.q, ensemble.training.v, ensemble.training.u], -1)
     x = (states - seen.mean(0)) / seen.std(0, correction=0)
     a = ensemble.training.a
-    means, variances = ensemble.model.layers(ensemble.parameters, x[None])
+    means, variances = mean_and_variance(ensemble.model.layers(ensemble.parameters, x[None]))
     means = means * a.std(0, correction=0) + a.mean(0)
     variances = variances * a.var(0, correction=0)
     second_moment = (variances + means.square()).mean(0)

@@ -182,7 +182,7 @@ def test_progress_counts_mean_and_samples(posterior, start):
         ({"u": torch.zeros(3)}, r"u has shape \(3,\); it must be \(\.\.\., T, 3\)"),
         ({"u": torch.zeros(0, 3)}, "u has no rows"),
         ({"v0": torch.full((3,), float("nan"))}, "v0 has values that are not finite"),
-        ({"v0": torch.zeros(3, 3)}, "the shapes do not broadcast"),
+        ({"v0": torch.zeros(3, 3)}, "shapes do not broadcast"),
         ({"q0": "here"}, "q0 must be an array of real numbers"),
         ({"q0": torch.zeros(0, 1, 3)}, "no motion at all"),
         ({"samples": -1}, "samples=-1"),

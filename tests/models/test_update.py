@@ -38,6 +38,18 @@ def at_once(posterior, data):
     return posterior.model.condition(whole, posterior.parameters, posterior.result, settings)
 
 
+def test_rows_that_count_as_one_do_so_after_an_update(tmp_path):
+    data = arm_data(20, 5)
+    few = fit(data)
+    settings = {**few.settings, "correlated_rows": 4.0}
+    alike = few.model.condition(few.training, few.parameters, few.result, settings)
+    updated = alike.update(data.rows(slice(12, 20)))
+    whole = dataclasses.replace(type(few.training).of(data, torch.device("cpu")), reference=few.training)
+    assert_same(updated, few.model.condition(whole, few.parameters, few.result, settings), data)
+    save_posterior(updated, tmp_path / "run")
+    assert_same(load_posterior(tmp_path / "run"), updated, data)
+
+
 def assert_same(one, other, data, tolerance=1e-8):
     states = data.q, data.v, data.u
     mine, theirs = one.predict(*states), other.predict(*states)

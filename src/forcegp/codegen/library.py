@@ -196,7 +196,7 @@ def code_digest() -> str:
     """Hash of the sources of this package: all that decide what is written, and more."""
     here = Path(__file__).parent.parent
     rooms = ("codegen", "robots", "mechanics", "priors", "inference", "models")
-    files = sorted(path for room in rooms for path in (here / room).rglob("*.py"))
+    files = sorted(path for room in rooms for path in (here / room).rglob("*") if path.suffix in (".py", ".c", ".h"))
     return hashlib.sha256(b"\0".join(path.read_bytes() for path in files)).hexdigest()
 
 

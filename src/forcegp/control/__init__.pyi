@@ -1,5 +1,4 @@
-from .hybrid_force import HybridForce as HybridForce
 from .monitor import ContactMonitor as ContactMonitor
 from .informative_motions import Excitation as Excitation, excitation as excitation
 from .mppi import MPPI as MPPI
-from .tracking import ComputedTorque as ComputedTorque, PDGravity as PDGravity
+from .tracking import ComputedTorque as ComputedTorque, HybridForce as HybridForce, PDGravity as PDGravity

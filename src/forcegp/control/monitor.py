@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.analytical.least_squares import NoiseLevels
-from forcegp.control.tracking import Model, system_of
+from forcegp.control.tracking import Model, joint_forces, system_of
 from forcegp.errors import DatasetError, InvalidInput, require_known
 from forcegp.integration.integrators import check_time_step
 from forcegp.models.predictor import Predictor
@@ -220,14 +220,10 @@ class ContactMonitor(Summary):
 
     def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """M a - Q_K - Q_U at rows, M, and M Cov(a) M of what the posterior leaves open."""
-        if isinstance(self.model, Predictor):
-            at = self.model.joint_forces(q, v, u)
-            Q, M = at.Q, at.M
-        else:
-            dynamics = self.model.dynamics(q, v, u)
-            Q, M = dynamics.Q_K, dynamics.M
+        at = joint_forces(self.model, q, v, u)
+        M = at.M
         extra = M @ self.model(q, v, u)[1] @ M if self.open and isinstance(self.model, Predictor) else None
-        return (M @ a[..., None])[..., 0] - Q, M, extra
+        return (M @ a[..., None])[..., 0] - at.Q, M, extra
 
     @staticmethod
     def _distance(tau: Tensor, S: Tensor) -> Float[Tensor, " rows"]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from forcegp.codegen.c_text import filled
+from forcegp.codegen.c_text import c_text, filled
 from forcegp.codegen.library import Purpose, aligned, default_folder, load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.models.predictor import Predictor
@@ -21,30 +21,6 @@ from forcegp.robots.arguments import whole_number
 from forcegp.summary import Summary
 
 mujoco: Any = untyped
-CALLBACK = """
-#include <mujoco/mujoco.h>
-static const double *const *tables;
-static int failed;
-void passive(const mjModel *m, mjData *d) {
-  enum {N = @JOINTS@};
-  static const int position[N] = {@POSITIONS@}, velocity[N] = {@VELOCITIES@};
-  double x[3 * N], y[N];
-  (void)m;
-  for (int j = 0; j < N; j++) {
-    x[j] = d->qpos[position[j]]; x[N + j] = d->qvel[velocity[j]]; x[2 * N + j] = 0.0;
-  }
-  program(tables, 1, x, y);
-  for (int j = 0; j < N; j++) {
-    if (!(y[j] - y[j] == 0.0)) failed = 1;
-    d->qfrc_passive[velocity[j]] += y[j];
-  }
-}
-int evaluate(const double *const *t) { /* take these tables, and report whether a force was not finite until now */
-  const int before = failed;
-  tables = t; failed = 0;
-  return before;
-}
-"""
 PURPOSE = Purpose("a passive force for MuJoCo", "the environment variable XDG_CACHE_HOME", "use predictor.rollouts")
 STATES = 5  # random ones, at which robots are compared
 ALIKE = 1e-6  # relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF
@@ -81,9 +57,9 @@ class MujocoForces(Summary):
             raise InvalidInput("the predictor was made with compile=False; MuJoCo needs the C program.")
         places = _joints(model, system.robot.joint_names)
         _require_alike(predictor, model, places)
-        code = predictor.code.traced
+        code, nv = predictor.code.traced, predictor.nv
         program = code.program("passive")
-        if set(program.graph.inputs[2 * code.nv :]) & set(program.graph.needed(program.nodes)):
+        if set(program.graph.inputs[2 * nv :]) & set(program.graph.needed(program.nodes)):
             raise InvalidInput(
                 "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
             )
@@ -91,14 +67,14 @@ class MujocoForces(Summary):
         if codes is None:
             raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
-        words = {"JOINTS": code.nv, "POSITIONS": positions, "VELOCITIES": velocities}
-        source = codes[0].c_source("passive", 1, filled(CALLBACK, words))
+        words = {"JOINTS": nv, "POSITIONS": positions, "VELOCITIES": velocities}
+        source = codes[0].c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
         include = f"-I{Path(mujoco.__file__).parent / 'include'}"
         key = json.dumps([source, mujoco.mj_versionString()])
         self._library = load_library("mujoco", key, lambda _: source, default_folder(), PURPOSE, (include,))[0]
         self._held = [[aligned(part.table()) for part in each.sums] for each in codes]
         self._tables = [(ctypes.c_void_p * max(1, len(held)))(*(x.data_ptr() for x in held)) for held in self._held]
-        self.use(0)
+        self._chosen, self._active, self._failed = self._tables[0], False, False
 
     @override
     def facts(self) -> Mapping[str, object]:
@@ -110,12 +86,14 @@ class MujocoForces(Summary):
         if not whole_number("number", number, 0) < len(self._tables):
             raise InvalidInput(f"function {number} is asked for, of {len(self._tables)}; make more by draw.")
         self._chosen = self._tables[number]
-        self._library.evaluate(self._chosen)
+        if self._active:  # one library serves all with equal programs: it takes the tables of whom it acts for
+            self._failed |= bool(self._library.evaluate(self._chosen))
 
     def __enter__(self) -> "MujocoForces":
         if mujoco.get_mjcb_passive() is not None:
             raise InvalidInput("MuJoCo has a passive callback already; leave its context, or set_mjcb_passive(None).")
         self._library.evaluate(self._chosen)
+        self._active, self._failed = True, False
         mujoco.set_mjcb_passive(
             ctypes.cast(self._library.passive, ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p))
         )
@@ -125,7 +103,8 @@ class MujocoForces(Summary):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         mujoco.set_mjcb_passive(None)
-        if self._library.evaluate(self._chosen) and kind is None:
+        self._active = False
+        if (self._library.evaluate(self._chosen) or self._failed) and kind is None:
             raise NumericalError("a learned force was not finite: a state left what its tables hold, or diverged.")
 
 

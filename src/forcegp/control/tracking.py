@@ -1,4 +1,4 @@
-"""Tracking of a reference in joint space, with and without a model of the forces."""
+"""Tracking of a reference in joint space, with and without a model of the forces, and along a surface."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -10,16 +10,23 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.control.controller import Controller, OnFailure, per_joint
-from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.errors import InvalidInput, NumericalError, require_known, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import MechanicalSystem
+from forcegp.models.prediction import JointForces
 from forcegp.models.predictor import Predictor
+from forcegp.models.structured.components import require_actuated
 from forcegp.robots import Robot
+from forcegp.robots.arguments import real_tensor
 from forcegp.robots.compiled import CompiledRobot
 
 Model = MechanicalSystem | Predictor
 ROUNDS = 20  # of Newton's method; one where no force depends on u
-CLOSE = 1e-9  # relative to the acceleration
+CLOSE = 1e-9  # relative to the forces
+NO_TORQUES = (
+    "no torques give the wanted acceleration: it is not finite, friction takes as much as they add, or a joint is not "
+    "actuated; check the reference, the gains and the model's friction."
+)
 
 
 class TrackingController(Controller):
@@ -142,10 +149,14 @@ class ComputedTorque(TrackingController):
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at, factor = v_d if self.forces_at == "desired" else v, 1.0
+        at_v, factor = v_d if self.forces_at == "desired" else v, 1.0
         if self.gain_factor is not None and isinstance(self.model, Predictor):
-            factor = self.gain_factor(self.model(q, at, self.last)[1].diagonal().sqrt())
-        return torques_for(self.model, q, at, a_d + self.feedback(e, e_v, factor), self.last)
+            factor = self.gain_factor(self.model(q, at_v, self.last)[1].diagonal().sqrt())
+        at = joint_forces(self.model, q, at_v, self.last)
+        u = torques_for(self.model, q, at_v, at.M @ (a_d + self.feedback(e, e_v, factor)), self.last, at)
+        if u is None:
+            raise NumericalError(NO_TORQUES)
+        return u
 
 
 def system_of(model: Model) -> MechanicalSystem:
@@ -157,26 +168,80 @@ def system_of(model: Model) -> MechanicalSystem:
     raise InvalidInput(f"model is a {type(model).__name__}; give posterior.predictor() or a MechanicalSystem.")
 
 
-def torques_for(model: Model, q: Tensor, v: Tensor, a: Tensor, start: Tensor) -> Float[Tensor, " nv"]:
-    """The u (nv,) whose acceleration at q, v (nv,) is a, by Newton's method from `start`: friction may depend on u.
+def joint_forces(model: Model, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
+    """Known and learned forces at a state (nv,) or states (n, nv) and what they act on."""
+    if isinstance(model, Predictor):
+        return model.joint_forces(q, v, u)
+    at = model.dynamics(q, v, u)
+    return JointForces(at.Q_K, torch.eye(u.shape[-1], dtype=u.dtype), at.M, at.A, at.b)
 
-    Raises NumericalError where there is none.
+
+def torques_for(
+    model: Model, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
+) -> Float[Tensor, " nv"] | None:
+    """The u (nv,) under which known and learned forces at q, v are those `needed`, by Newton's method; None if none is.
+
+    It begins at u, where they are `at`: friction may depend on u. Raises NumericalError for forces that are not finite.
     """
-    u = start
-    for _ in range(ROUNDS if bool(a.isfinite().all()) else 0):
-        if isinstance(model, Predictor):
-            found = model.linearize(q, v, u)
-            missing, response = a - found.a, found.da_du
-        else:
-            offset, response = model.dynamics(q, v, u).acceleration_map()
-            missing = a - offset
-        if float(missing.abs().max()) <= CLOSE * (1.0 + float(a.abs().max())):
+    if not bool(needed.isfinite().all()):
+        raise NumericalError(NO_TORQUES)
+    for _ in range(ROUNDS):
+        missing = needed - at.Q
+        if float(missing.abs().max()) <= CLOSE * (1.0 + float(needed.abs().max())):
             return u
-        try:
-            u = u + torch.linalg.solve(response, missing)
-        except torch.linalg.LinAlgError:
-            break
-    raise NumericalError(
-        "no torques give the wanted acceleration: it is not finite, friction takes as much as they add, or a joint is "
-        "not actuated; check the reference, the gains and the model's friction."
-    )
+        step, singular = torch.linalg.solve_ex(at.dQ_du, missing)
+        if int(singular) or not bool(step.isfinite().all()):
+            return None
+        u = u + step
+        at = joint_forces(model, q, v, u)
+    return None
+
+
+class HybridForce(TrackingController):
+    """u = M a + h - A^T lambda_d - Q_U(lambda_d): a reference along the contacts, and wanted forces against them.
+
+    a is the acceleration of the feedback, freed from what the contacts would resist: of all that satisfy A a = b the
+    one nearest to it in the kinetic metric (Gauss' principle). lambda_d presses the robot onto the surface; friction
+    under load, learned or known, is that of lambda_d. So the force is right where the model is: no sensor is read.
+
+    * predictor: `posterior.predictor()` of a model with contacts and analytical mean. Gains as `TrackingController`
+      has them. Forces are evaluated at (q, v_d), as in `ComputedTorque`. Newton's method goes on from the torques of
+      the last call, for friction under load depends on them.
+    """
+
+    def __init__(self, predictor: Predictor, **settings: Any) -> None:
+        self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
+        self.system = predictor.posterior.system
+        if not self.system.touching or self.system.loops:
+            raise InvalidInput(
+                "HybridForce wants a force against a contact, and this model has none, or a closed loop; name it in "
+                "posterior.with_contacts([...]), or use ComputedTorque."
+            )
+        require_actuated(predictor.posterior)
+        super().__init__(self.system.robot, **settings)
+
+    @override
+    def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
+        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) in N, one per contact.
+
+        A normal force is positive where the surface pushes the robot off; a surface only pushes.
+        """
+        count = len(self.system.contacts)
+        wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
+        if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):
+            raise InvalidInput(
+                f"normal_force is {normal_force!r}; give the force in N with which the surface pushes, at least 0, one "
+                f"per contact ({count})."
+            )
+        self.wanted = wanted.expand(count)
+        return super().__call__(q, v, q_d, v_d, a_d)
+
+    @override
+    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
+        at = self.predictor.joint_forces(q, v_d, self.last)
+        free = a_d + self.feedback(e, e_v)
+        towards = torch.linalg.solve(at.M, at.A.mT)  # M^-1 A^T
+        a = free + towards @ torch.linalg.lstsq(at.A @ towards, at.b - at.A @ free, driver="gelsd").solution
+        u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at)
+        # where that finds none with shorter steps, or its error
+        return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean if u is None else u

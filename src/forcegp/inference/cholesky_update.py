@@ -11,7 +11,7 @@ wrongly of it (`leave_out`). (Csato & Opper 2002, "Sparse on-line Gaussian proce
 score.) Leaving a row out of P is a step of Cholesky's algorithm on P, so that no other inversion is needed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +19,6 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.likelihood import DeflatedSystem, Deflation, Terms, deflated_covariance
 from forcegp.inference.posterior import ExactPosterior
 
@@ -38,7 +37,9 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
         rank = max(old.rank, added.rank)
         factor = _with_rank(latent.system.factor, len(old.t), old.rank, rank)
         old, added = _padded(old, rank), _padded(added, rank)
-        cross = _cross_covariance(latent.kernels, features, added.C, latent.features, old.C)
+        cross = added.t.new_zeros(added.t.numel(), old.t.numel())
+        for c, (kernel, z, at) in enumerate(zip(latent.kernels.dense, features, latent.features, strict=True)):
+            cross += added.through(c, old.through(c, kernel.cross(z, at).mT).mT)
         own = deflated_covariance(added.C, latent.kernels(features))
         factor = appended(factor, cross, own)
         joined = Deflation(*(torch.cat([getattr(part, name) for part in (old, added)]) for name in _PARTS))
@@ -148,18 +149,3 @@ def _with_rank(factor: CholeskyFactor, count: int, rank: int, wanted: int) -> Ch
     place = torch.arange(count * wanted, device=lower.device).reshape(count, wanted)[:, :rank].reshape(-1)
     lower[place[:, None], place] = factor.lower.tril()
     return CholeskyFactor(lower, factor.jitter)
-
-
-def _cross_covariance(
-    kernels: LatentKernels,
-    features: Sequence[Tensor],
-    C: Float[Tensor, "m r C"],
-    old_features: Sequence[Tensor],
-    old_C: Float[Tensor, "N r C"],
-) -> Float[Tensor, "mr Nr"]:
-    """T21 of size (rm, rN), point-major."""
-    cross = C.new_zeros(*C.shape[:2], *old_C.shape[:2])
-    parts = zip(kernels.dense, features, old_features, C.unbind(-1), old_C.unbind(-1), strict=True)
-    for kernel, z, old, own, other in parts:
-        cross.addcmul_(own[..., None, None], (kernel.cross(z, old)[..., None] * other)[:, None])
-    return cross.flatten(2).flatten(0, 1)

@@ -8,7 +8,6 @@ Functions of the distance, linear and constant kernels, and those with an embedd
 (`kernel_matrices`) are evaluated here; every other kernel is called as it is, and once more in the backward pass.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -18,17 +17,7 @@ from operator import add, mul
 from typing import Any, cast
 
 import torch
-from gpytorch.kernels import (
-    AdditiveKernel,
-    ConstantKernel,
-    Kernel,
-    LinearKernel,
-    MaternKernel,
-    PeriodicKernel,
-    ProductKernel,
-    RBFKernel,
-    ScaleKernel,
-)
+from gpytorch.kernels import AdditiveKernel, Kernel, MaternKernel, ProductKernel, RBFKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
@@ -45,17 +34,8 @@ from forcegp.inference.kernel_matrices import (
     weight_features,
 )
 
-KNOWN = (
-    AdditiveKernel,
-    ProductKernel,
-    ScaleKernel,
-    RBFKernel,
-    MaternKernel,
-    PeriodicKernel,
-    LinearKernel,
-    ConstantKernel,
-)
-"""GPyTorch classes whose formulas are evaluated here; subclasses may have other formulas and are called."""
+COMBINED = (AdditiveKernel, ProductKernel)
+"""Of GPyTorch, of which subclasses may have other formulas and are called."""
 
 
 class DenseKernel(ABC):
@@ -80,23 +60,22 @@ class DenseKernel(ABC):
 def taken_apart(kernel: Kernel) -> DenseKernel:
     """The kernel as sums, products and leaves whose formulas are evaluated here; any other kernel is called."""
     inner = _inner(kernel)
-    return inner if kernel.active_dims is None or isinstance(inner, _Called) else _Selected(kernel, inner)
+    return inner if kernel.active_dims is None or isinstance(inner, _Called) else _Composed([inner], of=kernel)
 
 
 def _inner(kernel: Kernel) -> DenseKernel:
     """The kernel on the features that it looks at."""
     if not _is_known(kernel):
         return _Called(kernel)
-    if isinstance(kernel, AdditiveKernel | ProductKernel) and type(kernel) in KNOWN:
+    if isinstance(kernel, AdditiveKernel | ProductKernel) and type(kernel) in COMBINED:
         parts = [taken_apart(cast(Kernel, part)) for part in kernel.kernels]
-        return _Combined(add if type(kernel) is AdditiveKernel else mul, parts)
+        return _Composed(parts, add if type(kernel) is AdditiveKernel else mul)
     if type(kernel) is ScaleKernel:
         base = kernel.base_kernel
         # active_dims of the base are those of the scaled kernel, which selects
         plain = type(base) in (RBFKernel, MaternKernel)
-        return _OfDistance(base, kernel) if plain else _Scaled(kernel, taken_apart(base))
-    of_distances = type(kernel) in (RBFKernel, MaternKernel) or embedding(kernel) is not None
-    return _OfDistance(kernel) if of_distances else _Weighted(kernel)
+        return _OfDistance(base, kernel) if plain else _Composed([taken_apart(base)], scale=kernel)
+    return _Weighted(kernel) if embedding(kernel) is None else _OfDistance(kernel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,60 +97,32 @@ class _Called(DenseKernel):
         return cast(Tensor, self.kernel(z, z, diag=True))
 
 
+@dataclass(frozen=True, eq=False)
 class _Composed(DenseKernel):
-    """A kernel made of others, in the same way for all three functions."""
+    """A sum or a product of others, times the variance of `scale`, of the features that `of` looks at."""
 
-    @abstractmethod
-    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
-        """What `of(part, *points)` of the parts makes."""
+    parts: Sequence[DenseKernel]
+    combine: Callable[[Tensor, Tensor], Tensor] = add
+    scale: ScaleKernel | None = None
+    of: Kernel | None = None
 
     @override
     def matrix(self, z: Tensor) -> Tensor:
-        return self.composed(lambda part, z: part.matrix(z), z)
+        return self._composed("matrix", z)
 
     @override
     def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self.composed(lambda part, z, other: part.cross(z, other), z, other)
+        return self._composed("cross", z, other)
 
     @override
     def diagonal(self, z: Tensor) -> Tensor:
-        return self.composed(lambda part, z: part.diagonal(z), z)
+        return self._composed("diagonal", z)
 
-
-@dataclass(frozen=True, eq=False)
-class _Selected(_Composed):
-    """A kernel of some of the features, its `active_dims`."""
-
-    kernel: Kernel
-    inner: DenseKernel
-
-    @override
-    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
-        return of(self.inner, *(z.index_select(-1, cast(Tensor, self.kernel.active_dims)) for z in points))
-
-
-@dataclass(frozen=True, eq=False)
-class _Combined(_Composed):
-    """A sum or a product."""
-
-    combine: Callable[[Tensor, Tensor], Tensor]
-    parts: Sequence[DenseKernel]
-
-    @override
-    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
-        return reduce(self.combine, [of(part, *points) for part in self.parts])
-
-
-@dataclass(frozen=True, eq=False)
-class _Scaled(_Composed):
-    """An output scale (variance) times another kernel."""
-
-    kernel: ScaleKernel
-    base: DenseKernel
-
-    @override
-    def composed(self, of: Callable[..., Tensor], *points: Tensor) -> Tensor:
-        return self.kernel.outputscale * of(self.base, *points)
+    def _composed(self, what: str, *points: Tensor) -> Tensor:
+        if self.of is not None:
+            points = tuple(z.index_select(-1, cast(Tensor, self.of.active_dims)) for z in points)
+        value = reduce(self.combine, [getattr(part, what)(*points) for part in self.parts])
+        return value if self.scale is None else self.scale.outputscale * value
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +149,10 @@ class _OfDistance(DenseKernel):
     def _form(self, z: Tensor) -> tuple[PointMap, Tensor, float]:
         """Embedding, length scales there, and smoothness."""
         found = embedding(self.kernel)
-        if found is not None:
-            return found[0], torch.ones(1, dtype=z.dtype, device=z.device), found[1]
-        smoothness = self.kernel.nu if isinstance(self.kernel, MaternKernel) else math.inf
-        return lambda points: points, lengthscale_of(self.kernel), smoothness
+        assert found is not None, "taken_apart found it"
+        if type(self.kernel) in (RBFKernel, MaternKernel):  # whose length scales have gradients written by hand
+            return lambda points: points, lengthscale_of(self.kernel), found[1]
+        return found[0], torch.ones(1, dtype=z.dtype, device=z.device), found[1]
 
     def _variance(self, z: Tensor) -> Tensor:
         if self.scale is None:
@@ -242,7 +193,7 @@ def _is_known(kernel: Kernel) -> bool:
         # It takes over the `active_dims` of its base, which then does not select again.
         base = kernel.base_kernel
         return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
-    return type(kernel) in KNOWN or embedding(kernel) is not None or weight_features(kernel) is not None
+    return type(kernel) in COMBINED or embedding(kernel) is not None or weight_features(kernel) is not None
 
 
 def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:

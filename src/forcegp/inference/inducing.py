@@ -153,7 +153,9 @@ class WeightSpace:
         right = factor.solve((d * self.mean)[:, None])[:, 0].contiguous()
         parts = zip(self.kernels.dense, terms.features, phis, strict=True)
         left_out = torch.stack([kernel.diagonal(z) - phi.square().sum(0) for kernel, z, phi in parts], dim=-1)
-        precision = with_left_out(deflation.C, left_out.clamp_min(0.0))
+        C = deflation.C
+        D = (C * left_out.clamp_min(0.0)[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(D))
         given = self.kernels, terms.features, self.points, deflation.C, deflation.t, precision
         return WeightSpace.of(*given, (factor.into_inverse(), right))
 
@@ -170,12 +172,8 @@ class WeightSpace:
 
     def columns(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "_ n"]]:
         """phi_c at points, one column each."""
-        return [self.column(c, z) for c, z in enumerate(features)]
-
-    def column(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "m n"]:
-        """phi_c of one latent at points of its own features."""
-        cross = self.kernels.dense[index].cross(self.points[index], z)
-        return torch.linalg.solve_triangular(self.lowers[index], cross, upper=False)
+        crosses = (k.cross(p, z) for k, p, z in zip(self.kernels.dense, self.points, features, strict=True))
+        return [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(self.lowers, crosses, strict=True)]
 
     def center_weights(self, weights: Float[Tensor, "P S"]) -> list[Float[Tensor, "_ S"]]:
         """Weights w_c of the features phi_c as those of the kernel functions about the points p_c: L_c^-T w_c."""
@@ -183,12 +181,6 @@ class WeightSpace:
             torch.linalg.solve_triangular(lower.mT, weights[part], upper=True)
             for lower, part in zip(self.lowers, self.slices, strict=True)
         ]
-
-
-def with_left_out(C: Float[Tensor, "N r C"], left_out: Float[Tensor, "N C"]) -> Float[Tensor, "N r r"]:
-    """D^-1 where the prior variances that the weights leave out of each latent count as noise of the rows."""
-    D = (C * left_out[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
-    return torch.cholesky_inverse(torch.linalg.cholesky(D))
 
 
 CANDIDATES = 20_000
@@ -252,14 +244,6 @@ class InducingPosterior(LatentPosterior):
             remainders.append((diagonal - phi.square().sum(0)).clamp_min(0.0))
         V = space.precision.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
         return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
-
-    @override
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        phi = self.space.column(index, z)
-        wide = phi.new_zeros(self.space.count, len(z))
-        wide[self.space.slices[index]] = phi
-        remainder = (self.kernels.dense[index].diagonal(z) - phi.square().sum(0)).clamp_min(0.0)
-        return remainder + self.space.precision.solve_lower(wide).square().sum(0)
 
     @override
     def function_weights(

@@ -16,7 +16,7 @@ from functools import partial
 from typing import cast
 
 import torch
-from gpytorch.kernels import ConstantKernel, Kernel, LinearKernel, PeriodicKernel, RBFKernel, ScaleKernel
+from gpytorch.kernels import ConstantKernel, Kernel, LinearKernel, MaternKernel, PeriodicKernel, RBFKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 
@@ -29,6 +29,9 @@ NO_DISTANCE = 1e-8
 
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
     """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
+    if type(kernel) in (RBFKernel, MaternKernel):
+        smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
+        return partial(scaled, kernel), float(smoothness)
     squared_exponential = getattr(kernel, "squared_exponential_embedding", None)
     if type(kernel) is PeriodicKernel:
         squared_exponential = partial(_circles, kernel)
@@ -73,6 +76,11 @@ def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[
 def lengthscale_of(kernel: Kernel) -> Float[Tensor, " d"]:
     """Its length scales, one or one per feature."""
     return cast(Tensor, kernel.lengthscale).reshape(-1)
+
+
+def scaled(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+    """Features over the length scales of a kernel."""
+    return z / lengthscale_of(kernel)
 
 
 def of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.codegen.c_text import c_text, filled
+from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import c_value
 from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
@@ -201,35 +201,21 @@ class KernelSum:
             narrow = dependence[node] == 0 or dependence[node] == (1 if one else 2)
             return f"R({operand(node)})" if narrow else operand(node)
 
-        signature = (
-            "const double *t, const double *z, long first, long count, double *k"
-            if keep
-            else "const double *t, long live, const real *z, real *f"
-        )
-        text = [f"static APART void {name}({signature}) {{", "  const long n = (long)t[0]; const double *rows = t + 8;"]
-        if not keep:
-            text.append("  (void)live;")
+        made_of_both = [node for node in graph.needed(made) if dependence[node] == 3]
         pick = "AT(z[{0}], 0)" if one and not keep else "z[{0}]"
-        text += [f"  const {state} z{k} = {pick.format(k)};" for k in range(len(operands))]
-        if not keep:
-            text += [f"  real s{k} = R(0.0);" for k in range(len(made))]
-        text.append(
-            f"  for (long j = {'first' if keep else '0'}; j < {'first + count' if keep else 'n'}; j += {step}) {{"
-        )
         load = "LOAD(rows + {0} * n + j)" if one else "rows[{0} * n + j]"
-        text += [f"    const {centre} c{k} = {load.format(k)};" for k in range(len(rows))]
-        for node in graph.needed(made):
-            if dependence[node] == 3:
-                text.append(f"    const real x{node} = {c_value(graph, node, operand, as_real, lanes)};")
-        if keep:
-            for g, (node, level) in enumerate(zip(made, self.level, strict=True)):
-                text.append(f"    STORE(k + {g} * {BLOCK} + j - first, {as_real(node)} + {level.hex()});")
-        else:
-            text += [f"    const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
-            text += [f"    s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made)]
-        text.append("  }")
-        if not keep:
-            total = "R(TOTAL(s{0}))" if one else "s{0}"
-            text += [f"  f[{k}] = {total.format(k)};" for k in range(len(made))]
-        text.append("}")
-        return "\n".join(text)
+        total = "R(TOTAL(s{0}))" if one else "s{0}"
+        words: dict[str, object] = {"NAME": name, "STEP": step}
+        words["OPERANDS"] = [f"const {state} z{k} = {pick.format(k)};" for k in range(len(operands))]
+        words["ROWS"] = [f"const {centre} c{k} = {load.format(k)};" for k in range(len(rows))]
+        words["NODES"] = [f"const real x{n} = {c_value(graph, n, operand, as_real, lanes)};" for n in made_of_both]
+        words["STARTS"] = [f"real s{k} = R(0.0);" for k in range(len(made))]
+        words["WEIGHTS"] = [f"const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
+        words["SUMS"] = [f"s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made) if owner]
+        words["ENDS"] = [f"f[{k}] = {total.format(k)};" for k in range(len(made))]
+        stored = enumerate(zip(made, self.level, strict=False))
+        words["KEPT"] = [
+            f"STORE(k + {g * BLOCK} + j - first, {as_real(x)} + {level.hex()});" for g, (x, level) in stored
+        ]
+        words |= {word: "\n".join(lines) for word, lines in words.items() if isinstance(lines, list)}
+        return filled(sections(__name__, "kernel_loop.c")["kept" if keep else "summed"], words)

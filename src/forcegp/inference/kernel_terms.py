@@ -15,12 +15,12 @@ from typing import cast
 
 import numpy as np
 import torch
-from gpytorch.kernels import AdditiveKernel, Kernel, MaternKernel, ProductKernel, RBFKernel, RQKernel, ScaleKernel
+from gpytorch.kernels import AdditiveKernel, Kernel, ProductKernel, RQKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import PointMap, embedding, weight_features
+from forcegp.inference.kernel_matrices import PointMap, embedding, scaled, weight_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,21 +97,13 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
 
 
 def _spectral_factor(kernel: Kernel) -> SpectralFactor | None:
-    if type(kernel) is RBFKernel:
-        return SpectralFactor(partial(_scaled, kernel))
-    if type(kernel) is MaternKernel:
-        return SpectralFactor(partial(_scaled, kernel), -0.5, float(kernel.nu))
     if type(kernel) is RQKernel:
-        return SpectralFactor(partial(_scaled, kernel), 0.5, float(kernel.alpha.detach()))
+        return SpectralFactor(partial(scaled, kernel), 0.5, float(kernel.alpha.detach()))
     found = embedding(kernel)
     if found is None:
         return None
     embed, smoothness = found
     return SpectralFactor(embed) if smoothness == math.inf else SpectralFactor(embed, -0.5, smoothness)
-
-
-def _scaled(kernel: Kernel, z: Tensor) -> Tensor:
-    return z / cast(Tensor, kernel.lengthscale).reshape(-1)
 
 
 GRID = 4096

@@ -14,12 +14,15 @@ sum_a C_iac alpha_ia:
     dNLL/dW~_i     = U_i dNLL/dC_i - remainder_i (K_c beta_c)_i^T           dNLL/dy~_i = U_i alpha_i + remainder_i
 
 The last line follows from S~^-1 = U T^-1 U^T + (I - U U^T), so nothing is differentiated through the basis U. T lives
-in one buffer of (rN)^2 doubles that becomes its own factor and its own inverse; it is written and read in panels of
-rows, lower triangle only.
+in one buffer of (rN)^2 doubles that becomes its own factor L and L^-1; it is written and read in panels of rows, lower
+triangle only. With V_c = L^-1 C_c, its rows numbered by r,
+
+    dNLL/dk_c = 1/2 (V_c^T V_c - beta_c beta_c^T)
+    sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] = sum_r L^-1_r(ia) (V_c k_c)_ri
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -49,23 +52,13 @@ class Deflation:
         """The largest rank of W_i over the points (r)."""
         return self.C.shape[-2]
 
-    def columns(self, index: int, cross: Float[Tensor, "n N"]) -> Float[Tensor, "Nr n"]:
-        """Covariance of t with one latent at n points, from its kernel function `cross` between these and all rows."""
-        return (cross.mT[:, None, :] * self.C[:, :, index, None]).flatten(0, 1)
+    def through(self, index: int, K: Float[Tensor, "N _"]) -> Float[Tensor, "Nr _"]:
+        """What t is of one latent whose values at the points are columns of K."""
+        return (K[:, None, :] * self.C[:, :, index, None]).flatten(0, 1)
 
-    def drawn_weights(
-        self,
-        prior: Sequence[Float[Tensor, "S N"]],
-        generator: torch.Generator,
-        solve: Callable[[Tensor], Tensor],
-        jitter: float = 0.0,
-    ) -> tuple[Float[Tensor, "S N"], ...]:
-        """Matheron's rule: C^T T^-1 (t - C g_s - eps_s) with eps_s ~ N(0, 1 + jitter) and `solve` for T^-1."""
-        residual = self.t - torch.einsum("jac,csj->sja", self.C, torch.stack(list(prior)))
-        noise = torch.randn(residual.shape, generator=generator, dtype=self.C.dtype, device=self.C.device)
-        residual = residual - math.sqrt(1.0 + jitter) * noise
-        alpha = solve(residual.flatten(1).mT.contiguous()).mT.reshape(residual.shape)
-        return torch.einsum("jac,sja->csj", self.C, alpha).unbind(0)
+    def back(self, index: int, alpha: Float[Tensor, "Nr _"]) -> Float[Tensor, "N _"]:
+        """The transpose of `through`."""
+        return (self.C[:, :, index, None] * alpha.unflatten(0, self.t.shape)).sum(1)
 
 
 def whiten(
@@ -193,43 +186,18 @@ def deflated_covariance(
     C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "N N"]]
 ) -> Float[Tensor, "n n"]:
     """T of size (rN, rN), point-major; only the lower triangle (and the diagonal panels) are filled."""
-    count, rank, _ = C.shape
-    T = torch.empty(count * rank, count * rank, dtype=C.dtype, device=C.device)
-    for panel in _panels(C, kernel_matrices):
-        rows = T[panel.start * rank : panel.stop * rank, : panel.stop * rank]
-        rows.copy_(torch.bmm(C[panel.start : panel.stop], panel.weighted).reshape(rows.shape))
-    T.diagonal().add_(1.0)
-    return T
-
-
-@dataclass(frozen=True, eq=False)
-class _Panel:
-    """Rows start..stop against columns 0..stop; what is computed of them is computed where it is needed."""
-
-    start: int
-    stop: int
-    kernel_matrices: Sequence[Float[Tensor, "N N"]]
-    C_by_latent: Float[Tensor, "C N r"]
-
-    @property
-    def kernel(self) -> Float[Tensor, "i C j"]:
-        """k_c[i, j]."""
-        return torch.stack([K[self.start : self.stop, : self.stop] for K in self.kernel_matrices], dim=1)
-
-    @property
-    def weighted(self) -> Float[Tensor, "i C jb"]:
-        """k_c[i, j] C_jbc."""
-        return (self.kernel[..., None] * self.C_by_latent[None, :, : self.stop, :]).flatten(2)
-
-
-def _panels(C: Float[Tensor, "N r C"], kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> Iterator[_Panel]:
     count, rank, latents = C.shape
-    if not latents:
-        return
+    T = torch.empty(count * rank, count * rank, dtype=C.dtype, device=C.device)
     C_by_latent = C.permute(2, 0, 1).contiguous()
     height = max(1, min(count, PANEL_BYTES // max(1, 8 * latents * count * rank)))
-    for start in range(0, count, height):
-        yield _Panel(start, min(count, start + height), kernel_matrices, C_by_latent)
+    for start in range(0, count if rank else 0, height):
+        stop = min(count, start + height)
+        kernel = torch.stack([K[start:stop, :stop] for K in kernel_matrices], dim=1)
+        weighted = (kernel[..., None] * C_by_latent[None, :, :stop]).flatten(2)  # k_c[i, j] C_jbc
+        rows = T[start * rank : stop * rank, : stop * rank]
+        rows.copy_(torch.bmm(C[start:stop], weighted).reshape(rows.shape))
+    T.diagonal().add_(1.0)
+    return T
 
 
 class _DeflatedNLL(torch.autograd.Function):
@@ -250,12 +218,8 @@ class _DeflatedNLL(torch.autograd.Function):
         if not kernel_matrices:
             gradients[0] = torch.zeros_like(W_white)
         elif W_needed or any(K_needed):
-            if W_varies:
-                C_gradient, K_gradients = _inverse_contractions(system, kernel_matrices, W_needed, K_needed)
-            else:
-                C_gradient, K_gradients = _factor_contractions(system, K_needed)
-            gradients[2:] = K_gradients
-            if C_gradient is not None and W_needed:
+            C_gradient, gradients[2:] = _contractions(system, kernel_matrices, W_needed and W_varies, K_needed)
+            if W_needed:
                 latent_mean = torch.stack([K @ beta[:, c] for c, K in enumerate(kernel_matrices)], dim=-1)
                 C_gradient = C_gradient - alpha[..., None] * latent_mean[:, None, :]
                 gradients[0] = deflation.U @ C_gradient - deflation.remainder[..., None] * latent_mean[:, None, :]
@@ -276,61 +240,36 @@ def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | N
     return tuple(None if g is None else upstream * g for g in gradients)
 
 
-def _factor_contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
-    """As `_inverse_contractions`, where only the noise moves W~: from L^-1, a fifth faster than from T^-1.
+def _contractions(
+    system: DeflatedSystem, kernel_matrices: Sequence[Tensor], W_varies: bool, K_needed: Sequence[bool]
+) -> tuple[Tensor, list[Tensor | None]]:
+    """sum_jb T^-1 C k and dNLL/dK from one sweep over L^-1; the factor's memory is used up.
 
-    With V_c = L^-1 C_c, dNLL/dK_c = 1/2 (V_c^T V_c - beta_c beta_c^T). Noise moves W~_i to E W~_i, so of dNLL/dC_i only
-    the part in the space of the rows of C_i counts; and since T = 1 + C K C^T,
-    ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii``.
+    Where only the noise moves W~_i, to E W~_i, of the first only the part in the space of the rows of C_i counts; and
+    since T = 1 + C K C^T, ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii``, which is cheaper.
     """
     C, beta = system.deflation.C, system.beta
     count, rank, _ = C.shape
     inverse = system.factor.into_inverse_factor()
     K_gradients = [torch.outer(beta[:, c], -0.5 * beta[:, c]) if need else None for c, need in enumerate(K_needed)]
-    diagonal = torch.zeros(count, rank, rank, dtype=C.dtype, device=C.device)
+    C_gradient, diagonal = torch.zeros_like(C), C.new_zeros(count, rank, rank)
     height = max(1, INNER // max(1, rank))
     for start in range(0, count, height):
         stop = min(count, start + height)
         rows = inverse[start * rank : stop * rank, : stop * rank]
         rows[:, start * rank :].tril_()  # LAPACK leaves the upper triangle as it is
         X = rows.view((stop - start) * rank, stop, rank).permute(1, 2, 0)
-        diagonal[:stop] += torch.bmm(X, X.mT)
         V = torch.bmm(C[:stop].mT, X)  # (j, c, rows)
         for c, K_gradient in enumerate(K_gradients):
             if K_gradient is not None:
                 K_gradient[:stop, :stop].addmm_(V[:, c], V[:, c].mT, alpha=0.5)
+        if W_varies:
+            seen = torch.stack([K[:stop, :stop] @ V[:, c] for c, K in enumerate(kernel_matrices)], dim=-1)
+            C_gradient[:stop] += torch.bmm(X, seen)
+        else:
+            diagonal[:stop] += torch.bmm(X, X.mT)
+    if W_varies:
+        return C_gradient, K_gradients
     squares = C.square().sum(-1, keepdim=True)  # the rows of C_i are orthogonal
     dual = torch.where(squares > RANK_TOLERANCE**2 * squares.sum(1, keepdim=True), C / squares, torch.zeros_like(C))
     return dual - (1.0 + system.factor.jitter) * diagonal @ dual, K_gradients
-
-
-def _inverse_contractions(
-    system: DeflatedSystem, kernel_matrices: Sequence[Tensor], W_needed: bool, K_needed: Sequence[bool]
-) -> tuple[Tensor | None, list[Tensor | None]]:
-    """sum_jb T^-1 C k and dNLL/dK from one sweep over T^-1; the factor's memory is used up."""
-    C, beta = system.deflation.C, system.beta
-    rank, latents = C.shape[1:]
-    inverse = system.factor.into_inverse()
-    C_by_latent = C.permute(2, 0, 1).contiguous()
-    C_gradient = torch.zeros_like(C) if W_needed else None
-    K_gradients = [torch.empty_like(K) if need else None for K, need in zip(kernel_matrices, K_needed, strict=True)]
-    for panel in _panels(C, kernel_matrices):
-        i, j, height = slice(panel.start, panel.stop), slice(0, panel.stop), panel.stop - panel.start
-        rows = inverse[panel.start * rank : panel.stop * rank, : panel.stop * rank]
-        corner = rows[:, panel.start * rank :]
-        lower = corner.tril()
-        corner.copy_(lower + lower.tril(-1).mT)  # LAPACK leaves the upper triangle of the diagonal block unset
-        rows = rows.reshape(height, rank, panel.stop * rank)
-        left = torch.bmm(C[i].mT, rows).view(height, latents, panel.stop, rank)  # C_i^T T^-1_ij
-        if any(K_needed):
-            contracted = torch.einsum("icjb,cjb->cij", left, C_by_latent[:, j])
-            for c, K_gradient in enumerate(K_gradients):
-                if K_gradient is not None:
-                    block = 0.5 * (contracted[c] - beta[i, c, None] * beta[j, c])
-                    K_gradient[i, j] = block
-                    K_gradient[j, i] = block.mT
-        if C_gradient is not None:
-            C_gradient[i] += torch.bmm(rows, panel.weighted.mT)
-            above = slice(0, panel.start)  # the mirrored half: rows j < start see the columns of this panel
-            C_gradient[above] += torch.einsum("icj,icjb->jbc", panel.kernel[..., above], left[:, :, above])
-    return C_gradient, K_gradients

@@ -20,7 +20,6 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from typing_extensions import override
 
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.dense_kernels import LatentKernels
@@ -33,10 +32,10 @@ REMEDY = "use fewer points (windows), or fewer nodes in each"
 
 @dataclass(frozen=True, eq=False)
 class Functionals:
-    """N functionals of n states each, whitened: G (N, D, n, C), y~ (N, D) and sum_w log|L_w|."""
+    """N functionals of n states each, whitened: G (N, D, n, C), t = y~ (N, D) and sum_w log|L_w|."""
 
     G: Float[Tensor, "N D n C"]
-    y: Float[Tensor, "N D"]
+    t: Float[Tensor, "N D"]
     log_noise: Float[Tensor, ""]
 
     @classmethod
@@ -70,8 +69,8 @@ class Functionals:
 
     def covariance(self, kernel_matrices: Sequence[Float[Tensor, "Nn Nn"]]) -> Float[Tensor, "ND ND"]:
         """S, differentiable in G and in the kernel matrices."""
-        rows = self.y.numel()
-        S = torch.eye(rows, dtype=self.y.dtype, device=self.y.device)
+        rows = self.t.numel()
+        S = torch.eye(rows, dtype=self.t.dtype, device=self.t.device)
         for index, K in enumerate(kernel_matrices):
             S = S + self.through(index, self.through(index, K).mT)
         return S
@@ -89,8 +88,8 @@ def functional_negative_log_likelihood(
 ) -> Float[Tensor, ""]:
     """Exact -log p(y) of `Functionals.of`; once differentiable. Raises NumericalError without a factorisation."""
     functionals = Functionals.of(weights, terms)
-    quadratic_and_logdet = _NormalNLL.apply(functionals.covariance(kernel_matrices), functionals.y.flatten())
-    constant = 0.5 * functionals.y.numel() * math.log(2.0 * math.pi)
+    quadratic_and_logdet = _NormalNLL.apply(functionals.covariance(kernel_matrices), functionals.t.flatten())
+    constant = 0.5 * functionals.t.numel() * math.log(2.0 * math.pi)
     return quadratic_and_logdet + functionals.log_noise + constant
 
 
@@ -123,14 +122,22 @@ class _NormalNLL(torch.autograd.Function):
 
 
 @dataclass(frozen=True, eq=False)
+class FunctionalSystem:
+    """S factorised, with the weights that every prediction needs; the centres are all N n states."""
+
+    deflation: Functionals
+    factor: CholeskyFactor
+    alpha: Float[Tensor, " ND"]
+    beta: Float[Tensor, "Nn C"]
+
+
+@dataclass(frozen=True, eq=False)
 class FunctionalPosterior(FactorizedPosterior):
     """The exact posterior given functionals; the centres of every latent are all N n states."""
 
     kernels: LatentKernels
     features: tuple[Float[Tensor, "Nn _"], ...]
-    functionals: Functionals
-    factor: CholeskyFactor
-    alpha: Float[Tensor, " ND"]
+    system: FunctionalSystem
     remedy: ClassVar[str] = "fit to accelerations, with StructuredGP.fit, for which single rows are what is observed"
 
     @classmethod
@@ -140,32 +147,7 @@ class FunctionalPosterior(FactorizedPosterior):
             functionals = Functionals.of(weights, terms)
             S = functionals.covariance(kernels(terms.features))
             factor = factorize(lambda: 0.5 * (S + S.mT))
-            alpha = factor.solve(functionals.y.reshape(-1, 1))[:, 0]
-        return cls(kernels, tuple(z.detach() for z in terms.features), functionals, factor, alpha)
-
-    @property
-    @override
-    def weights(self) -> tuple[Float[Tensor, " Nn"], ...]:
-        return tuple(self.functionals.back(index, self.alpha[:, None])[:, 0] for index in range(len(self.features)))
-
-    @property
-    @override
-    def data_factor(self) -> CholeskyFactor:
-        return self.factor
-
-    @override
-    def data_covariance(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        return self.functionals.through(index, self.kernels.dense[index].cross(self.features[index], z))
-
-    @override
-    def function_weights(
-        self, prior: Sequence[Float[Tensor, "S Nn"]], generator: torch.Generator
-    ) -> tuple[Float[Tensor, "S Nn"], ...]:
-        # G^T S^-1 (y~ - G g_s(Z) - eps_s) with eps_s ~ N(0, I)
-        seen = sum(self.functionals.through(index, values.mT) for index, values in enumerate(prior))
-        y = self.functionals.y
-        samples = prior[0].shape[0]
-        noise = torch.randn(y.numel(), samples, generator=generator, dtype=y.dtype, device=y.device)
-        residual = y.reshape(-1, 1) - seen - math.sqrt(1.0 + self.factor.jitter) * noise
-        alpha = self.factor.solve(residual.contiguous())
-        return tuple(self.functionals.back(index, alpha).mT for index in range(len(prior)))
+            alpha = factor.solve(functionals.t.reshape(-1, 1))
+            beta = torch.cat([functionals.back(c, alpha) for c in range(terms.W.shape[-1])], dim=-1)
+        system = FunctionalSystem(functionals, factor, alpha[:, 0], beta)
+        return cls(kernels, tuple(z.detach() for z in terms.features), system)

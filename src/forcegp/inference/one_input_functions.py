@@ -17,6 +17,7 @@ from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.codegen.c_text import c_text, filled
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import PointMap
 from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
@@ -65,10 +66,6 @@ class OneInputFunctions:
     low: float = -sys.float_info.max
     high: float = sys.float_info.max
     error: float = 0.0
-
-    def evaluate(self, s: Float[Tensor, " n"]) -> tuple[Float[Tensor, "n R"], Float[Tensor, "n R"]]:
-        """The functions and their derivatives; at a kink that to the right."""
-        return value_and_slope(self.values, s)
 
     def values(self, s: Float[Tensor, " n"]) -> Float[Tensor, "n R"]:
         """The functions, differentiable in s."""
@@ -125,33 +122,13 @@ class OneInputFunctions:
         slope = [_times(self.envelopes[e], f"({' + '.join(part)})") for e, part in enumerate(changes) if part]
         for e, factors in enumerate(self.envelopes):
             slope += [f"{slopes[i]} * {_times(factors[:k] + factors[k + 1 :], f'g{e}')}" for k, i in enumerate(factors)]
-        return f"""
-static void {name}(const double *table, real s, real *f, real *slope) {{
-  const double *p = table + 8, *bucket = p + (int)table[5], *row[LANES];
-  const int knots = (int)table[0], buckets = 2 * knots;
-  const double *knot = bucket + buckets + 1;
-  for (int k = 0; k < LANES; ++k) {{
-    if (!(AT(s, k) >= table[2] && AT(s, k) <= table[3])) AT(s, k) = NAN;
-    const double place = (AT(s, k) - table[6]) * table[7];
-    const int b = place >= buckets ? buckets - 1 : place > 0.0 ? (int)place : 0;
-    int low = (int)bucket[b], high = (int)bucket[b + 1]; /* as many knots are <= s as rows stand before its own */
-    while (low < high) {{ const int m = (low + high) / 2; if (AT(s, k) < knot[m]) high = m; else low = m + 1; }}
-    row[k] = knot + knots + (int)table[4] * low; (void)row;
-  }}
-  {" ".join(ready)}
-  {" ".join(f"real u{i};" for i in range(len(self.sides)))}
-  for (int k = 0; k < LANES; ++k) {{ {" ".join(found)} }}
-  {" ".join(decaying)}
-  for (int r = 0; r < (int)table[1]; ++r) {{
-    const double *c = p + {len(self.rates)} + {len(E)} * r;
-    real {", ".join([f"g{e}" for e in E] + [f"w{i}" for i in range(first)])};
-    for (int k = 0; k < LANES; ++k) {{ {" ".join(lanes)} }}
-    {" ".join(values)}
-    f[r] = {" + ".join(_times(factors, f"g{e}") for e, factors in enumerate(self.envelopes))};
-    if (slope) slope[r] = {" + ".join(slope) or "g0 - g0"};
-  }}
-}}
-"""
+        words: dict[str, object] = {"NAME": name, "RATES": len(self.rates), "ENVELOPES": len(E)}
+        words |= {"CURVES": " ".join(ready), "DISTANCES": " ".join(f"real u{i};" for i in range(len(self.sides)))}
+        words |= {"AWAY": " ".join(found), "DECAYS": " ".join(decaying), "COEFFICIENTS": " ".join(lanes)}
+        words |= {"NUMBERS": ", ".join([f"g{e}" for e in E] + [f"w{i}" for i in range(first)])}
+        words |= {"SIDES": " ".join(values), "SLOPE": " + ".join(slope) or "g0 - g0"}
+        words["VALUE"] = " + ".join(_times(factors, f"g{e}") for e, factors in enumerate(self.envelopes))
+        return filled(c_text(__name__, "one_input.c"), words)
 
 
 def cubic_table(
@@ -231,12 +208,10 @@ def one_input_form(
     latent: LatentPosterior,
     index: int,
     coefficients: Float[Tensor, "N R"] | None = None,
-    *,
-    tolerance: float = TOLERANCE,
 ) -> OneInputFunctions | None:
     """sum_j k(z, z_j) c_jr of one latent in the form that suits its kernel; without coefficients, its posterior mean.
 
-    A table is at most `tolerance` of the largest value from the sum and reaches `MARGIN` beyond the centres. None for
+    A table is at most `TOLERANCE` of the largest value from the sum and reaches `MARGIN` beyond the centres. None for
     several inputs and where `MOST_INTERVALS` do not suffice.
     """
     centers, kernel = latent.features[index].detach(), latent.kernels.dense[index]
@@ -246,7 +221,7 @@ def one_input_form(
     exact = markov_functions(latent.kernels[index], centers[:, 0], weights)
     if exact is not None:
         return exact
-    return cubic_table(lambda s: kernel.cross(s[:, None], centers) @ weights, centers[:, 0], MARGIN, tolerance)
+    return cubic_table(lambda s: kernel.cross(s[:, None], centers) @ weights, centers[:, 0], MARGIN, TOLERANCE)
 
 
 def drawn_form(

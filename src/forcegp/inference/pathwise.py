@@ -11,7 +11,7 @@ approximate, and the better the more cosines there are. Squared exponentials of 
 (`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -69,26 +69,13 @@ class StackedKernels:
         return distance.mul_(-0.5).exp_() * self.variances[:, None, None]  # not in place: exp needs its result
 
 
-@dataclass(frozen=True, eq=False)
-class StackedFunctions:
-    """The posterior mean of all latents, for many calls with few points: the same values as `LatentPosterior.mean`."""
-
-    latent: LatentPosterior
-    kernels: StackedKernels | None
-    weights: Float[Tensor, "C N"]
-
-    @classmethod
-    def mean_of(cls, latent: LatentPosterior) -> "StackedFunctions":
-        """Prepared once for a posterior; kernels that cannot be stacked are evaluated one by one."""
-        with torch.no_grad():
-            return cls(latent, StackedKernels.of(latent), stacked(latent.weights))
-
-    def __call__(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
-        """E f_c at the points."""
-        if self.kernels is None:
-            return self.latent.mean(features)
-        cross = self.kernels.cross(self.kernels.scaled(features))
-        return (cross @ self.weights[..., None])[..., 0].mT
+def mean_function(latent: LatentPosterior) -> Callable[[Sequence[Tensor]], Tensor]:
+    """`latent.mean`, prepared for many calls with few points; kernels that cannot be stacked are evaluated by it."""
+    with torch.no_grad():
+        kernels, weights = StackedKernels.of(latent), stacked(latent.weights)
+    if kernels is None:
+        return latent.mean
+    return lambda features: (kernels.cross(kernels.scaled(features)) @ weights[..., None])[..., 0].mT
 
 
 @dataclass(frozen=True, eq=False)

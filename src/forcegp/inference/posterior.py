@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,6 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.likelihood import DeflatedSystem, Terms, solve_deflated
 
@@ -43,23 +42,6 @@ class LatentPosterior(ABC):
         """Cov(f_c, f_d) at the same point, for n points."""
 
     @abstractmethod
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        """Variance of one latent at points of its own features."""
-
-    def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
-        """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
-
-        Rasmussen & Williams 2006, eq. 2.26. Raises InvalidInput for engines that do not factorise the covariance.
-        """
-        V = torch.cat([self.seen(index, z) for index, z in enumerate(features)], dim=-1)
-        prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
-        return prior - V.mT @ V
-
-    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        """L^-1 Cov(data, f(z)), L L^T that of the (whitened) data. Raises InvalidInput where nothing is factorised."""
-        raise InvalidInput(f"a {type(self).__name__} does not factorise the covariance of all rows; {self.remedy}.")
-
-    @abstractmethod
     def function_weights(
         self, prior: Sequence[Float[Tensor, "S _"]], generator: torch.Generator
     ) -> tuple[Float[Tensor, "S _"], ...]:
@@ -74,7 +56,8 @@ class LatentPosterior(ABC):
 
     def one(self, index: int, z: Float[Tensor, "n _"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Mean and variance of one latent at points of its own features."""
-        return self._mean_of(index, z), self.variance_of(index, z)
+        points = [z if c == index else z.new_zeros(len(z), own.shape[-1]) for c, own in enumerate(self.features)]
+        return self._mean_of(index, z), self.covariance(points)[:, index, index]
 
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
@@ -95,38 +78,59 @@ class LatentPosterior(ABC):
 
 
 class FactorizedPosterior(LatentPosterior):
-    """A posterior from the factorised covariance L L^T of the (whitened) data."""
+    """A posterior from the factorised covariance L L^T of the (whitened) data.
+
+    `system` holds the `factor`, `alpha` = (L L^T)^-1 data, the weights `beta` (N, C) of the centres, and as `deflation`
+    how the data depend on the values of the latents at these: its methods `through` and `back`.
+    """
+
+    system: Any
 
     @property
-    @abstractmethod
-    def data_factor(self) -> CholeskyFactor:
-        """L."""
+    @override
+    def weights(self) -> tuple[Float[Tensor, " N"], ...]:
+        return self.system.beta.unbind(-1)
 
-    @abstractmethod
     def data_covariance(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
         """Cov(data, f(z)) of one latent."""
+        return self.system.deflation.through(index, self.kernels.dense[index].cross(z, self.features[index]).mT)
 
-    @override
-    def seen(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        return self.data_factor.solve_lower(self.data_covariance(index, z))
+    def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
+        """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
 
-    @override
-    def variance_of(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
-        return self.kernels.dense[index].diagonal(z) - self.seen(index, z).square().sum(0)
+        Rasmussen & Williams 2006, eq. 2.26.
+        """
+        C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=-1)
+        V = self.system.factor.solve_lower(C)
+        prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
+        return prior - V.mT @ V
 
     @override
     def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 Cov(data, f_c(z)) (Rasmussen & Williams 2006, eq. 2.26)
         latents, points = len(self.features), len(features[0])
-        height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.data_factor.lower)))
+        height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.system.factor.lower)))
         blocks = []
         for start in range(0, points, height):
             block = [z[start : start + height] for z in features]
             C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(block)], dim=1)
-            V = self.data_factor.solve_lower(C).unflatten(1, (latents, -1)).permute(2, 1, 0)
+            V = self.system.factor.solve_lower(C).unflatten(1, (latents, -1)).permute(2, 1, 0)
             prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, block, strict=True)], dim=-1)
             blocks.append(torch.diag_embed(prior) - V @ V.mT)
         return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
+
+    @override
+    def function_weights(
+        self, prior: Sequence[Float[Tensor, "S N"]], generator: torch.Generator
+    ) -> tuple[Float[Tensor, "S N"], ...]:
+        # (L L^T)^-1 (data - what the prior functions make of them - eps) with eps ~ N(0, 1 + jitter)
+        observed, alpha, factor = self.system.deflation, self.system.alpha, self.system.factor
+        size = len(prior[0]), alpha.numel()
+        noise = torch.randn(size, generator=generator, dtype=alpha.dtype, device=alpha.device).mT
+        seen = sum(observed.through(index, values.mT) for index, values in enumerate(prior))
+        residual = observed.t.reshape(-1, 1) - seen - math.sqrt(1.0 + factor.jitter) * noise
+        weights = factor.solve(residual.contiguous())
+        return tuple(observed.back(index, weights).mT for index in range(len(prior)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,27 +147,6 @@ class ExactPosterior(FactorizedPosterior):
         with torch.no_grad():
             system = solve_deflated(terms.deflated(), kernels(terms.features))
         return cls(kernels, tuple(z.detach() for z in terms.features), system)
-
-    @property
-    @override
-    def weights(self) -> tuple[Float[Tensor, " N"], ...]:
-        return self.system.beta.unbind(-1)
-
-    @property
-    @override
-    def data_factor(self) -> CholeskyFactor:
-        return self.system.factor
-
-    @override
-    def data_covariance(self, index: int, z: Float[Tensor, "n _"]) -> Float[Tensor, "R n"]:
-        return self.system.deflation.columns(index, self.kernels.dense[index].cross(z, self.features[index]))
-
-    @override
-    def function_weights(
-        self, prior: Sequence[Float[Tensor, "S N"]], generator: torch.Generator
-    ) -> tuple[Float[Tensor, "S N"], ...]:
-        factor = self.system.factor
-        return self.system.deflation.drawn_weights(prior, generator, factor.solve, factor.jitter)
 
 
 def exact(latent: LatentPosterior, what: str) -> ExactPosterior:

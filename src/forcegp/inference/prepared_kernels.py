@@ -15,16 +15,15 @@ does to the standard deviations there, found a block at a time, where most is mi
 tenth more than the best ones, in a third of the time that a singular value decomposition takes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.inference.dense_kernels import DenseKernel
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
-from forcegp.inference.kernel_sums import KernelSum
+from forcegp.inference.kernel_sums import KernelSum, PairFunction
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior
 
 ROUNDING = 1e-7
@@ -60,7 +59,7 @@ class CompressedCovariance:
         """The covariance at n points, by torch."""
         parts: dict[int, Tensor] = {}
         for group, F in zip(kernel_groups(latent), self.factors, strict=True):
-            for c, own in zip(group.latents, F, strict=True):
+            for c, own in zip(group, F, strict=True):
                 parts[c] = latent.kernels.dense[c].cross(features[c], latent.features[c]) @ own
         P = torch.stack([parts[c] for c in sorted(parts)], dim=1)
         prior = torch.stack([k.diagonal(z) for k, z in zip(latent.kernels.dense, features, strict=True)], dim=-1)
@@ -68,13 +67,7 @@ class CompressedCovariance:
 
 
 def compress(
-    latent: ExactPosterior,
-    groups: Sequence[Sequence[int]],
-    sample: Sample,
-    check: Sample,
-    *,
-    tolerance: float,
-    largest: int,
+    latent: ExactPosterior, sample: Sample, check: Sample, *, tolerance: float, largest: int
 ) -> CompressedCovariance:
     """The smallest rank at which standard deviations at the states of `check` are at most 1 + `tolerance` too large.
 
@@ -103,7 +96,7 @@ def compress(
         S = latent.system.factor.solve_upper(B.mT.contiguous())
         C = latent.system.deflation.C
         factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], -1))
-        chosen = tuple(factors[list(group)].contiguous() for group in groups)
+        chosen = tuple(factors[list(group)].contiguous() for group in kernel_groups(latent))
     return CompressedCovariance(chosen, (1.0 + excess[len(B) - 1]).sqrt() - 1.0)
 
 
@@ -136,89 +129,49 @@ def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "
     return torch.cat(D), torch.cat(known).square()
 
 
-@dataclass(frozen=True, eq=False)
-class SharedCenters:
-    """Squared exponentials of latents with the same centres (N, d), whose mean is `shift`."""
-
-    latents: tuple[int, ...]
-    centers: Float[Tensor, "N d"]
-    shift: Float[Tensor, " d"]
-    precisions: Float[Tensor, "G d"]  # 1 / l^2
-    variances: Float[Tensor, " G"]
-
-    @classmethod
-    def of(
-        cls, latents: tuple[int, ...], centers: Float[Tensor, "N d"], scales: Sequence[tuple[Tensor, Tensor]]
-    ) -> "SharedCenters":
-        """`scales` are the length scales and the variance of every latent."""
-        precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])
-        variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])
-        return cls(latents, centers, centers.mean(0), precisions, variances)
-
-    def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, " G"]:
-        """k_c(z, z_j) - s_c from the features themselves: with long length scales k is nearly s, and sums cancel."""
-        z, center = z - self.shift, center - self.shift  # or what cancels would be large
-        scaled = z * self.precisions
-        own = -0.5 * (self.precisions * center.square()).sum(-1)
-        return self.variances * (((scaled * center).sum(-1) + own) - 0.5 * (scaled * z).sum(-1)).expm1()
-
-    @property
-    def level(self) -> tuple[float, ...]:
-        """What `pair` leaves out."""
-        return tuple(self.variances.tolist())
-
-    def variances_at(self, z: Float[Tensor, "1 d"]) -> Float[Tensor, "1 G"]:
-        """k_c(z, z)."""
-        return self.variances[None]
-
-
-@dataclass(frozen=True, eq=False)
-class AnyKernel:
-    """One latent with a kernel of any kind."""
-
-    latents: tuple[int]
-    centers: Float[Tensor, "N d"]
-    kernel: DenseKernel
-    level: tuple[float, ...] = (0.0,)
-
-    def pair(self, z: Float[Tensor, "1 d"], center: Float[Tensor, "1 d"]) -> Float[Tensor, "1 1"]:
-        """k(z, z_j)."""
-        return self.kernel.cross(z, center)
-
-    def variances_at(self, z: Float[Tensor, "1 d"]) -> Float[Tensor, " 1"]:
-        """k(z, z)."""
-        return self.kernel.diagonal(z)
-
-
-KernelGroup = SharedCenters | AnyKernel
-
-
 def kernel_sums(latent: LatentPosterior) -> tuple[KernelSum, ...]:
     """The groups as C functions of the posterior mean. Raises InvalidInput for a kernel that cannot be traced."""
     found = []
     for k, group in enumerate(kernel_groups(latent)):
-        weights = torch.stack([latent.weights[c].detach() for c in group.latents])
-        given = (group.centers, weights, group.pair, group.variances_at, group.level)
-        found.append(KernelSum.of(f"latents{k}", group.latents, *given))
+        centers, kernel = latent.features[group[0]], latent.kernels.dense[group[0]]
+        weights = torch.stack([latent.weights[c].detach() for c in group])
+        scales = [each for c in group if (each := squared_exponential_parameters(latent.kernels[c])) is not None]
+        formulas = _squared_exponentials(centers, scales) if scales else (kernel.cross, kernel.diagonal, (0.0,))
+        found.append(KernelSum.of(f"latents{k}", group, centers, weights, *formulas))
     return tuple(found)
 
 
-def kernel_groups(latent: LatentPosterior) -> tuple[KernelGroup, ...]:
-    """Latents by what they share."""
-    shared: list[tuple[Tensor, list[int]]] = []
-    scales: dict[int, tuple[Tensor, Tensor]] = {}
-    groups: list[KernelGroup] = []
+def _squared_exponentials(
+    centers: Float[Tensor, "N d"], scales: Sequence[tuple[Tensor, Tensor]]
+) -> tuple[PairFunction, Callable[[Tensor], Tensor], tuple[float, ...]]:
+    """k_c(z, z_j) - s_c of latents with the same centres, k_c(z, z), and s_c, from length scales and variances.
+
+    From the features themselves, less a constant: with long length scales k is nearly s, and sums cancel.
+    """
+    shift = centers.mean(0)
+    precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])
+    variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])
+
+    def pair(z: Tensor, center: Tensor) -> Tensor:
+        z, center = z - shift, center - shift  # or what cancels would be large
+        scaled = z * precisions
+        own = -0.5 * (precisions * center.square()).sum(-1)
+        return variances * (((scaled * center).sum(-1) + own) - 0.5 * (scaled * z).sum(-1)).expm1()
+
+    return pair, lambda z: variances[None], tuple(variances.tolist())
+
+
+def kernel_groups(latent: LatentPosterior) -> tuple[tuple[int, ...], ...]:
+    """Numbers of the latents that are summed together: first those that are not squared exponentials, each alone."""
+    alone: list[tuple[int, ...]] = []
+    shared: list[list[int]] = []
     for index, (kernel, centers) in enumerate(zip(latent.kernels, latent.features, strict=True)):
-        found = squared_exponential_parameters(kernel)
-        if found is None:
-            groups.append(AnyKernel((index,), centers, latent.kernels.dense[index]))
+        if squared_exponential_parameters(kernel) is None:
+            alone.append((index,))
             continue
-        scales[index] = found
-        same = next((members for other, members in shared if torch.equal(other, centers)), None)
+        same = next((group for group in shared if torch.equal(latent.features[group[0]], centers)), None)
         if same is None:
-            shared.append((centers, [index]))
+            shared.append([index])
         else:
             same.append(index)
-    for centers, members in shared:
-        groups.append(SharedCenters.of(tuple(members), centers, [scales[c] for c in members]))
-    return tuple(groups)
+    return (*alone, *map(tuple, shared))

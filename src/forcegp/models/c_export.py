@@ -119,8 +119,8 @@ def export_c(
         differences = {} if unchecked else _compared(export, checks, temporary)
         apart = ", ".join(f"{what} {value:.1e}" for what, value in differences.items())
         states = f"at {STATES} states, training rows and others between and around them"
-        said = f"Compared with forcegp {states}; largest difference / largest value: {apart}." if apart else ""
-        said = said or "Nobody has compared this program with forcegp: run self_test.c."
+        said = f"Compared with forcegp {states}; largest difference / largest value: {apart}."
+        said = said if apart else "This program was not compared with forcegp: run self_test.c."
         export.write(temporary, source, said, checks)
         files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
     inflation = None if reference.inflation is None else float(reference.inflation.max())

@@ -25,14 +25,9 @@ SLOW, AHEAD, LEARNING = 4.0, 0.5, 10.0  # s: of the mean that stays, of what is 
 
 
 def observing(
-    posterior: AnyPosterior,
-    dataset: Dataset,
-    *,
-    seconds: float | None = None,
-    frame: str | None = None,
-    whole: bool = False,
+    posterior: AnyPosterior, dataset: Dataset, *, seconds: float | None = None, whole: bool = False
 ) -> tuple[AnyPosterior, Dataset]:
-    """The posterior and the recording with an `ObservedWrench` on link `frame`, in six or twelve more columns of u.
+    """The posterior and the recording with an `ObservedWrench`, in six or twelve more columns of u.
 
     Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
     that the rows before show (`AirLaw.wind_before`).
@@ -41,12 +36,12 @@ def observing(
     episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
     et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
     what follows, and rows with a past shorter than that time are left out unless `whole`. By default the prior's
-    `AerodynamicForce` gives frame and time. Where it leaves the time open, each component takes that of .02 to 1 s
+    `AerodynamicForce` gives link and time. Where it leaves the time open, each component takes that of .02 to 1 s
     which missed least in the second before; and where no wind is observed, six more columns hold what will last of it,
     to which predicted motions fade. Otherwise they hold it: what is left of gusts beside an observed wind stays longer.
     Without such a prior, or where its time is 0, both come back as they are.
 
-    Calibrated intervals of motions go along where neither `seconds` nor `frame` is given.
+    Calibrated intervals of motions go along unless `seconds` is given.
 
     Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
     for a recording that is too short or whose rows are not in order of time.
@@ -55,7 +50,7 @@ def observing(
     own = next((term for term in prior.summands() if isinstance(term, AerodynamicForce)), None) if prior else None
     times = TRIED if seconds is None else (seconds,)
     # calibrated widths are of what is observed by default
-    widths = posterior.settings.get("motion_intervals") if seconds is None and frame is None else None
+    widths = posterior.settings.get("motion_intervals") if seconds is None else None
     if seconds is None:
         seconds = 0.0 if own is None else LEAST if own.observe is None else own.observe
         times = times if own is None or own.observe is None else (seconds,)
@@ -63,7 +58,7 @@ def observing(
             return posterior, dataset
     if not 0.0 < seconds < 1e6:
         raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
-    frame = frame or (own or AerodynamicForce()).link(posterior.system.robot)
+    frame = (own or AerodynamicForce()).link(posterior.system.robot)
     posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
     wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
@@ -197,9 +192,8 @@ def _unexplained(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv 6"]]:
     """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
     device, parts = posterior.system.robot.device, []
-    for start in range(0, len(dataset), ROWS_PER_BLOCK):
-        block = slice(start, start + ROWS_PER_BLOCK)
-        q, v, u, a = (torch.tensor(x[block], device=device) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
+    rows = (torch.tensor(x, device=device).split(ROWS_PER_BLOCK) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
+    for q, v, u, a in zip(*rows, strict=True):
         with torch.no_grad():
             dynamics = posterior.dynamics(q, v, u)
             effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT

@@ -40,6 +40,20 @@ class Gaussian(Summary):
         """Standard deviation of each entry (..., k)."""
         return self.variance.sqrt()
 
+    def through(
+        self, matrix: Float[Tensor, "*batch m k"], offset: Float[Tensor, "*batch m"] | None = None
+    ) -> "Gaussian":
+        """The distribution of offset + matrix x, whose covariance is symmetric, also where rounding is not."""
+        mean, covariance = (matrix @ self.mean[..., None])[..., 0], None
+        if self.covariance is not None:
+            covariance = matrix @ self.covariance @ matrix.mT
+            covariance = 0.5 * (covariance + covariance.mT)
+        return Gaussian(mean if offset is None else offset + mean, covariance)
+
+    def entries(self, which: slice) -> "Gaussian":
+        """The distribution of some entries."""
+        return Gaussian(self.mean[..., which], None if self.covariance is None else self.covariance[..., which, which])
+
     def __getitem__(self: AnyGaussian, index: Any) -> AnyGaussian:
         """The same for some of the states: `prediction[i]`, `prediction[:10]`, `prediction[mask]`.
 

@@ -19,12 +19,11 @@ from forcegp.errors import CompilerError, InvalidInput, NumericalError, Numerica
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import integrate
-from forcegp.integration.integrators import check_time_step, integrator_named
+from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
 from forcegp.models.fused_rollouts import FusedLoop, Motions, fused, steps_of
 from forcegp.models.kept_code import KeptCode
-from forcegp.models.mean_with_gradient import MeanWithGradient
 from forcegp.models.prediction import Gaussian, JointForces, Linearization
-from forcegp.models.predictor_code import TermsFunction
+from forcegp.models.predictor_code import MeanWithGradient, TermsFunction
 from forcegp.models.rollout import (
     StepLinearization,
     by_sample,
@@ -377,17 +376,12 @@ class Predictor(Summary):
         return self.widening**2 * found
 
     def _linearize(self, states: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        with torch.enable_grad():
-            leaves = [x.clone().requires_grad_() for x in states]
-            a = self._mean(*leaves)[0]
-            rows = [
-                torch.autograd.grad(a[:, i].sum(), leaves, retain_graph=True, materialize_grads=True)
-                for i in range(self.nv)
-            ]
-        in_q, in_v, in_u = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
-        if not self.space.is_vector_space:
-            in_q = in_q @ self.space.tangent(states[0])
-        return a.detach(), torch.cat([in_q, in_v, in_u], dim=-1)
+        nq, nv, nu = self.sizes
+        a, jacobian = rows_jacobian(lambda x: self._mean(*x.split(self.sizes, dim=-1))[0], torch.cat([*states], dim=-1))
+        if self.space.is_vector_space:
+            return a, jacobian
+        in_q, rest = jacobian.split([nq, nv + nu], dim=-1)
+        return a, torch.cat([in_q @ self.space.tangent(states[0]), rest], dim=-1)
 
     def _states(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[list[Tensor], bool]:
         """q, v and u, or a, as rows (n, size), and whether it was a single state."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.codegen.c_text import c_text, filled
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
@@ -89,11 +90,6 @@ class PredictorCode:
         flat = [int(node) for values in around for node in np.ravel(values)]
         nq, nv, nu = (x.shape[-1] for x in example)
         return cls(space, (nq, nv, nu), sums, graph, a, W, features, Q, flat, passive, held, compressed, widening)
-
-    @property
-    def nv(self) -> int:
-        """Number of degrees of freedom."""
-        return self.sizes[1]
 
     @property
     def _latents(self) -> list[int]:
@@ -173,7 +169,7 @@ class PredictorCode:
         finish = None
         if kind == "covariance":
             text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self._covariance_source()]
-            finish = {"covariance": ("covariance", self.nv**2)}
+            finish = {"covariance": ("covariance", self.sizes[1] ** 2)}
         text.append(write_function("program", program.graph, program.nodes, lanes, names))
         if loop:
             text += self.motion_source(lanes)
@@ -185,18 +181,18 @@ class PredictorCode:
         """C functions that steps on a manifold call: q after a step, and the rate of a step under a velocity."""
         if self.space.is_vector_space:
             return []
-        q, step = self.space.neutral(), torch.zeros(self.nv, dtype=torch.float64)
+        q, step = self.space.neutral(), torch.zeros(self.sizes[1], dtype=torch.float64)
         made = {"moved": trace(lambda q, step: [self.space.integrate(q, step)], [q, step])}
         made["step_rate"] = trace(lambda step, v: [self.space.chart_velocity(step, v)], [step, step])
         return [write_function(name, graph, x.tolist(), lanes) for name, (graph, (x,)) in made.items()]
 
     def _covariance_source(self) -> str:
         calls, C = [], len(self._latents)
-        first, place = 0, self.nv * C + C
+        first, place = 0, self.sizes[1] * C + C
         for k, part in enumerate(self.sums):
             calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
             first, place = first + len(part.latents), place + len(part.operands)
-        words = {"JOINTS": self.nv, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
+        words = {"JOINTS": self.sizes[1], "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
         return filled(c_text(__name__, "covariance.c"), words | {"ROOTS": "\n  ".join(calls)})
 
     @property
@@ -237,3 +233,26 @@ class PredictorCode:
         """A program, compiled or found, or a loop by its integrator. Raises CompilerError where that cannot be."""
         text = self.c_source(kind, VectorUnit.of_this_processor().lanes)
         return load_library(f"predictor-{kind}", text, lambda _: text, default_folder(), PURPOSE)[0]
+
+
+class MeanWithGradient(torch.autograd.Function):
+    """The mean of a compiled predictor, whose backward pass takes the Jacobians of its linearisation."""
+
+    @staticmethod
+    @override
+    def forward(ctx: Any, predictor: Any, *states: Tensor) -> Tensor:
+        ctx.predictor = predictor
+        ctx.save_for_backward(*states)
+        return predictor.run("mean", states)[0]
+
+    @staticmethod
+    @override
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
+            raise InvalidInput(
+                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
+            )
+        (_, nv, nu), space = ctx.predictor.sizes, ctx.predictor.space
+        jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 2 * nv + nu)
+        in_q, in_v, in_u = (grad_outputs[0][:, None] @ jacobian)[:, 0].split([nv, nv, nu], dim=-1)
+        return None, in_q if space.is_vector_space else space.cotangent(ctx.saved_tensors[0], in_q), in_v, in_u

@@ -26,7 +26,7 @@ from forcegp.models.search import FitProgress
 from forcegp.models.structured.components import Components, Curve
 from forcegp.models.training_data import TrainingData
 from forcegp.robots import Robot
-from forcegp.robots.arguments import real_tensor, require_finite
+from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, rounded
 
 ROWS_PER_BLOCK = 4096
@@ -47,6 +47,8 @@ class Posterior(MotionModel, Summary, ABC):
     """
 
     model: Any  # the Model, of which every subclass names its own
+    training: TrainingData
+    """The rows that the model was trained on."""
     parameters: Mapping[str, Tensor]
     settings: Mapping[str, Any]
     result: OptimizationResult
@@ -59,11 +61,6 @@ class Posterior(MotionModel, Summary, ABC):
     def system(self) -> MechanicalSystem:
         """The robot, contacts and known forces."""
         return self.model.system
-
-    @property
-    @abstractmethod
-    def training(self) -> TrainingData:
-        """The rows that the model was trained on."""
 
     @property
     @abstractmethod
@@ -126,12 +123,8 @@ class Posterior(MotionModel, Summary, ABC):
         """
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
-        q, v, u = states
-        blocks = [
-            self.predict_rows(q[block], v[block], u[block], covariance)
-            for start in range(0, max(len(q), 1), ROWS_PER_BLOCK)
-            for block in [slice(start, start + ROWS_PER_BLOCK)]
-        ]
+        parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
+        blocks = [self.predict_rows(q, v, u, covariance) for q, v, u in parts]
         predicted = join_predictions(blocks, batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance
@@ -186,13 +179,7 @@ class Posterior(MotionModel, Summary, ABC):
         device = self.system.robot.device
         named = zip("qvu", (q, v, u), sizes, strict=True)
         given = [_tensor(name, values, size, device) for name, values, size in named]
-        try:
-            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in given))
-        except RuntimeError:
-            shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip("qvu", given, strict=True))
-            raise InvalidInput(
-                f"the shapes do not broadcast: {shapes}; give one row of q, v and u per state."
-            ) from None
+        batch = broadcast_batch(dict(zip("qvu", (x.shape[:-1] for x in given), strict=True)))
         return [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]) for x in given], batch
 
     def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:

@@ -15,9 +15,9 @@ from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integ
 from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
 from forcegp.mechanics import Baumgarte, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop, fused, steps_of
-from forcegp.models.motion_intervals import MotionIntervals
+from forcegp.models.motion_models import MotionIntervals
 from forcegp.models.search import blas_threads
-from forcegp.robots.arguments import real_tensor, require_finite, whole_number
+from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite, whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
@@ -254,11 +254,7 @@ def checked_start(
     steps = forces.shape[-2]
     if not steps:
         raise InvalidInput("u has no rows; a rollout has at least one step.")
-    try:
-        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], forces.shape[:-2])
-    except RuntimeError:
-        shapes = f"q0 {tuple(q.shape)}, v0 {tuple(v.shape)}, u {tuple(forces.shape)}"
-        raise InvalidInput(f"the shapes do not broadcast: {shapes}; give one row of q0 and v0 per motion.") from None
+    batch = broadcast_batch({"q0": q.shape[:-1], "v0": v.shape[:-1], "u": forces.shape[:-2]})
     if not batch.numel():
         raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
     q, v = (x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in (q, v))

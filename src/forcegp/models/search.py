@@ -104,7 +104,12 @@ def resolved_noise(noise: Noise | None, rows: Dataset | Windows) -> Noise:
             DataWarning,
             stacklevel=2,
         )
-    return replace(noise, acceleration=_start_of_noise(rows), learn=True)
+    spread = (rows.observed if isinstance(rows, Windows) else rows.a).std(axis=0)
+    largest = float(spread.max())
+    if not largest > 0.0:
+        raise InvalidInput("the acceleration of every joint is constant, so its noise cannot be learned; give `noise`")
+    start = tuple(float(START_SHARE * max(std, QUIET * largest)) for std in spread)
+    return replace(noise, acceleration=start, learn=True)
 
 
 def learns_noise(noise: Noise | None, rows: Dataset) -> bool:
@@ -112,15 +117,6 @@ def learns_noise(noise: Noise | None, rows: Dataset) -> bool:
     if noise is None or noise.acceleration is None:
         return rows.noise_level is None or (noise is not None and noise.learn)
     return noise.learn
-
-
-def _start_of_noise(rows: Dataset | Windows) -> tuple[float, ...]:
-    """Where the search for the noise of every joint begins, in units of its acceleration."""
-    spread = (rows.observed if isinstance(rows, Windows) else rows.a).std(axis=0)
-    largest = float(spread.max())
-    if not largest > 0.0:
-        raise InvalidInput("the acceleration of every joint is constant, so its noise cannot be learned; give `noise`")
-    return tuple(float(START_SHARE * max(std, QUIET * largest)) for std in spread)
 
 
 def check_search_numbers(restarts: int, seed: int) -> None:

@@ -7,10 +7,10 @@ parameters; loading runs the same conditioning as fitting, so predictions are th
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -21,7 +21,7 @@ from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_uncha
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import OptimizationResult, engine_from_dict
-from forcegp.mechanics import Contact, MechanicalSystem
+from forcegp.mechanics import MechanicalSystem
 from forcegp.models.baselines.independent_gp import IndependentGP
 from forcegp.models.baselines.network_ensemble import NetworkEnsemble
 from forcegp.models.baselines.neural_network import NeuralNetwork
@@ -31,29 +31,11 @@ from forcegp.models.training_data import Noise, TrainingData
 from forcegp.priors import prior_from_dict, prior_to_dict
 
 
-@dataclass(frozen=True)
-class StoredKind:
+class StoredKind(NamedTuple):
     """One kind of model, whose constructor takes the system and these fields."""
 
-    model: type[Model]
+    model: Callable[..., Model]
     fields: tuple[str, ...]
-
-    def to_dict(self, given: Any) -> dict[str, Any]:
-        """The fields as plain JSON values."""
-        return {name: _write(name, getattr(given, name)) for name in self.fields}
-
-    def from_dict(self, system: MechanicalSystem, stored: Mapping[str, Any]) -> Model:
-        """The model that `to_dict` stored."""
-        make = cast("Callable[..., Model]", self.model)
-        return make(system, **{name: _read(name, stored[name]) for name in self.fields})
-
-
-def kind_of(model: Model) -> str:
-    """The name in `KINDS` of a model. Raises FileFormatError for a model that is not registered there."""
-    for name, kind in KINDS.items():
-        if type(model) is kind.model:
-            return name
-    raise FileFormatError(f"a {type(model).__name__} cannot be stored: it has no entry in KINDS ({', '.join(KINDS)})")
 
 
 def _write(name: str, value: Any) -> Any:
@@ -85,8 +67,8 @@ KINDS = {
 RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
 """What is stored of a search."""
 FORMAT_VERSION = 7
-WITH_DIGESTS = 7
-"""The first format whose files have digests."""
+BEFORE_DIGESTS = 6
+"""The oldest format that is read, of version 0.2: its files have no digests."""
 FEATURES = {
     "target": "it was carried to another system, for which it predicts",
     "reference": "its rows are standardised by others than those that it is conditioned on",
@@ -96,12 +78,10 @@ FEATURES = {
 """What a stored model may hold beyond rows and parameters: a program that ignored one of these would predict wrongly,
 so each is declared in `model.json`, and a program refuses those that it cannot read.
 """
-FEATURES_BEFORE = {1: set(), 2: {"target"}, 3: {"reference"}, 4: {"windows"}, 5: {"measured-torque"}}
-"""Formats 1 to 5 declared one feature by their number; other features could be there as well."""
 STATES = ("q", "v", "u", "a")
 NOISE, WEIGHTS = "noise_std", "weights"
 SOLUTION = "latent.solution"
-TRAINING, REFERENCE = "training.", "reference."
+TRAINING, REFERENCE, PARAMETERS = "training.", "reference.", "parameters."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
 
 
@@ -119,15 +99,22 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         if not overwrite:
             raise FileFormatError(f"{path} exists already; choose another name or pass overwrite=True")
-        if not _is_model_folder(path):
-            raise FileFormatError(f"{path} exists and is not a folder written by forcegp, so it is not overwritten")
+        try:
+            _document(path)
+        except FileFormatError:
+            what = "exists and is not a folder written by forcegp, so it is not overwritten"
+            raise FileFormatError(f"{path} {what}") from None
         others = added_files(path, ("model.json", "tensors.safetensors", ROBOT, TARGET))
         if others:
             raise FileFormatError(
                 f"{path} holds files that forcegp did not write there ({', '.join(others[:3])}), so it is not "
                 "overwritten; move them away or choose another name"
             )
-    kind = kind_of(posterior.model)
+    model = posterior.model
+    kind = next((name for name, stored in KINDS.items() if type(model) is stored.model), None)
+    if kind is None:
+        kinds = ", ".join(KINDS)
+        raise FileFormatError(f"a {type(model).__name__} cannot be stored: it has no entry in KINDS ({kinds})")
     system = posterior.model.system.to_dict()
     target = None if posterior.target is None else posterior.target.to_dict()
     robots = {ROBOT: system.pop("urdf")} | ({} if target is None else {TARGET: target.pop("urdf")})
@@ -142,7 +129,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
         "urdf_sha256": _sha256(robots[ROBOT]),
         "system": system,
         **({} if target is None else {"target": target, "target_urdf_sha256": _sha256(robots[TARGET])}),
-        "model": KINDS[kind].to_dict(posterior.model),
+        "model": {name: _write(name, getattr(model, name)) for name in KINDS[kind].fields},
         "result": {name: getattr(posterior.result, name) for name in RESULT},
         "engine": None if posterior.engine is None else posterior.engine.to_dict(),
         "settings": dict(posterior.settings),
@@ -151,10 +138,9 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     tensors = _row_tensors(TRAINING, training)
     if training.reference is not None:
         tensors |= _row_tensors(REFERENCE, training.reference)
-    tensors |= {f"parameters.{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
+    tensors |= {f"{PARAMETERS}{name}": value.detach().cpu().clone() for name, value in posterior.parameters.items()}
 
-    solution = posterior.solution
-    if solution is not None:
+    if (solution := posterior.solution) is not None:
         tensors[SOLUTION] = solution.detach().cpu().contiguous()
 
     with atomic_folder(path, overwrite=overwrite) as folder:
@@ -168,10 +154,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
 
 
 @usable_arguments("load_posterior")
-def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = None) -> Posterior:
+def load_posterior(path: str | Path) -> Posterior:
     """Read a folder that `save_posterior` wrote; it predicts without the training file.
-
-    `contacts` replaces those that the model was trained with; the system that it was carried to stays.
 
     Raises
     ------
@@ -181,7 +165,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     document = _document(path)
     declared = _declared(path / "model.json", document)
     # whatever the version says: a flipped bit could make it one of those that had no digests
-    if not require_unchanged(path, "fit the model again") and document["format_version"] >= WITH_DIGESTS:
+    if not require_unchanged(path, "fit the model again") and document["format_version"] > BEFORE_DIGESTS:
         raise FileFormatError(f"{path} is incomplete: it has no {SUMS}; fit the model again")
     try:
         urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
@@ -192,21 +176,19 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
     except (OSError, SafetensorError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
     try:
-        system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf}, contacts)
+        system = MechanicalSystem.from_dict({**document["system"], "urdf": urdf})
         settings = dict(document["settings"])
-        if settings.get("noise_from_data"):  # where formats 1 to 5 kept it
-            document["model"]["noise"]["from_data"] = True
-        model = KINDS[document["kind"]].from_dict(system, document["model"])
-        stored_engine = document.get("engine", settings.get("engine"))  # formats 1 to 5 kept it among the settings
-        engine = None if stored_engine is None else engine_from_dict(stored_engine)
-        target = None
-        if moved_to is not None:
-            target = MechanicalSystem.from_dict({**document["target"], "urdf": moved_to})
+        stored, make = document["model"], KINDS[document["kind"]]
+        model = make.model(system, **{name: _read(name, stored[name]) for name in make.fields})
+        engine = None if document["engine"] is None else engine_from_dict(document["engine"])
+        moved = None if moved_to is None else {**document["target"], "urdf": moved_to}
+        target = None if moved is None else MechanicalSystem.from_dict(moved)
         training = _rows(TRAINING, tensors)
         if "reference" in declared or any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors))
-        prefix = "parameters."
-        parameters = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+        parameters = {
+            name.removeprefix(PARAMETERS): value for name, value in tensors.items() if name.startswith(PARAMETERS)
+        }
         found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
         optimization = OptimizationResult(parameters, **found)
         names = document["joint_names"]
@@ -223,19 +205,18 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         raise FileFormatError(
             f"{path} was trained on joints {', '.join(names)}, its robot has {', '.join(system.robot.joint_names)}"
         )
-    file, solution = path / "tensors.safetensors", tensors.get(SOLUTION)
+    file = path / "tensors.safetensors"
+    for name, value in tensors.items():
+        if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
+            raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
     for prefix, rows in ((TRAINING, training), (REFERENCE, training.reference)):
         if rows is not None:
             _check_rows(file, model, prefix, rows)
-    for name, value in parameters.items():
-        _check_numbers(file, name, value)
     given = {name: tuple(value.shape) for name, value in parameters.items() if not name.startswith("inertials.")}
     if given != model.parameter_shapes(training):
         raise FileFormatError(f"{file} does not hold the parameters of its model")
-    if solution is not None:
-        _check_numbers(file, SOLUTION, solution)
     try:
-        posterior = model.condition(training, parameters, optimization, settings, engine, solution)
+        posterior = model.condition(training, parameters, optimization, settings, engine, tensors.get(SOLUTION))
     except (InvalidInput, RuntimeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
     if target is not None:
@@ -244,7 +225,7 @@ def load_posterior(path: str | Path, *, contacts: Sequence[Contact] | None = Non
         except ForceGPError as error:
             raise FileFormatError(f"{path / 'model.json'} does not fit its target: {error}") from None
     held = set(_features(posterior))
-    if not declared <= held or ("features" in document and declared != held):
+    if declared != held:
         raise FileFormatError(
             f"{path} is damaged: it declares {_listed(declared)} and holds {_listed(held)}; fit the model again"
         )
@@ -264,8 +245,6 @@ def _features(posterior: Posterior) -> list[str]:
 
 def _declared(file: Path, document: Mapping[str, Any]) -> set[str]:
     """The features that `model.json` declares. Raises FileFormatError for those that this version cannot read."""
-    if document["format_version"] in FEATURES_BEFORE:
-        return FEATURES_BEFORE[document["format_version"]]
     features = document.get("features")
     if not isinstance(features, list) or not all(isinstance(name, str) for name in features):
         raise FileFormatError(f"{file} is damaged: its features are {features!r}, not a list of names")
@@ -302,18 +281,10 @@ def _check_rows(file: Path, model: Model, prefix: str, rows: TrainingData) -> No
     sizes = dict(zip("qvu", model.system.sizes, strict=True))
     count = rows.q.shape[0] if rows.q.dim() == 2 else -1
     for name, value in states.items():
-        _check_numbers(file, prefix + name, value)
         if value.shape != (count, sizes.get(name, model.system.robot.nv)):
             raise FileFormatError(f"{file} is damaged: {prefix}{name} has shape {tuple(value.shape)}")
-    if rows.weights is not None:
-        _check_numbers(file, prefix + WEIGHTS, rows.weights)
-        if rows.weights.dim() != 2 or rows.weights.numel() != len(rows.q):
-            raise FileFormatError(f"{file} is damaged: {prefix}{WEIGHTS} has shape {tuple(rows.weights.shape)}")
-
-
-def _check_numbers(file: Path, name: str, value: torch.Tensor) -> None:
-    if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
-        raise FileFormatError(f"{file} is damaged: {name} is {value.dtype} or has values that are not finite")
+    if rows.weights is not None and (rows.weights.dim() != 2 or rows.weights.numel() != len(rows.q)):
+        raise FileFormatError(f"{file} is damaged: {prefix}{WEIGHTS} has shape {tuple(rows.weights.shape)}")
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -332,10 +303,10 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in [*KINDS]:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in range(1, FORMAT_VERSION + 1):
+    if version not in (BEFORE_DIGESTS, FORMAT_VERSION):
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads 1 to {FORMAT_VERSION}; use "
-            f"the version that wrote it ({document.get('forcegp_version')}) or fit again"
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {BEFORE_DIGESTS} and "
+            f"{FORMAT_VERSION}; use the version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document
 
@@ -347,13 +318,6 @@ def _robot(path: Path, name: str, sha256: str | None) -> str:
         what = "that the model was trained with" if name == ROBOT else "that the model was carried to"
         raise FileFormatError(f"{path / name} is not the robot {what} (its hash differs)")
     return urdf
-
-
-def _is_model_folder(path: Path) -> bool:
-    try:
-        return bool(_document(path))
-    except FileFormatError:
-        return False
 
 
 def _sha256(text: str) -> str:

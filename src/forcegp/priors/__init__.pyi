@@ -12,5 +12,4 @@ from .named import (
     NAMED_PRIORS as NAMED_PRIORS, NamedPrior as NamedPrior, named_prior as named_prior, PRIORS as PRIORS,
     prior_from_dict as prior_from_dict, prior_to_dict as prior_to_dict,
 )
-from .payload import Payload as Payload
-from .tool_forces import ToolForces as ToolForces
+from .tool_forces import Payload as Payload, ToolForces as ToolForces

@@ -119,8 +119,9 @@ class BaseWrench(ExpressedKernels):
         return 0.0
 
     def _labels(self, robot: Robot) -> dict[str, Sequence[str]]:
-        link = self.link(robot)
-        pushes = [f"actuation along {part} [{'N' if part in AXES else 'Nm'}]" for part in _base_parts(robot)]
+        link, groups = self.link(robot), robot.layout.groups
+        parts = groups[0].motion.velocities if groups else robot.joint_names
+        pushes = [f"actuation along {part} [{'N' if part in AXES else 'Nm'}]" for part in parts]
         return {
             "velocity": [f"velocity of {link} along its {axis} [m/s]" for axis in AXES],
             "drag": [f"speed times velocity of {link} along its {axis} [m^2/s^2]" for axis in AXES],
@@ -192,7 +193,3 @@ def _root_of_thrust(state: State) -> Float[Tensor, "*batch 1"]:
 def _thrust(robot: Robot) -> slice:
     """Which of the base rows thrusters that point up can drive; all where the base has no such rows."""
     return slice(2, None) if robot.layout.groups else slice(None)
-
-
-def _base_parts(robot: Robot) -> tuple[str, ...]:
-    return robot.layout.groups[0].motion.velocities if robot.layout.groups else robot.joint_names

@@ -223,7 +223,19 @@ class _WidthKernel(Kernel):
         return constraint.transform(raw)
 
 
-class SmoothSignKernel(_WidthKernel):
+class _WeightKernel(Kernel):
+    """k = phi(z) . phi(z') of the method `weight_features`."""
+
+    @override
+    def forward(
+        self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **params: Any
+    ) -> Tensor:
+        features: Any = self.weight_features
+        left, right = features(x1), features(x2)
+        return (left * right).sum(-1) if diag else left @ right.mT
+
+
+class SmoothSignKernel(_WeightKernel, _WidthKernel):
     """k = tanh(s / w) tanh(s' / w) of one feature s: a function that is a multiple of a smoothed sign of s.
 
     At s = w, 76 % of the friction is developed.
@@ -233,15 +245,8 @@ class SmoothSignKernel(_WidthKernel):
         """phi (n, 1), with k = phi phi^T."""
         return torch.tanh(z / self.width)
 
-    @override
-    def forward(
-        self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **params: Any
-    ) -> Tensor:
-        left, right = self.weight_features(x1), self.weight_features(x2)
-        return (left * right).sum(-1) if diag else left @ right.mT
 
-
-class BeyondVisitedKernel(Kernel):
+class BeyondVisitedKernel(_WeightKernel):
     """k = e(s) e(s'), e(s) = g (|s| - s_max)+ sign(s): beyond the visited velocities, friction may go on otherwise.
 
     Data say nothing about it, so means stay as they are, and intervals widen. The change of slope g is half of the
@@ -270,13 +275,6 @@ class BeyondVisitedKernel(Kernel):
     def weight_features(self, z: Tensor) -> Tensor:
         """e (n, 1)."""
         return self.slope * (z - z.clamp(-self.limit, self.limit))
-
-    @override
-    def forward(
-        self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **params: Any
-    ) -> Tensor:
-        left, right = self.weight_features(x1), self.weight_features(x2)
-        return (left * right).sum(-1) if diag else left @ right.mT
 
 
 class LogVelocityKernel(_WidthKernel):

@@ -15,8 +15,7 @@ from forcegp.priors.contact_friction import ContactFriction, foot_friction
 from forcegp.priors.force_prior import ForcePrior, SumPrior
 from forcegp.priors.joint_forces import JointAccelerations, JointForces, JointFriction, NoForces, PeriodicJointForces
 from forcegp.priors.kernels import KERNELS
-from forcegp.priors.payload import Payload
-from forcegp.priors.tool_forces import ToolForces
+from forcegp.priors.tool_forces import Payload, ToolForces
 
 PRIORS: dict[str, type[ForcePrior]] = {
     "joint-forces": JointForces,

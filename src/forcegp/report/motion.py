@@ -147,7 +147,7 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
         if point is None:
             of_joints[which] = True
         else:
-            force = latents.part(which).through(point)
+            force = latents.entries(which).through(point)
             groups.append(_at_point(name, _place(term, dynamics), force.mean, force.covariance))
     laws = _laws(posterior.system, dynamics)
     if bool(of_joints.any()) or laws is not None:

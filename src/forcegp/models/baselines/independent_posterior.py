@@ -21,7 +21,7 @@ from forcegp.inference import (
     leave_blocks_out,
     negative_log_likelihood,
 )
-from forcegp.inference.pathwise import StackedFunctions, draw_functions
+from forcegp.inference.pathwise import draw_functions, mean_function
 from forcegp.mechanics import Baumgarte
 from forcegp.models.prediction import Inputs, Positions, Prediction, Rows
 from forcegp.models.protocol import Model, Posterior
@@ -100,6 +100,23 @@ class IndependentLikelihood:
         return torch.cat([states[name] for name in self.inputs], dim=-1)
 
 
+@dataclass(frozen=True, eq=False)
+class JointLikelihood:
+    """That of one joint, as a search calls it."""
+
+    whole: IndependentLikelihood
+    joint: int
+
+    @property
+    def training(self) -> TrainingData:
+        """Of all joints."""
+        return self.whole.training
+
+    def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """In nats."""
+        return self.whole(self.joint, kernels, parameters)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class IndependentPosterior(Posterior):
     """An `IndependentGP` conditioned on training data; made by `IndependentGP.fit` or `load_posterior`.
@@ -119,7 +136,7 @@ class IndependentPosterior(Posterior):
 
     @property
     @override
-    def training(self) -> TrainingData:
+    def training(self) -> TrainingData:  # type: ignore[override]  # a field there, read only
         return self.likelihood.training
 
     @property
@@ -144,8 +161,7 @@ class IndependentPosterior(Posterior):
             each = zip(self.latents, seeds, strict=True)
             return through([draw_functions(latent, samples, int(own)) for latent, own in each])
 
-        stacked = StackedFunctions.mean_of
-        return AccelerationModel(base.system, None, lambda: through([*map(stacked, self.latents)]), sampled)
+        return AccelerationModel(base.system, None, lambda: through([*map(mean_function, self.latents)]), sampled)
 
     @property
     @override

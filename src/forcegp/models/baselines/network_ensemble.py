@@ -21,6 +21,7 @@ from forcegp.models.baselines.neural_network import (
     check_numbers,
     held_out_rows,
     initial_weights,
+    mean_and_variance,
 )
 from forcegp.models.prediction import Rows
 from forcegp.models.search import FitProgress
@@ -115,7 +116,7 @@ class NetworkEnsemble(NetworkModel):
 
     @override
     def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
-        means, variances = self.layers(posterior.parameters, x[None])
+        means, variances = mean_and_variance(self.layers(posterior.parameters, x[None]))
         shift, scale = posterior.standardization.shift[1], posterior.standardization.scale[1]
         mean = means.mean(0)
         spread = (means - mean).square().mean(0)
@@ -164,7 +165,7 @@ class _Training:
 
     def _loss(self, chosen: Tensor, beta: float) -> Float[Tensor, " members"]:
         """Seitzer et al. (2022), eq. 5: NLL times variance^beta as a constant, mean over rows, less log(2 pi)/2."""
-        mean, variance = self.model.layers(self.weights, self.x[chosen])
+        mean, variance = mean_and_variance(self.model.layers(self.weights, self.x[chosen]))
         loss = 0.5 * ((self.y[chosen] - mean).square() / variance + variance.log())
         return (loss * variance.detach() ** beta).mean(dim=(1, 2)) if beta else loss.mean(dim=(1, 2))
 

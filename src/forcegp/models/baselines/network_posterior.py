@@ -90,16 +90,11 @@ class NetworkPosterior(Posterior):
     """
 
     model: NetworkModel
-    data: TrainingData
+    training: TrainingData
     parameters: Mapping[str, Tensor]
     result: OptimizationResult
     settings: Mapping[str, Any]
     predicts_forces: ClassVar[bool] = False
-
-    @property
-    @override
-    def training(self) -> TrainingData:
-        return self.data
 
     @property
     @override
@@ -114,19 +109,19 @@ class NetworkPosterior(Posterior):
     @cached_property
     def standardization(self) -> Standardization:
         """Of the inputs and of the accelerations, from the training points."""
-        return Standardization.of([inputs(self.data.q, self.data.v, self.data.u), self.data.a])
+        return Standardization.of([inputs(self.training.q, self.training.v, self.training.u), self.training.a])
 
     @cached_property
     def _known_variance(self) -> Tensor | None:
         if self.model.noise is None:
             return None
         parameters = self.model.noise.parameters(self.system.robot.nv)
-        return (2.0 * parameters[ACCELERATION]).exp().to(self.data.a)
+        return (2.0 * parameters[ACCELERATION]).exp().to(self.training.a)
 
     @cached_property
     def _estimated_noise(self) -> Tensor:
         with torch.no_grad():
-            _, _, scatter = self._moments(self.data.q, self.data.v, self.data.u)
+            _, _, scatter = self._moments(self.training.q, self.training.v, self.training.u)
         return scatter.mean(0).sqrt()
 
     @property
@@ -138,9 +133,9 @@ class NetworkPosterior(Posterior):
     @override
     def negative_log_likelihood(self) -> float:
         with torch.no_grad():
-            prediction = self.predict(self.data.q, self.data.v, self.data.u)
+            prediction = self.predict(self.training.q, self.training.v, self.training.u)
         variance = prediction.measurement.variance
-        squared = (self.data.a - prediction.mean).square()
+        squared = (self.training.a - prediction.mean).square()
         return float(0.5 * (squared / variance + variance.log() + math.log(2.0 * math.pi)).sum())
 
     @override

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -28,56 +28,48 @@ SMALLEST_VARIANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class SigmoidLayer:
-    """One hidden layer with sigmoid activation: inputs - `width` - outputs, as in Rath et al. (2021), section 5."""
-
-    width: int = 80
-
-    def shapes(self, members: int, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the weights and biases."""
-        return layer_shapes(members, {"hidden": (inputs, self.width), "output": (self.width, outputs)})
-
-    def __call__(
-        self, weights: Mapping[str, Tensor], x: Float[Tensor, "#members rows inputs"]
-    ) -> Float[Tensor, "members rows outputs"]:
-        """The output of every member."""
-        return _linear(weights, "output", torch.sigmoid(_linear(weights, "hidden", x)))
-
-
-@dataclass(frozen=True)
 class ResidualLayers:
-    """`depth` residual layers h + W silu(h) between a linear input and a linear output layer; no normalisation.
+    """`depth` residual layers h + W f(h) between a linear input and a linear output layer f(h); no normalisation.
 
     Identity shortcuts after He et al. (2016), "Identity mappings in deep residual networks", with one linear map per
-    block. The outputs are a mean and a positive variance for every joint.
+    block. `activation` is f, `first` the name of the input layer, and `outputs` the numbers that belong to every joint.
     """
 
     width: int = 128
     depth: int = 3
+    activation: Callable[[Tensor], Tensor] = functional.silu
+    first: str = "input"
+    outputs: int = 2
 
-    def shapes(self, members: int, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the weights and biases; `outputs` counts the means."""
+    def shapes(self, members: int, inputs: int, joints: int) -> dict[str, tuple[int, ...]]:
+        """`<layer>.weight` (members, in, out) and `<layer>.bias` (members, 1, out)."""
         blocks = {f"block{k}": (self.width, self.width) for k in range(self.depth)}
-        return layer_shapes(members, {"input": (inputs, self.width), **blocks, "output": (self.width, 2 * outputs)})
+        layers = {self.first: (inputs, self.width), **blocks, "output": (self.width, self.outputs * joints)}
+        return {
+            f"{name}.{part}": (members, before if part == "weight" else 1, after)
+            for name, (before, after) in layers.items()
+            for part in ("weight", "bias")
+        }
 
     def __call__(
         self, weights: Mapping[str, Tensor], x: Float[Tensor, "#members rows inputs"]
-    ) -> tuple[Float[Tensor, "members rows outputs"], Float[Tensor, "members rows outputs"]]:
-        """Mean and variance of every member."""
-        h = _linear(weights, "input", x)
+    ) -> Float[Tensor, "members rows outputs"]:
+        """The outputs of every member."""
+        h = _linear(weights, self.first, x)
         for block in range(self.depth):
-            h = h + _linear(weights, f"block{block}", functional.silu(h))
-        mean, spread = _linear(weights, "output", functional.silu(h)).chunk(2, dim=-1)
-        return mean, functional.softplus(spread) + SMALLEST_VARIANCE
+            h = h + _linear(weights, f"block{block}", self.activation(h))
+        return _linear(weights, "output", self.activation(h))
 
 
-def layer_shapes(members: int, layers: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
-    """`<layer>.weight` (members, in, out) and `<layer>.bias` (members, 1, out)."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for name, (width_in, width_out) in layers.items():
-        shapes[f"{name}.weight"] = (members, width_in, width_out)
-        shapes[f"{name}.bias"] = (members, 1, width_out)
-    return shapes
+def sigmoid_layer(width: int) -> ResidualLayers:
+    """One hidden layer with sigmoid activation: inputs - `width` - outputs, as in Rath et al. (2021), section 5."""
+    return ResidualLayers(width, 0, torch.sigmoid, "hidden", 1)
+
+
+def mean_and_variance(outputs: Float[Tensor, "*batch outputs"]) -> tuple[Tensor, Tensor]:
+    """Of every joint, the variance positive."""
+    mean, spread = outputs.chunk(2, dim=-1)
+    return mean, functional.softplus(spread) + SMALLEST_VARIANCE
 
 
 def initial_weights(shapes: Mapping[str, tuple[int, ...]], generator: torch.Generator) -> dict[str, Tensor]:
@@ -200,13 +192,14 @@ class NeuralNetwork(NetworkModel):
         (x,) = Standardization.of(columns)(columns)
         generator = torch.Generator().manual_seed(seed)
         start_time = time.process_time()
-        shapes = SigmoidLayer(self.width).shapes(1, x.shape[-1], training.a.shape[-1])
+        layer = sigmoid_layer(self.width)
+        shapes = layer.shapes(1, x.shape[-1], training.a.shape[-1])
         weights = {name: value.to(x).requires_grad_() for name, value in initial_weights(shapes, generator).items()}
         with threadpool_limits(1):  # products this small do not gain from threads, and lose where cores are shared
             history = self._descend(weights, x, training.a, generator, progress)
         parameters = {name: value.detach() for name, value in weights.items()}
         with torch.no_grad():
-            residual = training.a - SigmoidLayer(self.width)(parameters, x[None])[0]
+            residual = training.a - layer(parameters, x[None])[0]
             parameters[RESIDUAL] = residual.square().mean(0).sqrt()
         result = OptimizationResult(
             parameters,
@@ -223,7 +216,7 @@ class NeuralNetwork(NetworkModel):
         self, weights: dict[str, Tensor], x: Tensor, a: Tensor, generator: torch.Generator, progress: FitProgress | None
     ) -> tuple[float, ...]:
         """Adam in place; the mean loss between any two reports."""
-        layer = SigmoidLayer(self.width)
+        layer = sigmoid_layer(self.width)
         optimizer = torch.optim.Adam(list(weights.values()), lr=self.rate)
         batches = Batches([torch.arange(len(x))], self.batch, generator)
         every = max(1, self.steps // REPORTS)
@@ -247,9 +240,9 @@ class NeuralNetwork(NetworkModel):
     @override
     def parameter_shapes(self, training: TrainingData) -> dict[str, tuple[int, ...]]:
         nv = self.system.robot.nv
-        return SigmoidLayer(self.width).shapes(1, sum(self.system.sizes), nv) | {RESIDUAL: (nv,)}
+        return sigmoid_layer(self.width).shapes(1, sum(self.system.sizes), nv) | {RESIDUAL: (nv,)}
 
     @override
     def moments(self, posterior: NetworkPosterior, x: Float[Tensor, "rows inputs"]) -> tuple[Rows, Rows, Rows]:
-        mean = SigmoidLayer(self.width)(posterior.parameters, x[None])[0]
+        mean = sigmoid_layer(self.width)(posterior.parameters, x[None])[0]
         return mean, torch.zeros_like(mean), posterior.parameters[RESIDUAL].square().expand_as(mean)

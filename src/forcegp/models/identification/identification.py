@@ -27,7 +27,7 @@ from typing_extensions import override
 from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.identification.physical_parameters import PHYSICAL, PhysicalParameters
-from forcegp.models.motion_intervals import DEVIATIONS
+from forcegp.models.motion_models import DEVIATIONS
 from forcegp.models.search import Objective, blas_threads
 from forcegp.summary import Summary, listed
 

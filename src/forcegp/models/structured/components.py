@@ -64,25 +64,6 @@ class Components(Mapping[str, ForceComponent]):
         return len(self.parts)
 
 
-@dataclass(frozen=True, eq=False)
-class Latents:
-    """Joint distribution of all processes at a batch of states: mean (..., C) and covariance (..., C, C) or None."""
-
-    mean: Float[Tensor, "*batch C"]
-    covariance: Float[Tensor, "*batch C C"] | None
-
-    def through(self, matrix: Float[Tensor, "*batch k C"], offset: Float[Tensor, "*batch k"] | None = None) -> Gaussian:
-        """The distribution of offset + matrix f."""
-        mean = (matrix @ self.mean[..., None])[..., 0]
-        covariance = None if self.covariance is None else symmetric(matrix @ self.covariance @ matrix.mT)
-        return Gaussian(mean if offset is None else offset + mean, covariance)
-
-    def part(self, which: slice) -> "Latents":
-        """Some of the processes alone."""
-        covariance = None if self.covariance is None else self.covariance[..., which, which]
-        return Latents(self.mean[..., which], covariance)
-
-
 def term_slices(prior: ForcePrior, robot: Robot) -> list[tuple[str, ForcePrior, slice]]:
     """Name, prior and latents of every term that adds up to `prior`."""
     if isinstance(prior, SumPrior):
@@ -90,19 +71,19 @@ def term_slices(prior: ForcePrior, robot: Robot) -> list[tuple[str, ForcePrior, 
     return [(prior.title, prior, slice(0, len(prior.latent_names(robot))))]
 
 
-def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Latents, known: bool) -> Components:
+def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Gaussian, known: bool) -> Components:
     """All components of Q_U = B f at the states of `dynamics`; `known`: whether Q_K acts beside them."""
     robot = dynamics.state.robot
     B = prior.mixing(dynamics)
     parts = {}
     for name, term, which in term_slices(prior, robot):
-        own, mixing = latents.part(which), B[..., which]
+        own, mixing = latents.entries(which), B[..., which]
         point = term.point_force(dynamics)
         parts[name] = ForceComponent(
             name,
             term.latent_names(robot),
             term.latent_units(robot),
-            Gaussian(own.mean, own.covariance),
+            own,
             joint_force=own.through(mixing),
             acceleration=own.through(dynamics.H @ mixing),
             point_force=None if point is None else own.through(point),
@@ -113,11 +94,6 @@ def components_of(prior: ForcePrior, dynamics: ConstrainedDynamics, latents: Lat
 
     multiplier, contact_force = dynamics.multiplier_map(known), dynamics.contact_force_map(known)
     return Components(latents.through(B), constraint(multiplier), constraint(contact_force), parts)
-
-
-def symmetric(matrix: Float[Tensor, "*batch k k"]) -> Float[Tensor, "*batch k k"]:
-    """Its symmetric part: products of covariances are symmetric up to rounding only."""
-    return 0.5 * (matrix + matrix.mT)
 
 
 @dataclass(frozen=True, eq=False)

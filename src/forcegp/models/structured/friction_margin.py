@@ -32,6 +32,8 @@ POINTS = 2048
 class FrictionMargins:
     """Margins to slipping (..., feet) of the feet called `names`, in N; NaN where a foot does not stand.
 
+    Names are those of their links, with the switch in brackets where a link has several feet.
+
     `mean` and `std` of mu N - |T|; `slip` the probability that it is negative; `force` (..., 3) is that on the foot
     along two tangents and the normal, by foot.
     """
@@ -77,7 +79,8 @@ def friction_margins(
         # a contact that does not act, or that a plane base holds, has a row of zeros
         stands = dynamics.A[..., [rows[0] for rows in feet.values()], :].abs().amax(-1) > 1e-9
         mean, std, slip = (torch.stack(part, -1).masked_fill(~stands, torch.nan) for part in zip(*moments, strict=True))
-    names = tuple(frame for frame, _ in feet)
+    frames = [frame for frame, _ in feet]
+    names = tuple(frame if frames.count(frame) == 1 else f"{frame} ({switch})" for frame, switch in feet)
     return FrictionMargins(names, mean, std, slip, dict(zip(names, forces, strict=True)))
 
 

@@ -313,14 +313,16 @@ class StructuredGP(StructuredModel):
         if search.learn is None:
             kernels = likelihood.kernels()
             objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior)
-            result, of_search = search.best(objective, kernels.initial_parameters() | learned_noise)
+            result, of_search = search.best(
+                objective, search.starts(kernels.initial_parameters() | learned_noise, fixed)
+            )
             return fitted.condition(training, result.parameters | fixed, result, {**described, **of_search})
         confounded = tuple(f"{link}.mass" for link in warn_of_thrust(self.prior, search.learn))
         strength = search.prior_strength
         physical, kernels, path = physical_start(search.learn, likelihood, learned_noise | fixed, strength)
         kernels = with_variance_priors(kernels) if search.hyperprior else kernels
         objective = FitObjective(likelihood, kernels, noise, fixed, search.hyperprior, physical, strength)
-        result, of_search = search.best(objective, path[-1] | learned_noise, keep_iterates=True)
+        result, of_search = search.best(objective, search.starts(path[-1] | learned_noise, fixed), keep_iterates=True)
         # the steps before the search are its first iterations
         result = with_steps_before(result, objective, [point | learned_noise for point in path[:-1]])
         settings = described | {

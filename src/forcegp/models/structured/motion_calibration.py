@@ -11,7 +11,7 @@ import torch
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.motion_records import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
-from forcegp.models.motion_intervals import DEVIATIONS, MotionIntervals
+from forcegp.models.motion_models import DEVIATIONS, MotionIntervals
 from forcegp.models.observed_wrench import in_own_air, observing, require_unobserved
 from forcegp.models.rollout import Rollout
 from forcegp.models.training_data import TrainingData

@@ -24,13 +24,13 @@ from forcegp.inference import (
     leave_blocks_out,
 )
 from forcegp.inference.cholesky_update import rows_to_keep
-from forcegp.inference.pathwise import StackedFunctions, draw_functions
+from forcegp.inference.pathwise import draw_functions, mean_function
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, MechanicalSystem
 from forcegp.models.fused_rollouts import FusedLoop
 from forcegp.models.identification.identification import Identification
 from forcegp.models.identification.physical_parameters import PHYSICAL, inertials_of
-from forcegp.models.motion_intervals import HORIZONS, MotionIntervals
+from forcegp.models.motion_models import HORIZONS, MotionIntervals
 from forcegp.models.observed_wrench import rows_of_own_system
 from forcegp.models.prediction import Gaussian, Inputs, Positions, Prediction, Rows
 from forcegp.models.predictor import Predictor
@@ -38,7 +38,7 @@ from forcegp.models.predictor_code import PredictorCode
 from forcegp.models.protocol import Array, Posterior
 from forcegp.models.rollout import AccelerationFunction, AccelerationModel
 from forcegp.models.search import blas_threads
-from forcegp.models.structured.components import Components, Curve, Latents, components_of, term_slices
+from forcegp.models.structured.components import Components, Curve, components_of, term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, StructuredModel
 from forcegp.models.structured.motion_calibration import calibrate_motions
 from forcegp.models.structured.motion_fit import refine_on_motions
@@ -84,7 +84,7 @@ class StructuredPosterior(Posterior):
 
     @property
     @override
-    def training(self) -> TrainingData:
+    def training(self) -> TrainingData:  # type: ignore[override]  # a field there, read only
         return self.likelihood.training
 
     @property
@@ -143,19 +143,19 @@ class StructuredPosterior(Posterior):
             return affine, None
         return shrunk(affine, dynamics.H, self.parameters[FORCE].exp(), second_moments(self.training.a))
 
-    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Latents:
-        """All processes at a batch of states."""
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:
+        """All processes at a batch of states: mean (..., C), and their joint covariance (..., C, C) where asked for."""
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.model.prior.features(dynamics))
         features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
         latents = len(features)
         if not latents:
             nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
-            return Latents(nothing.flatten(-2), nothing if covariance else None)
-        mean = self.latent.mean(features).reshape(*batch, latents)
-        if not covariance:
-            return Latents(mean, None)
-        return Latents(mean, self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents))
+            return Gaussian(nothing.flatten(-2), nothing if covariance else None)
+        mean, spread = self.latent.mean(features).reshape(*batch, latents), None
+        if covariance:
+            spread = self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents)
+        return Gaussian(mean, spread)
 
     @property
     def widening(self) -> float:
@@ -337,7 +337,7 @@ class StructuredPosterior(Posterior):
             return acceleration
 
         def mean() -> AccelerationFunction:
-            return through(StackedFunctions.mean_of(self.latent))
+            return through(mean_function(self.latent))
 
         def sampled(samples: int, seed: int) -> AccelerationFunction:
             if not len(self.kernels.kernels):  # no unknown force: all functions are the same
@@ -393,12 +393,8 @@ class StructuredPosterior(Posterior):
         model = self.model
         if z is not None and self.identification is not None:
             model = replace(model, system=self.identification.physical.system_at(z))
-        likelihood = model.likelihood(self.training)
-        kernels = likelihood.kernels(beyond=bool(self.settings.get("beyond_visited")))
-        latent = likelihood.condition(kernels, point, self.engine)
-        return StructuredPosterior(
-            model, likelihood, kernels, point, self.result, self.settings, latent, self.engine, target=self.target
-        )
+        moved: Any = model.condition(self.training, point, self.result, self.settings, self.engine)
+        return replace(moved, target=self.target)
 
     @override
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress, kernel_groups
+from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress
 from forcegp.mechanics import Actuation, ConstrainedDynamics, MechanicalSystem, ObservedWrench, RigidBodyBias
 from forcegp.models.kept_code import KeptCode, kept_covariance, record_key
 from forcegp.models.predictor import Predictor
@@ -179,7 +179,7 @@ def _numbers(latent: LatentPosterior, training: TrainingData, physics: Predictor
     found = [training.q, training.v, training.u, *latent.features, *latent.weights]
     found += [*latent.kernels.state_dict().values(), *physics.standardization.shift, *physics.standardization.scale]
     found += (physics.inertials or {}).values()
-    return [*found, latent.data_factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
+    return [*found, latent.system.factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
 
 
 def _compressed(
@@ -199,9 +199,8 @@ def _compressed(
         usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
         return Sample([z[usable] for z in features], W[usable])
 
-    latents = [group.latents for group in kernel_groups(latent)]
     chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
-    return compress(latent, latents, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
+    return compress(latent, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
 
 
 def sample_states(

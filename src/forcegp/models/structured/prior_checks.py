@@ -15,6 +15,7 @@ from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, ch
 from forcegp.models.training_data import CONSTANT, TrainingData
 from forcegp.priors import BaseWrench, ForcePrior
 from forcegp.robots.structure import LinkInertia
+from forcegp.summary import listed
 
 INVISIBLE = 1e-9
 """|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
@@ -28,6 +29,10 @@ LEFT_OUT = 0.1
 SPAN = 1e-9
 """Singular values of unit effects relative to the largest below which they are one effect fewer."""
 ROWS_LOOKED_AT = 500
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, DataWarning, stacklevel=6)
 
 
 def check_prior(likelihood: MarginalLikelihood) -> None:
@@ -77,12 +82,9 @@ def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], featur
         if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
             idle.setdefault(which, []).append(name)
     for which, latents in idle.items():
-        some = f"{', '.join(which[:4])}{' ...' if len(which) > 4 else ''}"
-        warnings.warn(
-            f"{some} never changes in the training rows, so nothing is learned of how {_few(latents)} depends on it; "
-            "leave that input out (inputs=...), or give data in which it changes",
-            DataWarning,
-            stacklevel=5,
+        _warn(
+            f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} depends "
+            "on it; leave that input out (inputs=...), or give data in which it changes"
         )
 
 
@@ -98,12 +100,10 @@ def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, eff
                 "contact of the prior, or leave it out"
             )
     if any(absent):
-        warnings.warn(
+        _warn(
             f"{_few([name for name, nothing in zip(names, absent, strict=True) if nothing])} moves no joint at any "
             "training row, so its posterior is its prior; give data in other postures, or leave it out "
-            "if the prior can do without",
-            DataWarning,
-            stacklevel=5,
+            "if the prior can do without"
         )
     hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
     blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
@@ -115,11 +115,9 @@ def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, eff
             f"of it; {remedy}"
         )
     if blind:
-        warnings.warn(
+        _warn(
             f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
-            f"its posterior and that of the normal force are the prior; {remedy}",
-            DataWarning,
-            stacklevel=5,
+            f"its posterior and that of the normal force are the prior; {remedy}"
         )
     return shows
 
@@ -151,17 +149,15 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
     size = float(known.square().sum().sqrt())
     share = float((known - carried).square().sum().sqrt()) / size if size > 0.0 else 0.0
     if share > LEFT_OUT:
-        warnings.warn(
+        _warn(
             f"with the mean 'zero' the prior carries gravity, actuation and all known forces, but {share:.0%} of the "
             "acceleration that they cause lies where none of its forces acts; take `mean='analytical'`, or "
-            "add a force on every joint to the `prior`, JointForces()",
-            DataWarning,
-            stacklevel=5,
+            "add a force on every joint to the `prior`, JointForces()"
         )
 
 
 def _few(names: Sequence[str]) -> str:
-    return f"{', '.join(map(repr, names[:4]))}{f' and {len(names) - 4} more' if len(names) > 4 else ''}"
+    return listed(map(repr, names))
 
 
 FAR_FROM_SURFACE = 0.01
@@ -184,11 +180,9 @@ def check_distance(system: MechanicalSystem, training: TrainingData) -> None:
                 f"more than {distance:.3g} m; {remedy}"
             )
         if distance > FAR_FROM_SURFACE:
-            warnings.warn(
+            _warn(
                 f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
-                "rows in contact only (forcegp.data.rows_in_contact)",
-                DataWarning,
-                stacklevel=4,
+                "rows in contact only (forcegp.data.rows_in_contact)"
             )
 
 
@@ -212,12 +206,10 @@ def warn_of_thrust(prior: ForcePrior, learned: Learned | Sequence[Learned]) -> t
     for term in prior.summands():
         free = {"thrust", "actuation"} & set(term.inputs if isinstance(term, BaseWrench) else ())
         if masses and free:
-            warnings.warn(
+            _warn(
                 f"the mass of {', '.join(masses)} is learned beside {type(term).__name__}, which depends on "
                 f"{' and '.join(sorted(free))}: a heavier robot with as much more thrust moves the same, so no motion "
-                "shows the mass. Where the thrust is known, leave that input out (inputs=...); else keep the mass.",
-                DataWarning,
-                stacklevel=5,
+                "shows the mass. Where the thrust is known, leave that input out (inputs=...); else keep the mass."
             )
             return masses
     return ()

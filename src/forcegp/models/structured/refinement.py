@@ -22,7 +22,6 @@ from forcegp.inference import (
     Exact,
     Inducing,
     InducingPosterior,
-    OptimizationResult,
     OptimizerOptions,
     ProblemSize,
     choose_engine,
@@ -116,13 +115,12 @@ def on_all_rows(
 
     `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
     """
-    reference = fitted.training
-    training = reference
+    reference = training = fitted.training
+    likelihood, latent = fitted.likelihood, fitted.latent
     if len(rows) != len(reference.q):
         training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
-    likelihood = replace(fitted.likelihood, training=training)
-    fitted.model.system.check_states(training.q, training.v, training.u)
-    if training is not reference:
+        likelihood = replace(likelihood, training=training)
+        fitted.model.system.check_states(training.q, training.v, training.u)
         check_distance(fitted.model.system, training)
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms(fitted.parameters))
@@ -130,18 +128,16 @@ def on_all_rows(
         choice = choose_engine(size, training.q.device)
     else:
         choice = Choice(engine, f"{engine.name}: as asked for")
-    settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
-    if isinstance(choice.engine, Exact) and training is reference:
-        settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
-        return replace(fitted, settings=settings)
     with blas_threads(training.q.numel()):
-        latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
+        if training is not reference or not isinstance(choice.engine, Exact):
+            latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
         left_out = latent.left_out if isinstance(latent, InducingPosterior) else 0.0
         if engine is None and isinstance(choice.engine, Inducing) and left_out > choice.engine.tolerance:
             choice = choose_engine(size, training.q.device, inducing=False)
             short = f"fewer inducing points leave out {left_out:.2g} of the noise variance of a row"
             choice = Choice(choice.engine, f"{choice.reason}; {short}")
             latent = likelihood.condition(fitted.kernels, fitted.parameters, choice.engine)
+        settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
         return refined(posterior, hyperprior, report)
@@ -156,47 +152,38 @@ def refined(
 ) -> StructuredPosterior:
     """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
 
-    Where physical parameters were learned they and all others stay, for their standard errors belong together.
+    Where physical parameters were learned they and all others stay, for their standard errors belong together. Warns
+    where inducing points leave out so much that the posterior is an approximation.
     """
     engine, latent = posterior.engine, posterior.latent
     if not isinstance(latent, InducingPosterior):
         return posterior
-    if posterior.identification is not None:
-        return _checked(posterior)
-    noise, (_, fixed) = posterior.model.known_noise, posterior.model.split_noise
-    held = {name: posterior.parameters[name] for name in fixed}
-    start = {name: value for name, value in posterior.parameters.items() if name not in held}
-    likelihood, kernels = posterior.likelihood, posterior.kernels
-    objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
-    if isinstance(engine, Inducing) and engine.refine and latent.left_out <= engine.tolerance:
+    left_out, tolerance = latent.left_out, engine.tolerance if isinstance(engine, Inducing) else 0.0
+    if posterior.identification is None and isinstance(engine, Inducing) and engine.refine and left_out <= tolerance:
+        likelihood, kernels = posterior.likelihood, posterior.kernels
+        noise, (_, fixed) = posterior.model.known_noise, posterior.model.split_noise
+        held = {name: posterior.parameters[name] for name in fixed}
+        start = {name: value for name, value in posterior.parameters.items() if name not in held}
+        objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
         options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
-        return _checked(_moved_to(posterior, minimize_objective(objective, start, options, report)))
-    return _checked(posterior)
-
-
-def _checked(posterior: StructuredPosterior) -> StructuredPosterior:
-    """The posterior; a warning where its inducing points leave out so much that it is an approximation."""
-    latent, engine = posterior.latent, posterior.engine
-    assert isinstance(latent, InducingPosterior)
-    if latent.left_out > max(ENOUGH, getattr(engine, "tolerance", 0.0)):
+        result = minimize_objective(objective, start, options, report)
+        parameters = {**posterior.parameters, **result.parameters}
+        latent = likelihood.condition(kernels, parameters, engine)
+        assert isinstance(latent, InducingPosterior), "its engine is"
+        left_out = latent.left_out
+        change = f"{result.history[0]:.1f} -> {result.value:.1f}"
+        note = f"on all rows, {result.evaluations} evaluations: {change} ({result.status})"
+        spent = replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds)
+        posterior = replace(posterior, parameters=parameters, result=spent, latent=latent).with_settings(refined=note)
+    if left_out > max(ENOUGH, tolerance):
+        points = sum(map(len, posterior.latent.features))
         warnings.warn(
-            f"{latent.space.count} inducing points leave out {latent.left_out:.2g} of the noise variance of a row, so "
-            "that the posterior is an approximation with wider intervals than the exact one; give more points, or take "
-            "`engine='exact'`",
+            f"{points} inducing points leave out {left_out:.2g} of the noise variance of a row, so that the posterior "
+            "is an approximation with wider intervals than the exact one; give more points, or take `engine='exact'`",
             NumericalWarning,
             stacklevel=4,
         )
     return posterior
-
-
-def _moved_to(posterior: StructuredPosterior, result: OptimizationResult) -> StructuredPosterior:
-    """The posterior at the parameters that a search on all rows found."""
-    parameters = {**posterior.parameters, **result.parameters}
-    change = f"{result.history[0]:.1f} -> {result.value:.1f}"
-    note = f"on all rows, {result.evaluations} evaluations: {change} ({result.status})"
-    spent = replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds)
-    latent = posterior.likelihood.condition(posterior.kernels, parameters, posterior.engine)
-    return replace(posterior, parameters=parameters, result=spent, latent=latent).with_settings(refined=note)
 
 
 ROUNDS = 8

@@ -1,13 +1,13 @@
 """The search of a structured model: what a fit lowers, and several starts, of which the best is kept."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
 from gpytorch.kernels import ScaleKernel
-from gpytorch.priors import NormalPrior
 from jaxtyping import Float
 from torch import Tensor
 
@@ -26,13 +26,17 @@ from forcegp.models.search import (
     perturbed,
     run_restarts,
 )
-from forcegp.models.structured.marginal_likelihood import MarginalLikelihood
 from forcegp.models.training_data import Noise
 from forcegp.parallel import Backend
+from forcegp.priors.basic_kernels import register_log_normal_prior
 from forcegp.robots import pseudo_inertia_from_parameters
 
 LOG_VARIANCE_SPREAD = 2.0
 """Standard deviation of the prior on the logarithm of a latent's variance, where physical parameters are learned."""
+
+
+Starts = Callable[[int], Mapping[str, Tensor]]
+"""Number of a start -> the parameters at which it begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,7 @@ class FitObjective:
     stands for the likelihood.
     """
 
-    likelihood: MarginalLikelihood
+    likelihood: Any  # a MarginalLikelihood, or one of another model: (kernels, parameters) -> nats, with its `training`
     kernels: LatentKernels
     noise: Noise
     fixed: Mapping[str, Tensor]
@@ -73,7 +77,7 @@ class FitObjective:
         """Log density of the hyper-parameters' priors; 0 without `hyperprior`."""
         if not self.hyperprior:
             return torch.zeros((), dtype=torch.float64)
-        return self.kernels.log_prior(parameters) + self.noise.log_prior(parameters, self.likelihood.system.robot.nv)
+        return self.kernels.log_prior(parameters) + self.noise.log_prior(parameters)
 
 
 def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
@@ -87,14 +91,8 @@ def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
     out = deepcopy(kernels)
     for module in out.modules():
         if isinstance(module, ScaleKernel) and "outputscale_prior" not in [name for name, *_ in module.named_priors()]:
-            center = _log_variance(module).detach()
-            prior = NormalPrior(center, torch.full_like(center, LOG_VARIANCE_SPREAD))
-            module.register_prior("outputscale_prior", prior, _log_variance)
+            register_log_normal_prior(module, "outputscale", torch.as_tensor(module.outputscale), LOG_VARIANCE_SPREAD)
     return out
-
-
-def _log_variance(kernel: ScaleKernel) -> Tensor:
-    return torch.as_tensor(kernel.outputscale).log()
 
 
 def squared_distance(parameters: Float[Tensor, "10"], reference: Float[Tensor, "10"]) -> Float[Tensor, ""]:
@@ -151,26 +149,28 @@ class Search:
         restarts = default_restarts(rows) if self.restarts is None else self.restarts
         return restarts, self.options or default_options(rows)
 
+    def starts(self, moments: Mapping[str, Tensor], fixed: Mapping[str, Tensor]) -> Starts:
+        """Start `index`: 0 is the moments, with what `start` gives in their place, others lie around the moments."""
+        return partial(_start, moments, first_start(moments, self.start or {}, fixed), self.seed)
+
     def best(
-        self, objective: FitObjective, moments: Mapping[str, Tensor], keep_iterates: bool = False
+        self, objective: FitObjective, starts: Starts, keep_iterates: bool = False, what: str = ""
     ) -> tuple[OptimizationResult, dict[str, Any]]:
         """The best of all starts with the work of all, and the settings of the search as plain JSON values.
 
-        The first start is `moments`, with what `start` gives in their place. Raises FitError where none could be
-        evaluated.
+        Raises FitError where none could be evaluated; `what` follows "evaluated" in its message.
         """
         restarts, options = self.resolved(len(objective.likelihood.training))
         if objective.physical is not None and options is SMALL:
             options = OptimizerOptions()  # standard errors are those of the optimum itself
-        first = first_start(moments, self.start or {}, objective.fixed)
-        kept = replace(options, keep_iterates=True) if keep_iterates else options
-        one = _OneStart(objective, moments, first, self.seed, kept)
+        kept = replace(options, keep_iterates=keep_iterates or options.keep_iterates)
+        one = partial(_one_start, objective, starts, kept)
         with blas_threads(objective.likelihood.training.q.numel()):
             results = run_restarts(one, restarts, options.patience, self.backend, self.progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
-            raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
+            raise FitError(f"none of {restarts} restarts could be evaluated{what} ({causes})")
         best = replace(
             best_of(usable),
             evaluations=sum(search.evaluations for search in usable),
@@ -188,23 +188,21 @@ class Search:
         return best, settings
 
 
-@dataclass(frozen=True, eq=False)
-class _OneStart:
-    """From start `index`: 0 is `first`, others lie around the moments. A class, so that processes receive it."""
+def _start(moments: Mapping[str, Tensor], first: Mapping[str, Tensor], seed: int, index: int) -> Mapping[str, Tensor]:
+    return perturbed(moments, seed, index) if index else first
 
-    objective: FitObjective
-    moments: Mapping[str, Tensor]
-    first: Mapping[str, Tensor]
-    seed: int
-    options: OptimizerOptions
 
-    def __call__(
-        self, index: int, before: Sequence[OptimizationResult | FitError], progress: FitProgress | None
-    ) -> OptimizationResult | FitError:
-        """Where it ended, or why it could not begin."""
-        first = perturbed(self.moments, self.seed, index) if index else self.first
-        note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
-        try:
-            return minimize_objective(self.objective, first, self.options, note, best_value(before))
-        except FitError as error:
-            return error
+def _one_start(
+    objective: FitObjective,
+    starts: Starts,
+    options: OptimizerOptions,
+    index: int,
+    before: Sequence[OptimizationResult | FitError],
+    progress: FitProgress | None,
+) -> OptimizationResult | FitError:
+    """Where the search from start `index` ended, or why it could not begin."""
+    note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
+    try:
+        return minimize_objective(objective, starts(index), options, note, best_value(before))
+    except FitError as error:
+        return error

@@ -104,7 +104,8 @@ def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
         _warn_of_another_noise(posterior.noise_std.cpu().numpy(), rows)
     if reference.noise_std is not None and stated is not None and stated.ndim == 1:
         rows = replace(rows, noise_std=np.tile(stated, (len(rows), 1)))  # every row states it then
-    added = replace(TrainingData.of(rows, training.q.device), reference=reference)
+    alike = training.correlated_rows
+    added = replace(TrainingData.of(rows, training.q.device), reference=reference, correlated_rows=alike)
     likelihood.system.check_states(added.q, added.v, added.u)
     check_distance(likelihood.system, added)
     return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
@@ -143,11 +144,14 @@ def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int
 
 
 def _selected(training: TrainingData, index: Tensor | slice) -> TrainingData:
-    values = (getattr(training, name) for name in ("q", "v", "u", "a", "noise_std"))
-    return TrainingData(*(None if value is None else value[index] for value in values))  # type: ignore[arg-type]  # noise_std alone may be None
+    return replace(training, **{name: rows[index] for name, rows in _rows_of(training)})
 
 
 def _joined(first: TrainingData, second: TrainingData) -> TrainingData:
-    states = (torch.cat([getattr(first, name), getattr(second, name)]) for name in ("q", "v", "u", "a"))
-    stated = [part.noise_std for part in (first, second) if part.noise_std is not None]
-    return TrainingData(*states, noise_std=torch.cat(stated) if stated else None)
+    return replace(first, **{name: torch.cat([rows, getattr(second, name)]) for name, rows in _rows_of(first)})
+
+
+def _rows_of(training: TrainingData) -> list[tuple[str, Tensor]]:
+    """What is known of every row, by name."""
+    named = [(name, getattr(training, name)) for name in ("q", "v", "u", "a", "noise_std")]
+    return [(name, rows) for name, rows in named if rows is not None]

@@ -23,7 +23,8 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 from forcegp.inference import LatentPosterior
-from forcegp.models.motion_intervals import DEVIATIONS
+from forcegp.inference.posterior import FactorizedPosterior
+from forcegp.models.motion_models import DEVIATIONS
 from forcegp.models.search import MOST_POINTS_FOR_RESTARTS, blas_threads
 from forcegp.models.structured.posterior import StructuredPosterior
 from forcegp.models.structured.search import FitObjective
@@ -49,6 +50,7 @@ def widened(posterior: StructuredPosterior, hyperprior: bool) -> StructuredPoste
         return posterior
     with torch.no_grad(), blas_threads(posterior.training.q.numel()):
         states = _States(posterior)
+        assert isinstance(posterior.latent, FactorizedPosterior), "fits are exact"
         factor = states.content_factor(posterior.latent)
         if len(posterior.training) <= MOST_POINTS_FOR_RESTARTS:  # beyond, parameters are known well, and searches long
             factor *= states.mixture_factor(posterior, hyperprior)
@@ -66,7 +68,7 @@ class _States:
         self.W: Float[Tensor, "n nv C"] = dynamics.H @ posterior.model.prior.mixing(dynamics)
         self.features = posterior.likelihood.standardization(posterior.model.prior.features(dynamics))
 
-    def content_factor(self, latent: LatentPosterior) -> float:
+    def content_factor(self, latent: FactorizedPosterior) -> float:
         """What makes `CONTENT` of the states lie inside, in `CONFIDENCE` of the functions; at least 1."""
         n, nv, latents = self.W.shape
         # every state has latents of its own: (n nv) accelerations from (C n) values
