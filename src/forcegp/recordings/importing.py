@@ -44,7 +44,7 @@ class ImportOptions:
     resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
     rate: of the even times in Hz, instead of the median of the recordings' median rates.
     start, end: seconds from the first row of each episode that are kept.
-    unwrap: continue positions of turning joints that jump by a turn.
+    unwrap: continue positions of turning joints that jump by a turn; those that count turns stay.
     beyond_limits: accept positions beyond the limits of the URDF.
     most_rows: of one recording.
     stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of
