@@ -11,17 +11,16 @@ from jaxtyping import Bool, Float
 
 from forcegp.checks.successive_rows import (
     FEW_JOINTS,
-    consecutive,
     drop_outs,
     few_stretches,
     mended_rows,
-    move_on,
     running_width,
     smoothed,
     white_noise,
 )
 from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.row_selection import consecutive, move_on
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem

@@ -7,7 +7,7 @@ same under other contacts: with the point moved, without any, or with one that t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 import forcegp.mechanics
 from forcegp.data.contact_residual import BLOCKS, Residual, missing_contact, moved_points, tensors
 from forcegp.data.dataset import Dataset
+from forcegp.data.row_selection import move_on
 from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
@@ -104,12 +105,16 @@ class _PointMotion(NamedTuple):
 
 
 def _point_motions(
-    dataset: Dataset, system: forcegp.mechanics.MechanicalSystem, velocity_noise: Float[np.ndarray, " nv"] | None = None
+    dataset: Dataset,
+    system: forcegp.mechanics.MechanicalSystem,
+    noise_seen: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[_PointMotion]:
+    """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
     q, v, u, a = tensors(dataset)
     state = system.state(q, v, u)
-    sigma = torch.zeros(dataset.nv) if dataset.noise_std is None else torch.tensor(dataset.noise_std)
-    wander = torch.zeros(dataset.nv) if velocity_noise is None else torch.tensor(velocity_noise)
+    wander, sigma = map(torch.tensor, noise_seen or (np.zeros(dataset.nv), np.zeros(dataset.nv)))
+    if dataset.noise_std is not None:
+        sigma = torch.tensor(dataset.noise_std)
     motions = []
     for contact in system.contacts:
         A, b, gradient = contact.constraint(state, system.baumgarte)
@@ -187,29 +192,31 @@ def contact_doubts(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem 
     system = dataset.system if system is None else system
     if system is None or system.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
         return []
-    noise = {signal: _white_noise(getattr(dataset, signal), dataset) for signal in "va"}
-    noisy = dataset if dataset.noise_std is not None else replace(dataset, noise_std=noise["a"])
-    rows = noisy.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
+    noise = _white_noise(dataset.v, dataset), _white_noise(dataset.a, dataset)
+    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
     with torch.no_grad():
         try:
-            return _stated(rows, system.to("cpu"), noise["v"]) if system.contacts else _missing(rows, system.to("cpu"))
+            return _stated(rows, system.to("cpu"), noise) if system.contacts else _missing(rows, system.to("cpu"))
         except (ForceGPError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
             return []  # states that no contact bears: who computes with them raises what is wrong
 
 
 def _white_noise(values: Float[np.ndarray, "rows nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
-    """Standard deviations of white noise, from medians of third differences, whose variance is 20 times its; else 0."""
-    if not dataset.time_ordered:
+    """Standard deviations of white noise, from medians of third differences, whose variance is 20 times its.
+
+    0 for rows that are no recorded motion.
+    """
+    if not dataset.time_ordered or not move_on(dataset):
         return np.zeros(dataset.nv)
     thirds = np.concatenate([np.diff(values[dataset.episode == number], 3, axis=0) for number in dataset.episodes])
     return 1.4826 * np.median(np.abs(thirds), axis=0) / 20.0**0.5 if len(thirds) else np.zeros(dataset.nv)
 
 
 def _stated(
-    rows: Dataset, system: forcegp.mechanics.MechanicalSystem, velocity_noise: Float[np.ndarray, " nv"]
+    rows: Dataset, system: forcegp.mechanics.MechanicalSystem, noise_seen: tuple[np.ndarray, np.ndarray]
 ) -> list[ContactDoubt]:
     touching = np.ones(len(rows), dtype=bool)
-    motions = _point_motions(rows, system, velocity_noise)
+    motions = _point_motions(rows, system, noise_seen)
     for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
         acts = (
             np.ones(len(rows), bool) if contact.switch is None else rows.u[:, system.inputs.index(contact.switch)] > 0.5
