@@ -30,11 +30,10 @@ from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.preparation import plain
 from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
-from forcegp.summary import Summary
+from forcegp.summary import Summary, plain
 from forcegp.summary import listed as shortened
 
 

@@ -91,6 +91,7 @@ class Auto(Resuming, Import):
                 raise DatasetError(
                     f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
                 )
+            terminal.names_stages = True  # of minutes, most of which have nothing to count
             with terminal.progress("checking"):
                 report = forcegp.check(dataset)
             wrong = [finding for finding in report.findings if finding.severity == "wrong"]
