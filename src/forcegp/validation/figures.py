@@ -127,4 +127,4 @@ def _looks(models: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _unit(document: Mapping[str, Any], quantity: str) -> str:
     units = document["units"][quantity]
-    return units if isinstance(units, str) else "/".join(dict.fromkeys(units))
+    return units if isinstance(units, str) else " or ".join(dict.fromkeys(units))

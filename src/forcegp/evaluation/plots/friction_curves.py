@@ -212,6 +212,7 @@ def _draw_curve(
     room = 0.12 * max(float(values.max() - values.min()), 1e-12)
     axes.set_ylim(float(values.min()) - 1.6 * room, float(values.max()) + room)
     axes.set_xlim(at[0], at[-1])
+    axes.locator_params(axis="x", nbins=6)
     if curve is not None:
         return curve.feature_names[panel.feature], curve.unit
     slides = posterior.system.robot.joints[panel.index].type == "prismatic"
