@@ -151,7 +151,10 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     for rows in episodes:
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
-    weight, whole = _weight(system), np.sum(asked, axis=0)
+    robot, whole, weight = system.robot, np.sum(asked, axis=0), 0.0
+    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
+    if gravity is not None and all(contact.switch for contact in system.contacts):  # which alone hold the robot up
+        weight = float(gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
         falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
@@ -204,15 +207,6 @@ def tilting(
                 away = np.linalg.norm(down[rows] - np.median(down[rows], axis=0), axis=1)
                 found[rows, k] |= away > TILTS
     return found
-
-
-def _weight(system: forcegp.mechanics.MechanicalSystem) -> float:
-    """What contacts with a switch must bear [N]; 0 where something else may hold the robot up."""
-    robot, alone = system.robot, all(contact.switch for contact in system.contacts)
-    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
-    if gravity is None or not alone:
-        return 0.0
-    return float(gravity.norm()) * robot.mass
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:

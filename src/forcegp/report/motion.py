@@ -14,7 +14,6 @@ from forcegp.mechanics import (
     Actuation,
     Armature,
     ConstrainedDynamics,
-    MechanicalSystem,
     ObservedWrench,
     RigidBodyBias,
     RotorInertia,
@@ -149,10 +148,10 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
         else:
             force = latents.part(which).through(point)
             groups.append(_at_point(name, _place(term, dynamics), force.mean, force.covariance))
-    laws = _laws(posterior.system, dynamics)
-    if bool(of_joints.any()) or laws is not None:
+    known_forces = [force for force in posterior.system.known_forces if not isinstance(force, NOT_SHOWN)]
+    if bool(of_joints.any()) or known_forces:
         own = latents.through(B * of_joints)
-        mean = own.mean if laws is None else own.mean + laws
+        mean = own.mean + sum(force.force(dynamics.state).expand_as(own.mean) for force in known_forces)
         title = "learned joint forces" if posterior.carries_known_forces else "friction and other joint forces"
         groups.append(_at_joints(robot, dynamics, title, mean, own.std))
     if dynamics.contacts and posterior.predicts_forces:
@@ -169,12 +168,6 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
             place = contact.position(dynamics.state.kinematics)
             groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean, force.covariance))
     return groups
-
-
-def _laws(system: MechanicalSystem, dynamics: ConstrainedDynamics) -> torch.Tensor | None:
-    """The sum (rows, nv) of the known forces that are friction, springs or offsets; None where there are none."""
-    forces = [force.force(dynamics.state) for force in system.known_forces if not isinstance(force, NOT_SHOWN)]
-    return torch.stack([force.expand_as(dynamics.state.v) for force in forces]).sum(0) if forces else None
 
 
 def _place(term: ForcePrior, dynamics: ConstrainedDynamics) -> torch.Tensor:

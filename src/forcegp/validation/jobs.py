@@ -41,7 +41,10 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
         inputs = tuple(sorted({*read.values()}))
         place = job_name(comparison.splits[split], seed, kind, name)
         cost = work.cost if isinstance(work, Candidate) else 1.0
-        return Job(place, f"{__name__}:compute", spec, inputs, cost, (comparison, work), _modules(work))
+        functions = (work.fit,) if isinstance(work, Candidate) else (work.identify, work.noise)
+        # where the functions are defined, which somebody else may have added
+        modules = tuple(sorted({_plain(function).__module__ for function in functions if function is not None}))
+        return Job(place, f"{__name__}:compute", spec, inputs, cost, (comparison, work), modules)
 
     for seed in range(seeds):
         for split in range(len(comparison.splits)):
@@ -70,12 +73,6 @@ def _needed(comparison: Comparison, wanted: set[str], name: str, seed: int) -> b
 def _identification_name(comparison: Comparison, name: str, split: int, seed: int) -> str:
     seed = 0 if identification_named(name).all_rows else seed
     return job_name(comparison.splits[split], seed, IDENTIFICATION, name)
-
-
-def _modules(work: Candidate | Identification) -> tuple[str, ...]:
-    """Where the functions are defined, which somebody else may have added."""
-    functions = (work.fit,) if isinstance(work, Candidate) else (work.identify, work.noise)
-    return tuple(sorted({_plain(function).__module__ for function in functions if function is not None}))
 
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:

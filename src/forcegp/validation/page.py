@@ -1,11 +1,10 @@
 """The page of a comparison: every number on it comes from the document of results."""
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
-from forcegp.evaluation.pages import rendered
+from forcegp.evaluation.pages import alike, rendered
 from forcegp.validation.paired_tests import SCORES
 
 ALT_TEXTS = {
@@ -42,7 +41,11 @@ def page(document: Mapping[str, Any]) -> str:
         alt_texts=ALT_TEXTS,
         listed=[[name, model["kind"], model["summary"], str(model["runs"])] for name, model in models.items()],
         failures=_failures(models, document),
-        warnings=_warnings(models),
+        warnings=[
+            f"{name} ({len(found)}): {found[0][0]}"
+            for name, model in models.items()
+            for found in alike((text, name) for text in model["warnings"])
+        ],
     )
 
 
@@ -177,7 +180,8 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
     lines = []
     for name, model in models.items():
         for reason, runs in _reasons(model["failures"]).items():
-            lines.append(f"**{name}** failed in {len(runs)} of {_runs(model)} runs ({'; '.join(runs)}): {reason}")
+            of = model["runs"] + len(model["failures"])
+            lines.append(f"**{name}** failed in {len(runs)} of {of} runs ({'; '.join(runs)}): {reason}")
     failed = [run for run in document["identifications"] if run["error"] is not None]
     for name in dict.fromkeys(run["name"] for run in failed):
         for reason, runs in _reasons(run for run in failed if run["name"] == name).items():
@@ -185,31 +189,16 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
     return lines
 
 
-def _runs(model: Mapping[str, Any]) -> int:
-    return model["runs"] + len(model["failures"])
-
-
-def _warnings(models: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for name, model in models.items():
-        kinds = _grouped((re.sub(r"\d[\d.e+-]*", "#", text), text) for text in model["warnings"])
-        lines += [f"{name} ({len(texts)}): {texts[0]}" for texts in kinds.values()]
-    return lines
-
-
 def _reasons(failed: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    return _grouped((run["error"], f"{run['split']}, seed {run['seed']}") for run in failed)
-
-
-def _grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
-    for key, value in pairs:
-        groups.setdefault(key, []).append(value)
+    for run in failed:
+        groups.setdefault(run["error"], []).append(f"{run['split']}, seed {run['seed']}")
     return groups
 
 
 def _named(name: str, model: Mapping[str, Any]) -> str:
-    return f"{name} ({model['runs']} of {_runs(model)} runs)" if model["failures"] else name
+    failed = len(model["failures"])
+    return f"{name} ({model['runs']} of {model['runs'] + failed} runs)" if failed else name
 
 
 def _least(values: Iterable[Mapping[str, Any] | None], level: float | None = None) -> float | None:
