@@ -176,7 +176,8 @@ class CheckInput:
             prepared = replace(chosen, trim=float(trim)).apply(even)
             compared = prepared.dataset
             applied = chosen.cutoff or _earlier(dataset).get("cutoff")
-            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(_first(even)):
+            first = even.time[even.episode == even.episode[0]]
+            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
                 lower = COMPARED * float(applied)
                 compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
         noise = None
@@ -238,10 +239,6 @@ def _earlier(dataset: Dataset) -> Mapping[str, Any]:
     while report and report.get("cutoff") is None:
         report = preparation_report({"preparation": report.get("earlier")})
     return report
-
-
-def _first(even: Dataset) -> np.ndarray:
-    return even.time[even.episode == even.episode[0]]
 
 
 def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:

@@ -111,7 +111,10 @@ def recorded_scene(
     if system is None:
         raise InvalidInput("the dataset holds no robot; import it with one, or give a fitted model, too.")
     rows = style.window(dataset, start, seconds)
-    rows = rows.rows(_evenly(rows.time))
+    first, last = rows.time[[0, -1]]
+    steps = int(np.clip((last - first) * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(rows) - 1) or 1))
+    grid = np.linspace(first, last, steps + 1)
+    rows = rows.rows(np.unique(np.searchsorted(rows.time, grid - 1e-9).clip(0, len(rows) - 1)))
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
     drawn, doubts = link_shapes(system.robot, shapes)
     with torch.no_grad():
@@ -125,14 +128,6 @@ def recorded_scene(
     poses = poses_of_links(system.robot, q, [shape.link for shape in drawn])
     time = rows.time - rows.time[0]
     return RecordedScene(system.robot, time, rows.q, drawn, poses, arrows, paths, reach(system.robot), doubts)
-
-
-def _evenly(time: np.ndarray) -> np.ndarray:
-    """Rows nearest to an even grid of frames."""
-    duration = float(time[-1] - time[0])
-    count = int(np.clip(duration * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(time) - 1) or 1)) + 1
-    grid = np.linspace(time[0], time[-1], count)
-    return np.unique(np.searchsorted(time, grid - 1e-9).clip(0, len(time) - 1))
 
 
 def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> list[Arrows]:

@@ -50,7 +50,8 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
         for split in range(len(comparison.splits)):
             for name in sorted({*wanted, comparison.identification}):
                 work = identification_named(name)
-                if _needed(comparison, wanted, name, seed):
+                # seeds choose rows: one of all rows, and that of the mass matrix, is done once
+                if seed == 0 or (name in wanted and not work.all_rows):
                     found = job(IDENTIFICATION, name, split, seed, work, {})
                     identifications[found.name] = found
             for name, each in models.items():
@@ -61,13 +62,6 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
                     read["mean"] = _identification_name(comparison, each.identification, split, seed)
                 fits.append(job(MODEL, name, split, seed, each, read))
     return list(identifications.values()), fits
-
-
-def _needed(comparison: Comparison, wanted: set[str], name: str, seed: int) -> bool:
-    """Seeds choose rows: an identification of all rows, and the one of the mass matrix, is done once."""
-    if name in wanted and (seed == 0 or not identification_named(name).all_rows):
-        return True
-    return name == comparison.identification and seed == 0
 
 
 def _identification_name(comparison: Comparison, name: str, split: int, seed: int) -> str:

@@ -1,6 +1,6 @@
 """The page of a comparison: every number on it comes from the document of results."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
@@ -76,7 +76,7 @@ def _against(answer: Mapping[str, Any] | None) -> str:
 
 
 def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
-    force = _listed_units(document["units"]["u"])
+    force = unit_of(document, "u")
     header = ["model", "nRMSE", f"force error [{force}], rms", "mean abs", "NLPD [nats]"]
     header += ["in 95 %", "in 50 %", "fit [CPU s]"]
     errors, levels = ("nrmse", "force_rms", "force_mae", "nlpd"), {"coverage_95": 0.95, "coverage_50": 0.5}
@@ -106,7 +106,7 @@ def _range(models: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Score, title and table."""
-    force = _listed_units(document["units"]["u"])
+    force = unit_of(document, "u")
     scores = (
         ("nrmse_per_joint", "Normalised error of the acceleration (RMSE / standard deviation of the target)", 3),
         ("force_rms_per_joint", f"Force-space error, rms [{force}]", 3),
@@ -168,7 +168,7 @@ def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str
         rows.append([_named(name, model), *cells])
     at_last = {name: {**model, "at": model["motions"]["rms_per_joint"][-1]} for name, model in moving.items()}
     return {
-        "unit": _listed_units(document["units"]["q"]),
+        "unit": unit_of(document, "q"),
         **{name: first[name] for name in ("integrator", "dt")},
         "table": markdown_table(["model", *(f"after {h:g} s" for h in first["horizons"])], rows),
         "last": first["horizons"][-1],
@@ -223,6 +223,7 @@ def _percent(value: Mapping[str, Any] | None, best: float | None = None) -> str:
     return _marked(in_percent, 1, None if best is None else 100.0 * best) + " %"
 
 
-def _listed_units(units: str | Sequence[str]) -> str:
-    """`Nm`, or `Nm and N` where joints differ."""
-    return units if isinstance(units, str) else " and ".join(dict.fromkeys(units))
+def unit_of(document: Mapping[str, Any], quantity: str) -> str:
+    """`Nm`, or `Nm or N` where joints differ."""
+    units = document["units"][quantity]
+    return units if isinstance(units, str) else " or ".join(dict.fromkeys(units))
