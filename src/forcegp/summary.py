@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from html import escape
+from math import isfinite
 
 WIDTH = 100
 """Longest text that stands on one line."""
@@ -36,3 +37,8 @@ def listed(names: Iterable[object], most: int = 4) -> str:
 def rounded(values: Iterable[float]) -> str:
     """Three digits of each: `0.05, 0.051, 0.048`."""
     return listed((f"{value:.3g}" for value in values), most=7)
+
+
+def plain(values: Iterable[float]) -> list[float | None]:
+    """Numbers for JSON, which has no NaN."""
+    return [float(value) if isfinite(value) else None for value in values]

@@ -54,6 +54,9 @@ def answered(folder, forcegp):
         assert flag in command
     done = forcegp(*shlex.split(command)[1:], "--json", folder=folder)
     assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    stages = ["checking", "preparing", "identifying", "looking for a payload", "validating", "learning from all rows"]
+    assert [line.removesuffix(" ...") for line in lines if line.removesuffix(" ...") in stages] == stages
     return command, json.loads(done.stdout)
 
 

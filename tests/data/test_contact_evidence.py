@@ -7,8 +7,9 @@ import pytest
 from tests.checks.clean_logs import clean_logs
 from tests.checks.corruptions import clean, invented, moved, on_a_line, two_links, without_contacts
 
-from forcegp.data import Dataset, contact_doubts
+from forcegp.data import Dataset, contact_doubts, differentiate
 from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
 def simulated(seed: int, surface: str = "plane", noise: float = 0.1, seconds: float = 10.0) -> Dataset:
@@ -99,3 +100,18 @@ def test_wrong_contacts_of_five_seeds_are_doubted(seed):
         for shift in ((0.02, 0.0, 0.0), (0.0, 0.02, 0.0)) if each is data else ((0.02, 0.0, 0.0),):
             assert kinds(moved(each, shift))
         assert kinds(without_contacts(each)) == ["missing"]
+
+
+def test_noise_of_positions_is_no_motion_of_feet_that_stand():
+    """At .03 mm and .1 mrad a standing foot is differentiated to .02 m/s, and swings in some rows."""
+    clean_walk = simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=1))
+    space, noise = clean_walk.system.robot.space, np.random.default_rng(0)
+    q = clean_walk.q.copy()
+    q[:, :3] += 3e-5 * noise.standard_normal((len(q), 3))
+    q[:, 7:] += 1e-4 * noise.standard_normal(q[:, 7:].shape)
+    v = differentiate(q, clean_walk.time, space)
+    a = differentiate(v, clean_walk.time)
+    assert kinds(replace(clean_walk, q=q, v=v, a=a, noise_std=None, truth={})) == []
+    lifted = 1.0 - clean_walk.u[:, -4:]
+    inverted = replace(clean_walk, u=np.hstack([clean_walk.u[:, :-4], lifted]), truth={})
+    assert kinds(inverted) == ["off"]

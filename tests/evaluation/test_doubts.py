@@ -70,6 +70,27 @@ def test_intervals_that_miss_are_named(friction):
     assert f"hold {found.coverage_95:.0%} of the measurements" in sentence
 
 
+def test_a_joint_that_hides_in_the_mean_is_named(friction):
+    """One joint lacks the friction that was learned, and another is as noisy as five times what is stated."""
+    data = arm_data(200, 1)
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    known = data.system.dynamics(*states).acceleration_map().offset.numpy()
+    a, measured = data.truth["a"].copy(), data.a.copy()
+    a[:, 0] = known[:, 0]
+    measured[:, 0] = known[:, 0] + (data.a - data.truth["a"])[:, 0]
+    names = data.joint_names
+    found = evaluate(friction, dataclasses.replace(data, a=measured, truth={"a": a}))
+    assert found.mae_noise_free < found.known_physics_mae_noise_free
+    (sentence,) = about(found.warnings, "worse at")
+    assert f"worse at 1 of {len(names)} joints (noise-free MAE: {names[0]} " in sentence
+    noisy = data.a.copy()
+    noisy[:, 2] += 2.0 * NOISE * np.random.default_rng(0).normal(size=len(noisy))
+    found = evaluate(friction, dataclasses.replace(data, a=noisy))
+    assert found.coverage_95 > 0.85
+    (sentence,) = about(found.warnings, "95 % intervals")
+    assert f"of the measurements ({names[2]} {found.coverage_95_per_joint[2]:.0%}):" in sentence
+
+
 @pytest.mark.parametrize("identified", [True, False])
 def test_another_robot_is_advised_only_where_the_rows_bear_it_out(identified):
     """The advice to take the robot of the data turned an error of .28 into 25 where the model's own was identified."""

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from forcegp.data import farthest_rows
-from forcegp.experiments.fits import MODELS, NETWORKS, FitSettings, fit_series, fitted
+from forcegp.experiments.fits import MODELS, NETWORKS, FitSettings, fit_series, fit_to_all, fitted
 
 SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, tolerance={"0": 1e-6, "400": 1e-5})
 
@@ -21,8 +21,9 @@ def test_the_largest_key_that_does_not_exceed_the_points_counts(points, restarts
 
 
 def test_networks_are_told_their_steps_only_where_the_preset_has_some():
-    assert SETTINGS.of_network() == {}
-    assert FitSettings({"0": 1}, 5, {"0": 1e-6}, network_steps=100).of_network() == {"steps": 100}
+    stated = FitSettings({"0": 1}, 5, {"0": 1e-6}, network_steps=100)
+    specs = [fit_to_all(NETWORKS[0], "data/seed3", 3, settings).spec for settings in (SETTINGS, stated)]
+    assert [spec.get("steps") for spec in specs] == [None, 100]
 
 
 def test_a_series_begins_where_the_fit_with_fewer_points_ended():

@@ -11,17 +11,16 @@ from jaxtyping import Bool, Float
 
 from forcegp.checks.successive_rows import (
     FEW_JOINTS,
-    consecutive,
     drop_outs,
     few_stretches,
     mended_rows,
-    move_on,
     running_width,
     smoothed,
     white_noise,
 )
 from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.row_selection import consecutive, move_on
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
@@ -177,10 +176,15 @@ class CheckInput:
             prepared = replace(chosen, trim=float(trim)).apply(even)
             compared = prepared.dataset
             applied = chosen.cutoff or _earlier(dataset).get("cutoff")
-            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(_first(even)):
+            first = even.time[even.episode == even.episode[0]]
+            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
                 lower = COMPARED * float(applied)
                 compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
-        noise = None if compared is None else np.nan_to_num(_filtered_noise(mended, prepared, compared))
+        noise = None
+        if prepared is not None:  # white noise as logged, or what the filter left
+            left = prepared.report.get("acceleration_noise", {}).get("after")
+            seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF
+            noise = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
         results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
         return cls(**_known(dataset, system), **found, **results, mended=mended, automatic=preparation.cutoff == "auto")
 
@@ -215,11 +219,14 @@ def _known(dataset: Dataset, system: MechanicalSystem | None) -> dict[str, Any]:
 
 
 def _mended(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
-    """The log with its drop-outs interpolated, and where they, wraps and jumps are."""
+    """The log with its drop-outs interpolated, and where they are; rows after which an angle wraps, or jumps by pi."""
     dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
     mended = mended_rows(dataset, dropped)
-    wraps, jumps = _leaps(mended)
-    return mended, {"dropped": dropped, "wraps": wraps, "jumps": jumps}
+    change = np.abs(np.diff(mended.q, axis=0, append=mended.q[-1:]))
+    change[~consecutive(mended)] = 0.0
+    angular = _angular(mended)
+    wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & angular
+    return mended, {"dropped": dropped, "wraps": wraps, "jumps": (change > np.pi) & angular & ~wraps}
 
 
 def _angular(dataset: Dataset) -> np.ndarray:
@@ -232,29 +239,6 @@ def _earlier(dataset: Dataset) -> Mapping[str, Any]:
     while report and report.get("cutoff") is None:
         report = preparation_report({"preparation": report.get("earlier")})
     return report
-
-
-def _first(even: Dataset) -> np.ndarray:
-    return even.time[even.episode == even.episode[0]]
-
-
-def _leaps(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Jumps of an angle by a turn, and by more than pi otherwise, after each row."""
-    change = np.zeros_like(dataset.q)
-    change[:-1] = np.diff(dataset.q, axis=0)
-    change[~consecutive(dataset)] = 0.0
-    angular, size = _angular(dataset), np.abs(change)
-    turn = (np.abs(size - 2.0 * np.pi) < 0.5) & angular
-    return turn, (size > np.pi) & angular & ~turn
-
-
-def _filtered_noise(log: Dataset, prepared: Prepared | None, compared: Dataset) -> np.ndarray:
-    """Noise of the acceleration in `compared`: white noise as logged, or what the filter left."""
-    price = {} if prepared is None else prepared.report.get("acceleration_noise", {})
-    if "after" in price:
-        return numbers_of(price["after"]) * HALF_CUTOFF
-    seen = white_noise(log)
-    return np.zeros(compared.nv) if seen is None else seen
 
 
 def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:

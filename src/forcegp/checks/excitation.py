@@ -8,8 +8,8 @@ import torch
 from forcegp.analytical.identifiability import base_parameters, excitation
 from forcegp.checks.check_input import CheckInput, Finding, listed, look, numbers_of, ok
 from forcegp.checks.successive_rows import white_noise
-from forcegp.data.preparation import plain
 from forcegp.errors import InvalidInput
+from forcegp.summary import plain
 
 MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
 
@@ -73,7 +73,8 @@ def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
     with np.errstate(invalid="ignore"):
         loud = np.flatnonzero(before > MUCH * spread)
         left = np.flatnonzero(after > MUCH * spread)
-    if raw and len(loud) and _measured_noise(inputs, loud):
+    # a log may hold better accelerations than differences
+    if raw and (np.std(inputs.log.a, axis=0)[loud] > np.hypot(1.0, MUCH) * spread[loud]).any():
         yield look(
             subject="noise",
             seen=f"the acceleration in this dataset is not filtered: its noise is up to "
@@ -113,13 +114,6 @@ def _in_torques(inputs: CheckInput, after: np.ndarray) -> Iterator[Finding]:
         joints=inputs.named(loud),
         numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
     )
-
-
-def _measured_noise(inputs: CheckInput, joints: np.ndarray) -> bool:
-    """Whether the accelerations of the log are really that noisy: a log may hold better ones than differences."""
-    assert inputs.prepared is not None
-    spread = np.std(inputs.prepared.dataset.a, axis=0)[joints]
-    return bool((np.std(inputs.log.a, axis=0)[joints] > 1.0 * np.hypot(1.0, MUCH) * spread).any())
 
 
 def torque_noise(inputs: CheckInput, noise: np.ndarray) -> np.ndarray | None:

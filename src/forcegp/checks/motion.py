@@ -10,10 +10,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, GAP, CheckInput, Finding, import_flags, listed, look, ok
-from forcegp.checks.successive_rows import consecutive
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.filtering import JITTER
+from forcegp.data.row_selection import consecutive
 
 LOST = 1.8  # median steps at which at least one sample is missing
 MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger

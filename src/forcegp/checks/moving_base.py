@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from forcegp.checks.check_input import Finding, import_flags, look, ok, wrong
-from forcegp.checks.successive_rows import consecutive, whole_windows
+from forcegp.checks.successive_rows import whole_windows
 from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
+from forcegp.data.row_selection import consecutive
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots.manifold import Group, difference, pose
 

@@ -30,11 +30,10 @@ from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.preparation import plain
 from forcegp.errors import InvalidInput, require_type
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
-from forcegp.summary import Summary
+from forcegp.summary import Summary, plain
 from forcegp.summary import listed as shortened
 
 
@@ -42,7 +41,10 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
     """Moving links without inertia, equal inertias, centres of mass and radii of gyration beyond the robot's reach."""
     moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
     heavy = [link for link in moving if link.mass > 0.0]
-    reach = _reach(robot)
+    # the distances between joints, and the largest of a centre of mass from its joint [m]
+    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
+    centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
+    reach = origins + max(centers, default=0.0) if origins > 0.0 else 0.0
     children = {joint.child for joint in robot.layout.bodies}
     alone = [link.name for link in moving if link.mass == 0.0 and link.name in children]
     if alone:
@@ -69,13 +71,6 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
                 remedy="Check the units of this link (kg, m, kg m²).",
                 numbers={"gyration": gyration, "center": center, "reach": reach},
             )
-
-
-def _reach(robot: Robot) -> float:
-    """Sum of the distances between joints, plus the largest distance of a centre of mass from its joint [m]."""
-    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
-    centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
-    return origins + max(centers, default=0.0) if origins > 0.0 else 0.0
 
 
 def contact_findings(inputs: CheckInput, system: MechanicalSystem | None) -> list[Finding]:

@@ -6,9 +6,10 @@ from itertools import chain
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput, Finding, listed, look, wrong
-from forcegp.checks.successive_rows import consecutive, runs
+from forcegp.checks.successive_rows import runs
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.row_selection import consecutive
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}

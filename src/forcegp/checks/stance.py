@@ -8,7 +8,8 @@ import torch
 
 from forcegp.checks.check_input import Finding, listed, look, ok, wrong
 from forcegp.data import Dataset, estimate_stance
-from forcegp.data.stance import TILTS, missing_gravity, tilting
+from forcegp.data.gravity import missing_gravity
+from forcegp.data.stance import TILTS, tilting
 from forcegp.errors import ContactError
 from forcegp.mechanics import MechanicalSystem
 

@@ -7,32 +7,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from forcegp.data import Dataset
+from forcegp.data.row_selection import consecutive
 
 JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
 LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
-LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
 FEW_JOINTS = 3  # of more joints, half as many rows
 STRETCHES, STRETCH_ROWS = 3, 400  # of a log that are looked at before a fit, where it is longer
 MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
 FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
 
 SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciPy's filters take half a second to import
-
-
-def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
-    """Whether the next row belongs to the same episode and follows; False for the last row."""
-    return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
-
-
-def move_on(dataset: Dataset) -> bool:
-    """Whether rows that follow each other belong to one motion; a sample of rows or of random states leaps about."""
-    steps = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]]
-    spread = dataset.q.std(axis=0)
-    moving = spread > 0.0
-    if not len(steps) or not moving.any():
-        return bool(len(steps))
-    return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
 def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:

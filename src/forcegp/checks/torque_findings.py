@@ -8,8 +8,8 @@ from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, 
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT
-from forcegp.data.preparation import plain
 from forcegp.errors import DatasetError
+from forcegp.summary import plain
 
 NO_WORSE = 2.0  # factor by which more may remain without a rotor inertia
 ROUGHLY = 1.5  # factor either way that wrong inertias explain

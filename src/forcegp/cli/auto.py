@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -79,10 +79,16 @@ class Auto(Resuming, Import):
         if self.robot is None and self.identified is None:
             raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
         begin, preparation = time.process_time(), self._preparation()
-        self._require_own_folder()
+        present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
+        if self.out.is_file() or (present and "log.h5" not in present):
+            raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
+        if not self.out.parent.is_dir():
+            raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
         system, mapping = self._system(), self._mapping(terminal)
         assert system is not None
-        with self._log() as path:
+        path = self.out.parent / f".{self.out.name}.log.h5"
+        with contextlib.ExitStack() as cleanup:
+            cleanup.callback(path.unlink, missing_ok=True)  # where the log is refused
             dataset, done, mapping, mistakes = self._imported(terminal, system, mapping, path)
             corrected = self._command(mapping)
             if mistakes and not self.correct:
@@ -91,6 +97,7 @@ class Auto(Resuming, Import):
                 raise DatasetError(
                     f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
                 )
+            terminal.names_stages = True  # of minutes, most of which have nothing to count
             with terminal.progress("checking"):
                 report = forcegp.check(dataset)
             wrong = [finding for finding in report.findings if finding.severity == "wrong"]
@@ -103,7 +110,10 @@ class Auto(Resuming, Import):
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing"):
-            timed = self._timed(terminal, preparation, dataset)
+            if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.system):
+                timed = self.with_delay_that_shows(terminal, preparation, dataset)
+            else:
+                timed = replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
         with terminal.progress("identifying", may_end_early=True) as progress:
@@ -142,23 +152,6 @@ class Auto(Resuming, Import):
         terminal.show(facts("", dict(answer)), best)
         return content
 
-    def _require_own_folder(self) -> None:
-        """Refuse a folder with other content: InvalidInput."""
-        present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
-        if self.out.is_file() or (present and "log.h5" not in present):
-            raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
-        if not self.out.parent.is_dir():
-            raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-
-    @contextlib.contextmanager
-    def _log(self) -> Iterator[Path]:
-        """A place beside the results for the dataset, which is gone where the log is refused."""
-        path = self.out.parent / f".{self.out.name}.log.h5"
-        try:
-            yield path
-        finally:
-            path.unlink(missing_ok=True)
-
     def _imported(
         self, terminal: Terminal, system: forcegp.MechanicalSystem, mapping: forcegp.ColumnMapping, path: Path
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
@@ -172,7 +165,15 @@ class Auto(Resuming, Import):
                     )
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
-                mistakes.append(_mistake(error, correction))
+                mistakes.append(
+                    forcegp.checks.Finding(
+                        severity="wrong",
+                        subject=f"unit of {error.quantity}",
+                        seen=str(error).partition(" Is ")[0],
+                        remedy=f"forcegp import {forcegp.checks.import_flags(correction)}",
+                        correction=correction,
+                    )
+                )
                 mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
                 continue
             dataset, undecided = forcegp.Dataset.load(path), None
@@ -203,14 +204,6 @@ class Auto(Resuming, Import):
     @override
     def _preparation(self) -> forcegp.Preparation:
         return super()._preparation() if self.lag != "auto" else replace(self, lag="0")._preparation()
-
-    def _timed(
-        self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
-    ) -> forcegp.Preparation:
-        """With the delay, or the lag of thrusters, where the robot shows them."""
-        if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.system):
-            return self.with_delay_that_shows(terminal, preparation, dataset)
-        return replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
 
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
@@ -306,9 +299,3 @@ class Auto(Resuming, Import):
             terminal.note(f"no C program: {error}")
             return None
         return str(self.out / "c")
-
-
-def _mistake(error: MistakenUnit, correction: Mapping[str, Any]) -> forcegp.checks.Finding:
-    seen, remedy = str(error).partition(" Is ")[0], f"forcegp import {forcegp.checks.import_flags(correction)}"
-    subject = f"unit of {error.quantity}"
-    return forcegp.checks.Finding(severity="wrong", subject=subject, seen=seen, remedy=remedy, correction=correction)

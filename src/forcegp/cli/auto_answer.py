@@ -45,7 +45,9 @@ def answer_lines(
     jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
     seconds = content["seconds"]
     rate = (len(dataset) - len(dataset.episodes)) / seconds
-    mistakes = ", ".join(_corrected(each) for each in content["mistakes"]) or "nothing"
+    # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
+    flags = ((forcegp.checks.import_flags(each["correction"]), each["subject"]) for each in content["mistakes"])
+    mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late = prepared["delay"][0]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
     on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
@@ -70,7 +72,10 @@ def answer_lines(
     by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.given) else ""
     q = "rad or m" if moving else q
     models = content["models"]
-    scores = "; ".join(f"{NAMES.get(name, name)} {_score(model)}" for name, model in models.items())
+    scores = "; ".join(
+        f"{NAMES.get(name, name)} {number(_motion(model))} / {number(_acceleration(model))}"
+        for name, model in models.items()
+    )
     best = content["recommended"]
     covered = models[best]["coverage_95"]
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
@@ -97,8 +102,10 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
     """Which model to trust, and how much better than the URDF it is on unseen time."""
     models, best = content["models"], content["recommended"]
     unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
+    motions = models[best].get("motions")
+    horizon = f"{motions['horizons'][-1]:g} s" if motions and motions["horizons"] else ""
     scores = {
-        f"positions {_horizon(models[best])} ahead are wrong by {{:.2g}} {unit}": _motion,
+        f"positions {horizon} ahead are wrong by {{:.2g}} {unit}": _motion,
         "accelerations are wrong by {:.2g} of their standard deviation": _acceleration,
     }
     name, error = NAMES.get(best, best), _acceleration(models[best])
@@ -119,11 +126,6 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
     return f"Trust the model “{name}”."
 
 
-def _horizon(model: Mapping[str, Any]) -> str:
-    motions = model.get("motions")
-    return f"{motions['horizons'][-1]:g} s" if motions and motions["horizons"] else ""
-
-
 def _motion(model: Mapping[str, Any] | None) -> float | None:
     motions = None if model is None else model.get("motions")
     last = motions["rms"][-1] if motions and motions["rms"] else None
@@ -142,13 +144,3 @@ def payload_text(payload: forcegp.analytical.PayloadEstimate) -> str:
         return f"none ({mass:.2g} ± {error:.1g} kg)"
     center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
     return f"{mass:.3g} ± {error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
-
-
-def _corrected(mistake: Mapping[str, Any]) -> str:
-    """`q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected."""
-    flags = forcegp.checks.import_flags(mistake["correction"])
-    return flags.replace("--unit ", "").replace("--", "") or mistake["subject"]
-
-
-def _score(model: Mapping[str, Any]) -> str:
-    return f"{number(_motion(model))} / {number(_acceleration(model))}"

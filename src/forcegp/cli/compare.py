@@ -72,7 +72,12 @@ class Compare(LearningOptions):
             terminal.warn(warning)
         content = {"data": str(self.data), "test": None if self.test is None else str(self.test)}
         content |= comparison.to_dict()
-        folders = _folders(comparison)
+        # letters that every file system takes, with a number where two names become one
+        plain = {name: re.sub(r"[^\w.+-]+", "_", name.replace(" ", "")) for name in comparison.posteriors}
+        all_of = list(plain.values())
+        folders = {
+            name: text if all_of.count(text) == 1 else f"{text}-{k}" for k, (name, text) in enumerate(plain.items())
+        }
         if self.out is not None:
             with self.folder(self.out, self._given()) as folder:
                 for name, posterior in comparison.posteriors.items():
@@ -159,12 +164,3 @@ class Compare(LearningOptions):
 def _density(value: float) -> str:
     """Three decimals, none for numbers of 100 and more: the table has to fit into 80 columns."""
     return f"{value:.3f}" if abs(value) < 100.0 else f"{value:.0f}"
-
-
-def _folders(comparison: forcegp.PriorComparison) -> dict[str, str]:
-    """A folder name for every candidate: its own, of letters that every file system takes."""
-    plain = {name: re.sub(r"[^\w.+-]+", "_", name.replace(" ", "")) for name in comparison.posteriors}
-    taken = list(plain.values())
-    return {
-        name: text if taken.count(text) == 1 else f"{text}-{place}" for place, (name, text) in enumerate(plain.items())
-    }

@@ -68,7 +68,14 @@ class Demo(Command):
         options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
         start = time.monotonic()
         with self.folder(self.out, {"options": options, "machine": machine}) as folder:
-            train, test = (self._simulated(terminal, folder, name, seed) for name, seed in self._seeds().items())
+            data, seeds = {}, {"train": self.seed, "test": self.seed + 1}
+            for name, seed in seeds.items():
+                begin, how = time.monotonic(), {"seconds": self.seconds, "seed": seed, "noise": NOISE}
+                data[name] = simulate_with_progress(terminal, "kuka-surface", **how)
+                data[name].save(folder / f"{name}.h5")
+                seconds = time.monotonic() - begin
+                terminal.note(f"simulated {name}: {len(data[name])} rows, seed {seed} ({seconds:.1f} s)")
+            train, test = data.values()
             models, evaluations, fits = {}, {}, {}
             for name, (place, mean) in MODELS.items():
                 models[name], fits[name] = self._fitted(terminal, folder / place, train, name, mean)
@@ -78,7 +85,7 @@ class Demo(Command):
             wall_seconds = time.monotonic() - start
             results = {
                 "out": str(self.out),
-                "seeds": self._seeds(),
+                "seeds": seeds,
                 **{name: options[name] for name in ("seconds", "points")},
                 "models": {
                     name: {
@@ -135,16 +142,6 @@ class Demo(Command):
             )
             forcegp.report.write_page(folder / "report.html", page)
         return best
-
-    def _seeds(self) -> dict[str, int]:
-        return {"train": self.seed, "test": self.seed + 1}
-
-    def _simulated(self, terminal: Terminal, folder: Path, name: str, seed: int) -> forcegp.Dataset:
-        start = time.monotonic()
-        dataset = simulate_with_progress(terminal, "kuka-surface", seconds=self.seconds, seed=seed, noise=NOISE)
-        dataset.save(folder / f"{name}.h5")
-        terminal.note(f"simulated {name}: {len(dataset)} rows, seed {seed} ({time.monotonic() - start:.1f} s)")
-        return dataset
 
     def _fitted(
         self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: Any

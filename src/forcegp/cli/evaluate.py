@@ -177,14 +177,6 @@ def acceleration_unit(dataset: forcegp.Dataset) -> str:
     return units.replace("^2", "²") if isinstance(units, str) else "the units of each joint"
 
 
-def _carried(posterior: forcegp.models.Posterior) -> bool:
-    """Whether robot or contacts are not those of the training; what an observer reports is neither."""
-    if posterior.target is None:
-        return False
-    here, there = ({**system.to_dict(), "known_forces": None} for system in (posterior.target, posterior.model.system))
-    return here != there
-
-
 def _report(
     posterior: forcegp.models.Posterior,
     evaluation: forcegp.Evaluation,
@@ -194,7 +186,9 @@ def _report(
 ) -> list[Any]:
     points = len(posterior.training)
     unit = acceleration_unit(dataset)
-    where = ", carried to another robot or contacts" if _carried(posterior) else ""
+    # what an observer reports is neither robot nor contact
+    systems = [{**x.to_dict(), "known_forces": None} for x in (posterior.target, posterior.model.system) if x]
+    where = ", carried to another robot or contacts" if systems[0] != systems[-1] else ""
     title = (
         f"{points} training points, {posterior.description}{where}; {evaluation.rows} rows of {data}; errors in {unit}"
     )

@@ -173,7 +173,9 @@ def motion_report(posterior: Any) -> list[Any]:
 def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
     result, settings = posterior.result, posterior.settings
-    force_noise = posterior.parameters.get("noise.log_force")
+    force_noise, prior = posterior.parameters.get("noise.log_force"), getattr(posterior.model, "prior", None)
+    air = [x for x in prior.summands() if isinstance(x, forcegp.AerodynamicForce)] if prior else []
+    looked = not {"air", "observe"} & set(settings) and not posterior.system.held_inputs  # not for wind in windows
     return {
         "model": posterior.description,
         "objective_is": posterior.objective,
@@ -191,20 +193,12 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
         "wind": posterior.settings.get("air", {}).get("wind"),
-        "wind_not_found": _wind_not_found(posterior),
+        "wind_not_found": looked and any(x.observe != 0.0 for x in air),
         "steady_forces": posterior.settings.get("steady_forces"),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
     }
-
-
-def _wind_not_found(posterior: Any) -> bool:
-    """Whether the fit looked for wind that its rows do not show; windows do not look for it."""
-    prior = getattr(posterior.model, "prior", None)
-    air = [x for x in prior.summands() if isinstance(x, forcegp.AerodynamicForce)] if prior else []
-    looked = not {"air", "observe"} & set(posterior.settings) and not posterior.system.held_inputs
-    return looked and any(x.observe != 0.0 for x in air)
 
 
 def payloads(posterior: Any, dataset: forcegp.Dataset) -> dict[str, str]:
@@ -228,23 +222,17 @@ def payloads(posterior: Any, dataset: forcegp.Dataset) -> dict[str, str]:
     return found
 
 
-def _points_used(summary: Mapping[str, Any]) -> str:
-    """How many points were conditioned on, and where parameters were found on fewer of them, on how many."""
-    points, learning = summary["points"], summary["learning_points"]
-    if learning == points:
-        return f"{points} points"
-    refined = " and refined on all" if "refined" in summary else ""
-    return f"{points} points (parameters: from {learning} of them{refined})"
-
-
 def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
     forces, air = summary.get("force_noise_std"), summary.get("wind")
     still = "learned as still air" + (", with a force in each episode" if summary.get("steady_forces") else "")
+    points, learning = summary["points"], summary["learning_points"]
+    refined = " and refined on all" if "refined" in summary else ""
+    fewer = f" (parameters: from {learning} of them{refined})" if learning != points else ""
     # the status counts failed evaluations, too, and the starts
     status = with_option_names(summary["status"], ("iterations",))
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
     table = facts(
-        f"{run}: {summary['model']}, learned from {_points_used(summary)}",
+        f"{run}: {summary['model']}, learned from {points} points{fewer}",
         {
             **summary.get("payloads", {}),
             **({"engine": summary["engine"]} if "engine" in summary else {}),

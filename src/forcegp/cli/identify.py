@@ -287,7 +287,9 @@ def _report(command: Identify, found: forcegp.models.Identification, summary: Ma
     for name, unit in found.units.items():
         unit, factor = ("mm", 1e3) if unit == "m" else (unit, 1.0)
         start, value, error = (factor * each[name] for each in (found.start, found.values, found.standard_errors))
-        digits = _digits(error, value)
+        # decimals that show two digits of the standard error, and four of the value where there is none
+        size = error if 0.0 < error < math.inf else 1e-3 * abs(value)
+        digits = min(9, max(0, 1 - math.floor(math.log10(size)))) if size > 0.0 else 4
         low, high = (factor * end for end in found.intervals[name])
         interval = f"{low:.{digits}f} … {high:.{digits}f}" if math.isfinite(error) else NONE
         of, part = _owner_and_part(name)
@@ -312,9 +314,3 @@ def _owner_and_part(name: str) -> tuple[str, str]:
         return owner, part
     pieces = name.rsplit(".", 1 if name.endswith(".mass") else 2)
     return pieces[0], ".".join(pieces[1:])
-
-
-def _digits(error: float, value: float) -> int:
-    """Decimals that show two digits of the standard error, and four of the value where there is none."""
-    size = error if 0.0 < error < math.inf else 1e-3 * abs(value)
-    return min(9, max(0, 1 - math.floor(math.log10(size)))) if size > 0.0 else 4

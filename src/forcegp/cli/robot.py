@@ -51,7 +51,12 @@ class Robot(RobotFileOptions, Overwriting):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
-        self.require_free_file(self.out, _own, "a PNG or a robot file")
+
+        def own(path: Path) -> bool:
+            data = path.read_bytes()
+            return data.startswith(b"\x89PNG") or b"<mujoco" in data or b"<robot" in data
+
+        self.require_free_file(self.out, own, "a PNG or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
             options = {"inertias": self.inertias, "strict": self.strict, **self._changes()}
@@ -85,12 +90,6 @@ class Robot(RobotFileOptions, Overwriting):
         return content
 
 
-def _own(path: Path) -> bool:
-    """Whether it is a picture or a robot file."""
-    data = path.read_bytes()
-    return data.startswith(b"\x89PNG") or b"<mujoco" in data or b"<robot" in data
-
-
 def _content(robot: forcegp.Robot) -> dict[str, Any]:
     links = [robot.link(name) for name in robot.link_names]
     joints = [asdict(joint) | {"armature": x} for joint, x in zip(robot.joints, robot.armature.tolist(), strict=True)]
@@ -110,11 +109,6 @@ def _content(robot: forcegp.Robot) -> dict[str, Any]:
     }
 
 
-def _followed(joint: str, multiplier: float, offset: float) -> str:
-    times = {1.0: "", -1.0: "-"}.get(multiplier, f"{multiplier:g} ")
-    return f" = {times}{joint}" + (f" {offset:+g}" if offset else "")
-
-
 def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     """The tree and the table of joints."""
     from rich.text import Text
@@ -131,7 +125,9 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     for joint in robot.all_joints:
         mimic = content["mimics"].get(joint.name)
         how = joint.type if {joint.name, joint.type} & moving else "locked"
-        how += "" if mimic is None else _followed(**mimic)
+        if mimic is not None:
+            times = {1.0: "", -1.0: "-"}.get(mimic["multiplier"], f"{mimic['multiplier']:g} ")
+            how += f" = {times}{mimic['joint']}" + (f" {mimic['offset']:+g}" if mimic["offset"] else "")
         branches[joint.child] = branches[joint.parent].add(line(joint.child, f"  {joint.name} ({how})"))
     header = {"lower": "lower", "upper": "upper", "velocity": "velocity_limit", "effort": "effort_limit"}
     header |= {name: name for name in ("damping", "friction", "armature")}

@@ -90,6 +90,8 @@ class Terminal:
     def __init__(self, *, json: bool, options: Collection[str] = ()) -> None:
         self.json = json
         self.options = options
+        self.names_stages = False
+        """Report the beginning of every stage where there is no terminal to draw a bar on."""
         self._stdout: int | None = None
 
     # rich is imported when something is shown, so that --help and errors come at once
@@ -172,6 +174,8 @@ class Terminal:
     def _lines(self, what: str, may_end_early: bool) -> ProgressCallback:
         """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
         start = reported = time.monotonic()
+        if self.names_stages:
+            self.note(f"{what} ...")
 
         def report(done: int, total: int, note: str = "") -> None:
             nonlocal reported

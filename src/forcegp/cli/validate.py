@@ -92,7 +92,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
         backend = self._backend()
         start = time.monotonic()
 
-        comparison = self._comparison(terminal)
+        comparison, digest = self._comparison(terminal), file_digest(self.data)
+        text, robot = f"{self.data} (SHA-256 {digest[:16]}…)", [f"robot from {self.robot}"] * (self.robot is not None)
         with terminal.progress(f"validating: {len(comparison.splits)} split(s), {self.seeds} seed(s)") as report:
             validation = forcegp.validate(
                 comparison,
@@ -100,7 +101,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
                 models=self.models or None,
                 seeds=self.seeds,
                 backend=backend,
-                source=self._source(),
+                source={"title": str(self.data), "data": [text, *robot], "sha256": digest},
                 margin=self.margin,
                 overwrite=self.overwrite,
                 progress=report,
@@ -149,11 +150,6 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
                 f"--guard {self.guard:g} s is shorter than two time constants of the filter ({2.0 * memory:.2g} s), so "
                 "rows on both sides of a border share measurements; give a longer one."
             )
-
-    def _source(self) -> dict[str, Any]:
-        digest = file_digest(self.data)
-        robot = [f"robot from {self.robot}"] if self.robot is not None else []
-        return {"title": str(self.data), "data": [f"{self.data} (SHA-256 {digest[:16]}…)", *robot], "sha256": digest}
 
     def _report(self, document: Mapping[str, Any]) -> list[Any]:
         def median(value: Mapping[str, Any] | None, show: Callable[[float | None], str] = number) -> str:

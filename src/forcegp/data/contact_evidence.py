@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 import forcegp.mechanics
 from forcegp.data.contact_residual import BLOCKS, Residual, missing_contact, moved_points, tensors
 from forcegp.data.dataset import Dataset
+from forcegp.data.row_selection import move_on
 from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
@@ -89,7 +90,8 @@ def rows_in_contact(dataset: Dataset) -> Dataset:
 class _PointMotion(NamedTuple):
     """The point of a contact in every row, in m, m/s and m/s^2; `rate` and `residual` A a - b are along the normal.
 
-    `noise` is the standard deviation of A a that the noise on the acceleration makes; 0 where it is not known.
+    `noise` is the standard deviation of A a that the noise on the acceleration makes; 0 where it is not known. Those
+    that noise on v makes of the rate and the speed are `rate_noise` and `speed_noise`.
     """
 
     distance: Float[np.ndarray, " rows"]
@@ -98,12 +100,21 @@ class _PointMotion(NamedTuple):
     acceleration: Float[np.ndarray, " rows"]
     residual: Float[np.ndarray, " rows"]
     noise: Float[np.ndarray, " rows"]
+    rate_noise: Float[np.ndarray, " rows"]
+    speed_noise: Float[np.ndarray, " rows"]
 
 
-def _point_motions(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[_PointMotion]:
+def _point_motions(
+    dataset: Dataset,
+    system: forcegp.mechanics.MechanicalSystem,
+    noise_seen: tuple[np.ndarray, np.ndarray] | None = None,
+) -> list[_PointMotion]:
+    """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
     q, v, u, a = tensors(dataset)
     state = system.state(q, v, u)
-    sigma = torch.zeros(dataset.nv) if dataset.noise_std is None else torch.tensor(dataset.noise_std)
+    wander, sigma = map(torch.tensor, noise_seen or (np.zeros(dataset.nv), np.zeros(dataset.nv)))
+    if dataset.noise_std is not None:
+        sigma = torch.tensor(dataset.noise_std)
     motions = []
     for contact in system.contacts:
         A, b, gradient = contact.constraint(state, system.baumgarte)
@@ -111,8 +122,9 @@ def _point_motions(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem)
         J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
         speed, acceleration = (torch.linalg.vector_norm((J @ x[..., None])[..., 0], dim=-1) for x in (v, a))
         distance, rate = contact.distance(state.kinematics) / size, (A * v).sum(-1) / size
-        residual, noise = ((A * a).sum(-1) - b) / size, (A * sigma).norm(dim=-1) / size
-        motions.append(_PointMotion(*(x.numpy() for x in (distance, rate, speed, acceleration, residual, noise))))
+        residual = ((A * a).sum(-1) - b) / size
+        noises = (A * sigma).norm(dim=-1) / size, (A * wander).norm(dim=-1) / size, (J * wander).flatten(1).norm(dim=-1)
+        motions.append(_PointMotion(*(x.numpy() for x in (distance, rate, speed, acceleration, residual, *noises))))
     return motions
 
 
@@ -180,25 +192,46 @@ def contact_doubts(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem 
     system = dataset.system if system is None else system
     if system is None or system.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
         return []
+    noise = _white_noise(dataset.v, dataset), _white_noise(dataset.a, dataset)
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
     with torch.no_grad():
         try:
-            return _stated(rows, system.to("cpu")) if system.contacts else _missing(rows, system.to("cpu"))
+            return _stated(rows, system.to("cpu"), noise) if system.contacts else _missing(rows, system.to("cpu"))
         except (ForceGPError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
             return []  # states that no contact bears: who computes with them raises what is wrong
 
 
-def _stated(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[ContactDoubt]:
+def _white_noise(values: Float[np.ndarray, "rows nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
+    """Standard deviations of white noise, from medians of third differences, whose variance is 20 times its.
+
+    0 for rows that are no recorded motion.
+    """
+    if not dataset.time_ordered or not move_on(dataset):
+        return np.zeros(dataset.nv)
+    thirds = np.concatenate([np.diff(values[dataset.episode == number], 3, axis=0) for number in dataset.episodes])
+    return 1.4826 * np.median(np.abs(thirds), axis=0) / 20.0**0.5 if len(thirds) else np.zeros(dataset.nv)
+
+
+def _stated(
+    rows: Dataset, system: forcegp.mechanics.MechanicalSystem, noise_seen: tuple[np.ndarray, np.ndarray]
+) -> list[ContactDoubt]:
     touching = np.ones(len(rows), dtype=bool)
-    for index, (contact, motion) in enumerate(zip(system.contacts, _point_motions(rows, system), strict=True)):
+    motions = _point_motions(rows, system, noise_seen)
+    for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
+        acts = (
+            np.ones(len(rows), bool) if contact.switch is None else rows.u[:, system.inputs.index(contact.switch)] > 0.5
+        )
+        if not acts.any():
+            continue
+        motion = _PointMotion(*(values[acts] for values in motion))
         distance, rate = motion.distance, np.abs(motion.rate)
         residual, acceleration, noise = (
             float(np.median(np.abs(values))) for values in (motion.residual, motion.acceleration, motion.noise)
         )
         broken = residual > max(BROKEN * acceleration, NOISE * noise)
         recovered = _recovery(system) * np.minimum(np.abs(distance), FARTHEST)
-        slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered
-        moves = motion.speed > 2.0 * CREEP
+        slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered + 2.0 * motion.rate_noise
+        moves = motion.speed > 2.0 * (CREEP + motion.speed_noise)
         along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= FARTHEST)
         what = f"contact {index} (frame {contact.frame!r}): "
         remedy = "Check its point, its surface and their units (m), or leave the contact out (`contacts=none`)."
@@ -215,7 +248,7 @@ def _stated(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[C
         elif far > FAR:
             seen = f"its point moves along the surface, but {far:.3g} m away from it."
         else:
-            touching &= along
+            touching[acts] &= along
             continue
         numbers = {"contact": index, "share": share, "distance": far}
         return [ContactDoubt(kind="off", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]

@@ -293,7 +293,11 @@ def _truth(
     rows: int,
     system: forcegp.mechanics.MechanicalSystem | None,
 ) -> FrozenDict:
-    unknown = sorted(name for name in given if name not in TRUTH_NAMES and not _of_a_kind(name))
+    def known(name: str) -> bool:  # or `Q_U.tool`, `force.tool-friction`, with a name that a file can carry
+        ends = (name[len(kind) :] for kind in TRUTH_KINDS if name.startswith(kind))
+        return name in TRUTH_NAMES or any(end.replace("-", "").isalnum() for end in ends)
+
+    unknown = sorted(name for name in given if not known(name))
     if unknown:
         kinds = ", ".join(f"{kind}<name>" for kind in TRUTH_KINDS)
         raise DatasetError(f"truth has no {unknown}; allowed: {', '.join(TRUTH_NAMES)}, {kinds}.")
@@ -312,11 +316,6 @@ def _truth(
             values = finite_columns(what, given[name], joint_names, rows)
         checked[name] = values
     return FrozenDict(checked)
-
-
-def _of_a_kind(name: str) -> bool:
-    """`Q_U.tool`, `force.tool-friction`: a beginning from `TRUTH_KINDS` and a name that a file can carry."""
-    return any(name.startswith(kind) and name[len(kind) :].replace("-", "").isalnum() for kind in TRUTH_KINDS)
 
 
 def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:

@@ -67,7 +67,9 @@ def _judged(
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), robot).common)  # the best guess, sure or not
     log = shifted(log, np.full(log.nv, delay))
-    inner = _inner(log, SETTLED / tried[0] + abs(delay))
+    away = SETTLED / tried[0] + abs(delay)
+    times = [rows.time for _, rows, _ in episodes_in_order(log)]
+    inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
     folds = np.array_split(np.arange(int(inner.sum())), FOLDS)
     sides = [np.concatenate(folds[first::2]) for first in (0, 1)]
     sharp = torque_columns(robot, behind(tried[-1]))
@@ -92,12 +94,3 @@ def _judged(
     mean = np.exp(np.log(np.maximum(shares, 1e-12)).mean(axis=1))
     best = float(f"{tried[int(np.argmin(mean))]:.3g}")
     return best, {float(f"{f:.3g}"): float(share) for f, share in zip(tried, mean, strict=True)}
-
-
-def _inner(log: Dataset, away: float) -> np.ndarray:
-    """Rows (rows,) as truth values that lie so many seconds from both ends of their episode."""
-    parts = [
-        (rows.time >= rows.time[0] + away) & (rows.time <= rows.time[-1] - away)
-        for _, rows, _ in episodes_in_order(log)
-    ]
-    return np.concatenate(parts)

@@ -20,6 +20,7 @@ from forcegp.data.stance import estimate_stance
 from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
+from forcegp.summary import plain
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 AUTOMATIC = "auto", "each"
@@ -328,11 +329,6 @@ def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | N
         old, change = as_vectors(before), space.difference(*(torch.tensor(x) for x in (new, old))).numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
         return plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
-
-
-def plain(values: np.ndarray) -> list[float | None]:
-    """Numbers for JSON, which has no NaN."""
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _finite(value: object) -> bool:

@@ -5,7 +5,7 @@ therefore by episode, and `require_disjoint` refuses a pair that overlaps.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
@@ -133,3 +133,21 @@ def _first_row(rows: int, start: int | None, seed: int | None) -> int:
     if not 0 <= start < rows:
         raise InvalidInput(f"start is {start}; it must be a row number from 0 to {rows - 1}.")
     return int(start)
+
+
+LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
+
+
+def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
+    """Whether the next row belongs to the same episode and follows; False for the last row."""
+    return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
+
+
+def move_on(dataset: Dataset) -> bool:
+    """Whether rows that follow each other belong to one motion; a sample of rows or of random states leaps about."""
+    steps = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]]
+    spread = dataset.q.std(axis=0)
+    moving = spread > 0.0
+    if not len(steps) or not moving.any():
+        return bool(len(steps))
+    return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())

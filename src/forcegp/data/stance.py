@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 import forcegp.mechanics
 from forcegp.data.contact_residual import tensors
 from forcegp.data.dataset import Dataset
+from forcegp.data.gravity import missing_gravity
 from forcegp.errors import ContactError, DatasetError, DataWarning
 
 WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
@@ -36,8 +37,6 @@ FALLS, SURE = 0.2, 0.1
 to which its absence decides."""
 TILTS = 0.05
 """rad by which a foot held flat leans away from the median of its stretch of stance."""
-EARTH, NEAR, OFTEN = 9.81, 0.5, 0.1
-"""m/s^2: of free fall, and about it; share of the rows in which a robot falls so."""
 FEW = 10
 MANY_OPEN = 0.25
 """Share of open rows that more than changes of stance leave."""
@@ -152,7 +151,10 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     for rows in episodes:
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
-    weight, whole = _weight(system), np.sum(asked, axis=0)
+    robot, whole, weight = system.robot, np.sum(asked, axis=0), 0.0
+    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
+    if gravity is not None and all(contact.switch for contact in system.contacts):  # which alone hold the robot up
+        weight = float(gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
         falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
@@ -205,42 +207,6 @@ def tilting(
                 away = np.linalg.norm(down[rows] - np.median(down[rows], axis=0), axis=1)
                 found[rows, k] |= away > TILTS
     return found
-
-
-def missing_gravity(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem) -> tuple[str, str] | None:
-    """What shows that a robot in a plane falls in it although its gravity has no part there, and the remedy."""
-    robot = system.robot
-    if robot.base != "planar" or robot.gravity[:2].any():
-        return None
-    q, v, a = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.a))
-    force = robot.kinematics(q, v).inverse_dynamics(a)[:, :2].cpu().numpy() / robot.mass  # in the axes of the base
-    c, s = dataset.q[:, 2], dataset.q[:, 3]
-    motion = np.stack([c * force[:, 0] - s * force[:, 1], s * force[:, 0] + c * force[:, 1]], 1)
-    near = abs(np.linalg.norm(motion, axis=1) - EARTH) < NEAR
-    if not near.any():
-        return None
-    fall = np.median(motion[near], axis=0)
-    often, size = (np.linalg.norm(motion - fall, axis=1) < NEAR).mean(), np.linalg.norm(fall)
-    if often < OFTEN or abs(size - EARTH) > NEAR:
-        return None
-    direction = fall / size
-    direction = np.where(abs(direction) < TILTS, 0.0, direction)
-    x, y = EARTH * direction / np.linalg.norm(direction)
-    return (
-        f"in {often:.0%} of the rows the robot falls at ({fall[0]:.3g}, {fall[1]:.3g}) m/s^2 in its plane, in which it "
-        "has no gravity",
-        f"forcegp import --robot FILE --base planar --gravity={x + 0.0:.4g},{y + 0.0:.4g},0 reads it with gravity, as "
-        f"Robot.from_urdf(..., gravity=({x + 0.0:.4g}, {y + 0.0:.4g}, 0)) does.",
-    )
-
-
-def _weight(system: forcegp.mechanics.MechanicalSystem) -> float:
-    """What contacts with a switch must bear [N]; 0 where something else may hold the robot up."""
-    robot, alone = system.robot, all(contact.switch for contact in system.contacts)
-    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
-    if gravity is None or not alone:
-        return 0.0
-    return float(gravity.norm()) * robot.mass
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:

@@ -16,12 +16,20 @@ from forcegp.errors import ForceGPError
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import StructuredPosterior
 from forcegp.models.protocol import Posterior
+from forcegp.summary import listed
 
 WORSE = 1.01
 """Error of the model over that of its known forces alone, from which it is pointed out."""
 
+WORSE_JOINT, LEAST_WORSE = 1.2, 0.1
+"""The same of one joint, and by how much its error must be larger, in standard deviations of the noise."""
+
 FEWEST_INSIDE = 0.9
 """Least coverage of 95 % intervals, over all joints, about which nothing is said."""
+
+MISSED, CHANCE = 0.15, 4.0
+"""How much less than 95 % the intervals of one joint may hold: this share, or so many deviations of a count by chance
+if that is more."""
 
 MARGIN, POSTURE = 0.25, 0.1
 """How far beyond the training range of a joint a value may lie: a fraction of that range, and of the widest range of
@@ -64,36 +72,52 @@ def rows_outside(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
         )
 
 
-def poor_scores(scores: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences about the scores of an `Evaluation`: worse than the known forces alone, and intervals that miss."""
-    for error, known, what in (
-        ("mae_noise_free_per_joint", "known_physics_mae_noise_free_per_joint", "noise-free MAE"),
-        ("mae_per_joint", "known_physics_mae_per_joint", "MAE"),
-    ):
-        if scores.get(error) is None or scores.get(known) is None:
+def poor_scores(posterior: Posterior, dataset: Dataset, scores: Mapping[str, Any]) -> Iterator[str]:
+    """Sentences about the scores of an `Evaluation`: worse than the known forces alone, and intervals that miss.
+
+    On average over the joints, or at some of them, which are named with the worst first.
+    """
+    names, noise = np.array(posterior.joint_names), posterior.noise_std.detach().cpu().numpy()
+    for suffix, what in (("_noise_free_per_joint", "noise-free MAE"), ("_per_joint", "MAE")):
+        if scores.get(f"mae{suffix}") is None or scores.get(f"known_physics_mae{suffix}") is None:
             continue
-        mine, alone = (float(np.mean(scores[name])) for name in (error, known))
-        if mine > WORSE * alone:
+        mine, alone = (np.asarray(scores[f"{name}{suffix}"], dtype=float) for name in ("mae", "known_physics_mae"))
+        worse = mine > np.maximum(WORSE_JOINT * alone, alone + LEAST_WORSE * noise)
+        places = [
+            f"{names[joint]} {mine[joint]:.3g} against {alone[joint]:.3g}"
+            for joint in sorted(np.flatnonzero(worse), key=lambda joint: alone[joint] / mine[joint])
+        ]
+        if mine.mean() > WORSE * alone.mean():
             yield (
-                f"the model is worse here than its known forces alone ({what} {mine:.3g} against {alone:.3g}): "
-                "do not use it for motions like these"
+                f"the model is worse here than its known forces alone ({what} {mine.mean():.3g} against "
+                f"{alone.mean():.3g}): do not use it for motions like these"
+            )
+        elif places:
+            yield (
+                f"the model is better here than its known forces alone on average, but worse at {len(places)} of "
+                f"{len(names)} joints ({what}: {listed(places)}): do not use it for these"
             )
         break  # against the truth where it is known, for noise hides the difference
+    least = 0.95 - max(MISSED, CHANCE * (0.95 * 0.05 / len(dataset)) ** 0.5)
     for name, what in (
         ("coverage_95_per_joint", "measurements"),
         ("coverage_95_noise_free_per_joint", "true accelerations"),
     ):
-        inside = scores.get(name)
-        if inside is not None and float(np.mean(inside)) < FEWEST_INSIDE:
-            yield (
-                f"the 95 % intervals hold {float(np.mean(inside)):.0%} of the {what}: the model is "
-                "overconfident; a force is missing, the noise is larger than stated, or these motions are new to it"
-            )
+        inside = np.asarray(scores.get(name, ()), dtype=float)
+        if scores.get(name) is None or not (inside.mean() < FEWEST_INSIDE or inside.min() < least):
+            continue
+        places = [f"{names[joint]} {inside[joint]:.0%}" for joint in np.argsort(inside) if inside[joint] < least]
+        of = f" ({listed(places)})" if places else ""
+        yield (
+            f"the 95 % intervals hold {inside.mean():.0%} of the {what}{of}: the model is "
+            "overconfident; a force is missing, the noise is larger than stated, or these motions are new to it"
+        )
 
 
 def doubts(posterior: Posterior, dataset: Dataset, scores: Mapping[str, Any]) -> tuple[str, ...]:
     """All of them, for the scores of this model on this dataset."""
-    return (*unfinished_search(posterior), *rows_outside(posterior, dataset), *poor_scores(scores))
+    poor = poor_scores(posterior, dataset, scores)
+    return (*unfinished_search(posterior), *rows_outside(posterior, dataset), *poor)
 
 
 STATES = 20

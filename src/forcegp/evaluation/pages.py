@@ -1,9 +1,18 @@
 """Pages of Markdown from Jinja templates, which lie beside the modules that have their numbers."""
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
+
+
+def alike(told: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
+    """Texts and what they are about, in groups whose texts differ in numbers alone."""
+    groups: dict[str, list[tuple[str, Any]]] = {}
+    for text, about in told:
+        groups.setdefault(re.sub(r"\d[\d.e+-]*", "#", text), []).append((text, about))
+    return list(groups.values())
 
 
 def rendered(template: str, **values: Any) -> str:

@@ -132,7 +132,12 @@ def allowing_for_correlation(
     inducing points then improve on all rows. No row is left out, for friction changes within a few of them at a
     reversal. The note is None where errors do not resemble each other.
     """
-    k = _correlated_rows(posterior, dataset) if dataset.time_ordered else 1.0
+    k, some = 1.0, dataset.rows(slice(RESIDUALS))
+    if dataset.time_ordered:
+        residual = posterior.predict(some.q, some.v, some.u, covariance=False).mean.cpu().numpy() - some.a
+        spread = residual.std(axis=0)
+        k = float(np.median(correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)))
+    k = k if k >= NOTICEABLE else 1.0
     if k > 1.0:
         settings = {**posterior.settings, "correlated_rows": k}
         given = posterior.training, posterior.parameters, posterior.result, settings, posterior.engine
@@ -142,12 +147,3 @@ def allowing_for_correlation(
     if isinstance(posterior.engine, Inducing):
         posterior = refined(replace(posterior, engine=replace(posterior.engine, refine=Inducing.refine)), hyperprior)
     return posterior, f"errors resemble each other over {k:.0f} rows, which count as one" if k > 1.0 else None
-
-
-def _correlated_rows(posterior: StructuredPosterior, dataset: Dataset) -> float:
-    some = dataset.rows(slice(RESIDUALS))
-    residual = posterior.predict(some.q, some.v, some.u, covariance=False).mean.cpu().numpy() - some.a
-    spread = residual.std(axis=0)
-    times = correlation_time(residual / np.where(spread > 0.0, spread, 1.0), some.episode)
-    k = float(np.median(times))
-    return k if k >= NOTICEABLE else 1.0

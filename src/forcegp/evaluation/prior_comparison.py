@@ -223,7 +223,11 @@ def compare_priors(
     if test is not None:
         require_rows("test", test, dataset.joint_names, "the training data")
     rows = training_rows(known.robot.joint_names, dataset, points)
-    seconds = _block_seconds(rows) if block_seconds is None else block_seconds
+    seconds = block_seconds
+    if seconds is None:
+        seconds = sum(float(np.ptp(rows.time[rows.episode == episode])) for episode in rows.episodes) / BLOCKS
+        if not seconds > 0.0:
+            raise InvalidInput("every episode has one training row, so there are no stretches of time to leave out")
     blocks = time_blocks(rows.time, rows.episode, seconds)
     if len(blocks) < FEWEST_BLOCKS:
         raise InvalidInput(
@@ -299,14 +303,6 @@ def paired_difference(
     gain, rows, count = one - other, float(sizes.sum()), len(sizes)
     mean = float(gain.sum()) / rows
     return mean, math.sqrt(count / (count - 1) * float(np.square(gain - sizes * mean).sum())) / rows
-
-
-def _block_seconds(rows: Dataset) -> float:
-    """A twentieth of the time that was recorded."""
-    recorded = sum(float(np.ptp(rows.time[rows.episode == episode])) for episode in rows.episodes)
-    if not recorded > 0.0:
-        raise InvalidInput("every episode has one training row, so there are no stretches of time to leave out")
-    return recorded / BLOCKS
 
 
 def _checked_size(model: StructuredGP, rows: Dataset) -> ProblemSize:

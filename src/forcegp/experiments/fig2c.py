@@ -61,7 +61,10 @@ class Fig2c(Experiment):
         estimates = [results.result(_estimate_name(seed)) for seed in self.seeds]
         intervals = {
             name: {
-                "inside": sum(_inside(each["error"][name], each["std"][name]) for each in estimates),
+                # of the 95 % intervals; one of infinite width holds everything
+                "inside": sum(
+                    x["std"][name] is None or abs(x["error"][name]) <= 1.96 * x["std"][name] for x in estimates
+                ),
                 "error": median_and_range(abs(each["error"][name]) for each in estimates),
                 "std": median_and_range(each["std"][name] for each in estimates),
             }
@@ -110,11 +113,6 @@ class Fig2c(Experiment):
             verdicts=verdicts,
             estimates=intervals,
         )
-
-
-def _inside(error: float, std: float | None) -> bool:
-    """Is the truth in the 95 % interval? One of infinite width holds everything."""
-    return std is None or abs(error) <= 1.96 * std
 
 
 def _found_at(trace: Mapping[str, Any]) -> int | None:

@@ -33,10 +33,12 @@ def trace(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
     true = _values(train.system)
     posterior, identification = _fitted(train, spec)
     history = [{NAMES[name]: value for name, value in point.items()} for point in identification.history]
+    every = (posterior.at_iteration(k) for k in range(len(history)))
+    predicted = (each.predict(test.q, test.v, test.u, covariance=False) for each in every)
     return {
         "mass_error": [point["mass"] - true["mass"] for point in history],
         "center_error": [math.dist(*([x[f"com.{axis}"] for axis in "xyz"] for x in (at, true))) for at in history],
-        "mae": [_mae(posterior.at_iteration(k), test) for k in range(len(history))],
+        "mae": [float(np.abs(each.mean.numpy() - test.a).mean()) for each in predicted],
         "start_mass": MASS_OFFSET,
         "start_center": list(CENTER_OFFSET),
         "converged": posterior.result.converged,
@@ -80,10 +82,6 @@ def _values(system: MechanicalSystem | None) -> dict[str, float]:
     assert system is not None
     link = system.robot.link(TOOL_LINK)
     return {"mass": link.mass, **{f"com.{axis}": value for axis, value in zip("xyz", link.center_of_mass, strict=True)}}
-
-
-def _mae(posterior: StructuredPosterior, test: Dataset) -> float:
-    return float(np.abs(posterior.predict(test.q, test.v, test.u, covariance=False).mean.numpy() - test.a).mean())
 
 
 def _uncertainty(identification: Identification) -> dict[str, Any]:

@@ -88,22 +88,11 @@ class FitSettings:
     tolerance: Mapping[str, float]
     network_steps: int | None = None
 
-    def of_network(self) -> dict[str, Any]:
-        """The settings of a network, as a job's spec holds them; None leaves it its own number of training steps."""
-        return {} if self.network_steps is None else {"steps": self.network_steps}
-
     def of(self, points: int) -> dict[str, Any]:
         """The settings for this many points, as a job's spec holds them."""
-        return {
-            "restarts": _at(self.restarts, points),
-            "iterations": self.iterations,
-            "tolerance": _at(self.tolerance, points),
-        }
-
-
-def _at(steps: Mapping[str, Any], points: int) -> Any:
-    """The value of the largest key that does not exceed the points; JSON turns the keys into text."""
-    return steps[str(max(int(key) for key in steps if int(key) <= points))]
+        by_points = {"restarts": self.restarts, "tolerance": self.tolerance}  # JSON turns the keys into text
+        last = {name: str(max(int(key) for key in each if int(key) <= points)) for name, each in by_points.items()}
+        return {name: each[last[name]] for name, each in by_points.items()} | {"iterations": self.iterations}
 
 
 # Model, points and seed -> where the fit to the first rows of a trajectory lies; model and seed: that to all rows.
@@ -126,7 +115,8 @@ def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings
 def fit_to_all(model: str, data: str, seed: int, settings: FitSettings) -> Job:
     """A network or an analytical model on all training rows of the data job."""
     spec = {"model": model, "data": data, "points": None, "seed": seed, "start": None}
-    spec |= settings.of_network() if model in NETWORKS else {}
+    if model in NETWORKS and settings.network_steps is not None:  # else it has its own number of training steps
+        spec["steps"] = settings.network_steps
     return Job(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
 
 

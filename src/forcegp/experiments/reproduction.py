@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
+from forcegp.evaluation.pages import alike
 from forcegp.experiments.experiment import DataSettings, Experiment, Row
 from forcegp.experiments.fig2b import Fig2b
 from forcegp.experiments.fig2c import Fig2c
@@ -114,23 +114,13 @@ def report(
         parts.append(f"## {experiment.title}")
         parts += [f"![{experiment.title}]({page.name}/{name}.png)" for name in document["figures"]]
         parts.append(experiment.section(document["summary"]).strip())
-        parts += _warnings(document["warnings"])
+        told = [(text, job) for job, texts in document["warnings"].items() for text in texts]
+        lines = [f"* jobs: {len(found)}, for example `{found[0][1]}`: {found[0][0]}" for found in alike(told)]
+        parts += ["Warnings while this was computed:\n\n" + "\n".join(lines)] if lines else []
     seconds = {name: value for document in documents.values() for name, value in document["cpu_seconds"].items()}
     machines = sorted({machine for document in documents.values() for machine in document["machines"]})
     parts += ["## Time", _times(" and ".join(machines), seconds)]
     return "\n\n".join(parts) + "\n"
-
-
-def _warnings(by_job: Mapping[str, Sequence[str]]) -> list[str]:
-    """What the computation warned of, with the number of jobs and one of them; numbers in the text are that one's."""
-    kinds: dict[str, list[tuple[str, str]]] = {}
-    for job, messages in by_job.items():
-        for message in messages:
-            kinds.setdefault(re.sub(r"\d[\d.e+-]*", "#", message), []).append((job, message))
-    if not kinds:
-        return []
-    lines = [f"* jobs: {len(found)}, for example `{found[0][0]}`: {found[0][1]}" for found in kinds.values()]
-    return ["Warnings while this was computed:\n\n" + "\n".join(lines)]
 
 
 def _times(machine: str, times: Mapping[str, float]) -> str:
@@ -169,8 +159,12 @@ def reproduce(
         experiment.require_possible()
     results = JobStore.open(out, page.program, {"preset": preset})
     roots = (out,) if docs is None else (out, docs)
-    for root in roots:
-        _make_folder(root / page.name)
+    for folder in (root / page.name for root in roots):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            require_writable(folder / "trial")
+        except OSError as error:
+            raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
     jobs = {job.name: job for experiment in experiments for job in experiment.jobs()}
     run_jobs(results, list(jobs.values()), backend, progress)
     documents, pictures = {}, {}
@@ -201,14 +195,6 @@ def reproduce(
             write_text(beside / f"{experiment.name}.csv", as_csv(experiment.rows(document["summary"])))
         write_text(root / page.file(experiments), report(experiments, documents, page))
     return {name: document["summary"] for name, document in documents.items()}
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        require_writable(folder / "trial")
-    except OSError as error:
-        raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
 
 
 def as_csv(rows: Sequence[Row]) -> str:

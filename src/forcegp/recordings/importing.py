@@ -13,7 +13,7 @@ from forcegp.atomic_files import file_digest
 from forcegp.data.dataset_writer import DatasetWriter
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import Stamps, Stretch, episode_rows, read_stamps
+from forcegp.recordings.episode_rows import Stamps, episode_rows, read_stamps
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
@@ -44,7 +44,7 @@ class ImportOptions:
     resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
     rate: of the even times in Hz, instead of the median of the recordings' median rates.
     start, end: seconds from the first row of each episode that are kept.
-    unwrap: continue positions of turning joints that jump by a turn.
+    unwrap: continue positions of turning joints that jump by a turn; those that count turns stay.
     beyond_limits: accept positions beyond the limits of the URDF.
     most_rows: of one recording.
     stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of
@@ -102,7 +102,11 @@ def import_recordings(
         raise InvalidInput("no logs are given.")
     if not out.parent.is_dir():
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
-    robot = None if system is None else system.robot
+    robot, wheels = None, set[str]()
+    if system is not None:  # wheels that roll turn as often as they like
+        robot = system.robot
+        rolling = [each for each in system.contacts if isinstance(each, forcegp.mechanics.RollingContact)]
+        wheels = {robot.layout.bodies[robot.frame(each.frame)[0]].name for each in rolling}
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
     joined = [on_one_clock(source, signal_plan(mapping, source, system, **lacks), out.parent) for _, source in sources]
@@ -121,8 +125,7 @@ def import_recordings(
             report(index, steps, f"reading {label}")
             found = read_recording(source, own, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
             if not options.beyond_limits:
-                believed = own.joints if "q" in mapping.unit else _wheels(system)
-                require_plausible_positions(found, own, robot, believed)
+                require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
             warn_of_implausible_forces(found, own, robot)
             recordings.append(found)
         stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
@@ -132,8 +135,12 @@ def import_recordings(
             for each, own in zip(plans, stamps, strict=True)
             for stretch in own.stretches
         ]
-        for stretch, *_ in episodes:
-            _require_no_jumps(stretch)
+        for stretch, *_ in episodes:  # inside an episode, derivatives would take a jump by a turn for motion
+            recording = stretch.recording
+            for row, seen, remedy in recording.jumps:
+                if stretch.start < row < stretch.end:
+                    where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
+                    raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
         done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
         with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
             for number, (stretch, kept, layout) in enumerate(episodes):
@@ -193,22 +200,6 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
-
-
-def _wheels(system: forcegp.mechanics.MechanicalSystem | None) -> set[str]:
-    """Joints of wheels that roll, which turn as often as they like."""
-    contacts = () if system is None else system.contacts
-    rolling = [each.frame for each in contacts if isinstance(each, forcegp.mechanics.RollingContact)]
-    return {system.robot.layout.bodies[system.robot.frame(frame)[0]].name for frame in rolling} if system else set()
-
-
-def _require_no_jumps(stretch: Stretch) -> None:
-    """Refuse positions that jump by a turn inside an episode: derivatives would take it for motion."""
-    recording = stretch.recording
-    for row, seen, remedy in recording.jumps:
-        if stretch.start < row < stretch.end:
-            where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
-            raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
 
 
 def _what_was_done(

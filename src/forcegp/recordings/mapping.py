@@ -307,7 +307,10 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
             _require(isinstance(value, dict), key, value, f"name the quantity, as {_EXAMPLES[key]} ({quantities})")
             values[key] = {str(name): _texts(f"{key} of {name}", entry) for name, entry in value.items()}
         elif key in ("sign", "scale", "offset"):
-            entries = {signal: _listed(entry) for signal, entry in _by_signal(key, value).items()}
+            if not isinstance(value, dict):  # for all signals, which only a sign can be: it turns the axis of a joint
+                _require(key == "sign", key, value, f"name its signal, for example {_EXAMPLES[key]}")
+                value = dict.fromkeys(SIGNALS, value)
+            entries = {str(signal): _listed(entry) for signal, entry in value.items()}
             values[key] = {name: tuple(_number(f"{key} of {name}", x) for x in own) for name, own in entries.items()}
         elif key == "headerless":
             values[key] = tuple(_listed(value))
@@ -373,14 +376,6 @@ def _texts(key: str, value: Any) -> tuple[str, ...]:
     plain = all(isinstance(entry, str | int | float) and not isinstance(entry, bool) for entry in entries)
     _require(bool(entries) and plain, key, value, "give a text or a list of texts")
     return tuple(str(entry) for entry in entries)
-
-
-def _by_signal(key: str, value: Any) -> Mapping[str, Any]:
-    """A list without signals is for all of them, which only a sign can be: it turns the axis of a joint around."""
-    if isinstance(value, dict):
-        return {str(name): entry for name, entry in value.items()}
-    _require(key == "sign", key, value, f"name its signal, for example {_EXAMPLES[key]}")
-    return dict.fromkeys(SIGNALS, value)
 
 
 def _listed(value: Any) -> list[Any]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 import forcegp.robots
@@ -16,6 +17,7 @@ from forcegp.errors import DatasetError, DataWarning, FileFormatError, MistakenU
 from forcegp.recordings.moving_base import MOST_JUMPS, Poses
 from forcegp.recordings.signal_plan import JointSignal, SignalPlan
 from forcegp.recordings.source import Columns, Source
+from forcegp.recordings.turns import TURN, turns_to_add
 
 
 class Spool:
@@ -39,6 +41,7 @@ class Spool:
 
     def append(self, table: Float[np.ndarray, "rows width"]) -> None:
         """Put rows at the end."""
+        self._file.seek(0, 2)
         self._file.write(np.ascontiguousarray(table, dtype=np.float64).data)
         self.rows += len(table)
 
@@ -48,9 +51,24 @@ class Spool:
         data = self._file.read((end - start) * self.width * 8)
         return np.frombuffer(data, np.float64).reshape(-1, self.width)
 
+    def column(self, start: int, end: int, place: int) -> Float[np.ndarray, " rows"]:
+        """One column of rows start to end."""
+        return np.concatenate([self.read(row, next_)[:, place] for row, next_ in _pieces(start, end)])
+
+    def add(self, start: int, end: int, place: int, values: Float[np.ndarray, " rows"]) -> None:
+        """Add values to one column of rows start to end."""
+        for row, next_ in _pieces(start, end):
+            table = self.read(row, next_).copy()
+            table[:, place] += values[row - start : next_ - start]
+            self._file.seek(row * self.width * 8)
+            self._file.write(table.data)
+
 
 ROWS_AT_A_TIME = 16384
-TURN = 2.0 * np.pi
+
+
+def _pieces(start: int, end: int) -> Iterator[tuple[int, int]]:
+    return ((row, min(row + ROWS_AT_A_TIME, end)) for row in range(start, end, ROWS_AT_A_TIME))
 
 
 @dataclass(frozen=True)
@@ -67,7 +85,7 @@ class RawRecording:
     lowest, highest: (signals,) of each signal of the plan, in SI.
     jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
         seen, and what to do.
-    notes: on the orientations of a base.
+    notes: on the orientations of a base, and angles that step by more than half a turn.
     """
 
     label: str
@@ -88,7 +106,7 @@ def read_recording(
     """Read a table once. Raises FileFormatError and DatasetError naming the file, the row, the time and the column."""
     first = spool.rows
     clock = _Clock(plan, source)
-    turns = _Turns(plan, unwrap)
+    turns = _Turns(plan)
     poses = Poses(plan.layout.space, plan.orientation, source)
     positions = sum(item.signal == "q" for item in plan.signals)
     times: list[np.ndarray] = []
@@ -116,9 +134,13 @@ def read_recording(
     if rows == 0:
         raise FileFormatError(f"{label} has no rows; give a log with rows.")
     begins = np.asarray(episodes or [(0, 0)], dtype=np.int64)
-    jumps = tuple(turns.jumps + poses.jumps)
     time = np.concatenate(times)
-    return RawRecording(label, source, first, time, clock.begin, begins, lowest, highest, jumps, poses.note())
+    if unwrap:
+        jumps, notes = turns.continued(spool, first, time, begins[:, 1], lowest, highest)
+    else:
+        jumps, notes = turns.refused(), ()
+    notes, jumps = (*poses.note(), *notes), (*jumps, *poses.jumps)
+    return RawRecording(label, source, first, time, clock.begin, begins, lowest, highest, jumps, notes)
 
 
 class _Clock:
@@ -150,37 +172,65 @@ class _Clock:
 
 
 class _Turns:
-    """Positions of turning joints: where they step by more than half a turn, continued beyond it if asked for."""
+    """Positions of turning joints: where they step by more than half a turn, and which of them then wrap."""
 
-    def __init__(self, plan: SignalPlan, unwrap: bool) -> None:
+    def __init__(self, plan: SignalPlan) -> None:
         self.plan = plan
-        self.unwrap = unwrap
         angles = [item.signal == "q" and item.unit.si == "rad" for item in plan.signals]
         self.columns = [i for i, turns in enumerate(angles) if turns and plan.signals[i].joint in plan.joints]
         self.last: np.ndarray | None = None
-        self.added = np.zeros(len(self.columns))
-        self.jumps: list[tuple[int, str, str]] = []
+        self.jumps: list[tuple[int, int]] = []
+        self.jumped = np.zeros(len(self.columns), dtype=bool)
 
     def follow(self, table: np.ndarray, rows: int, restarts: list[int]) -> None:
-        """Note jumps, or add whole turns to the positions in place; rows in `restarts` begin another episode."""
+        """Note where the positions jump; rows in `restarts` begin another episode."""
         q = table[:, self.columns]
         before = q[:1] if self.last is None else self.last[None, :]
         steps = np.diff(np.concatenate([before, q]), axis=0)
         steps[restarts] = 0.0
         self.last = q[-1].copy()
         jumps = np.abs(steps) > np.pi
-        if not self.unwrap:
-            found = np.argwhere(jumps)[:MOST_JUMPS]
-            joints = [self.plan.signals[column].joint for column in self.columns]
-            remedy = "the angle wraps, or is in degrees. Add `unwrap`, or `unit` q=deg."
-            self.jumps += [
-                (rows + int(row), f"q of joint {joints[index]!r} jumps by more than half a turn", remedy)
-                for row, index in found
-            ]
-        elif jumps.any() or self.added.any():
-            added = np.cumsum(-np.round(steps / TURN) * jumps, axis=0) + self.added
-            self.added = added[-1].copy()
-            table[:, self.columns] = q + TURN * added
+        self.jumped |= jumps.any(axis=0)
+        self.jumps += [(rows + int(row), int(index)) for row, index in np.argwhere(jumps)[:MOST_JUMPS]]
+
+    def refused(self) -> list[tuple[int, str, str]]:
+        """All jumps, for `RawRecording`."""
+        remedy = "the angle wraps, or is in degrees. Add `unwrap`, or `unit` q=deg."
+        return [(row, f"{self._name(index)} jumps by more than half a turn", remedy) for row, index in self.jumps]
+
+    def continued(
+        self, spool: Spool, first: int, time: np.ndarray, begins: np.ndarray, lowest: np.ndarray, highest: np.ndarray
+    ) -> tuple[list[tuple[int, str, str]], list[str]]:
+        """Add whole turns to the angles that wrap: in the spool, to `lowest` and to `highest`.
+
+        Returns the jumps about which nothing decides, and notes on angles that wrap or count turns.
+        """
+        layout, end = self.plan.layout, first + len(time)
+        single = [self.plan.joints[row] for row in layout.space.single_rows]
+        places = dict(
+            zip(single, layout.space.singles(torch.arange(float(layout.space.nq))).int().tolist(), strict=True)
+        )
+        remedy = "nothing shows whether it wraps or counts turns. Map its velocity (`v`), or mend these rows."
+        jumps, notes = list[tuple[int, str, str]](), list[str]()
+        for index in map(int, np.flatnonzero(self.jumped)):
+            joint = self.plan.signals[self.columns[index]].joint
+            place = layout.places["q"].start + places[joint]
+            q, v = spool.column(first, end, place), None
+            if "v" in layout.places:
+                v = spool.column(first, end, layout.places["v"].start + self.plan.joints.index(joint))
+            turns, undecided = turns_to_add(q, time, v, begins)
+            seen = f"{self._name(index)} jumps by more than half a turn"
+            jumps += [(int(row), seen, remedy) for row in undecided[:MOST_JUMPS]]
+            if turns.any():
+                spool.add(first, end, place, TURN * turns)
+                q += TURN * turns
+                lowest[self.columns[index]], highest[self.columns[index]] = q.min(), q.max()
+            elif not len(undecided):
+                notes.append(f"{self._name(index)} counts turns: steps of more than half a turn stay")
+        return jumps, notes
+
+    def _name(self, index: int) -> str:
+        return f"q of joint {self.plan.signals[self.columns[index]].joint!r}"
 
 
 def _require_finite(

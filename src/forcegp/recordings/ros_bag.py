@@ -58,7 +58,11 @@ class RosBag(Source):
             )
         # Exception: rosbags meets damaged files with whatever its parsers, sqlite, zstd and lz4 raise
         with reading(self.path, "a bag", Exception), reader_of([self.path], default_typestore=known) as reader:
-            _require_plausible_chunks(self.path, reader)
+            # rosbags 0.11 does not publish its list of MCAP chunks; a version without it reads them unchecked
+            for storage in (getattr(bag, "storage", None) for bag in reader.readers):
+                for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
+                    for chunk in getattr(store, "chunks", ()):
+                        require_plausible_size(self.path, "a chunk", chunk.uncompressed_size, chunk.compressed_size)
             yield reader
 
     @cached_property
@@ -151,18 +155,6 @@ class RosBag(Source):
                 if table:
                     columns = zip(*table, strict=True)
                     yield {name: as_column(np.array(column)) for name, column in zip(names, columns, strict=True)}
-
-
-def _require_plausible_chunks(path: Path, reader: Any) -> None:
-    """Refuse MCAP chunks that claim to hold far more than they store.
-
-    `rosbags` 0.11 does not publish its list of chunks; a version without it reads them unchecked.
-    """
-    for bag in reader.readers:
-        storage = getattr(bag, "storage", None)
-        for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
-            for chunk in getattr(store, "chunks", ()):
-                require_plausible_size(path, "a chunk", chunk.uncompressed_size, chunk.compressed_size)
 
 
 def numbers(message: Any, fields: Collection[str] | None = None) -> dict[str, int | float]:

@@ -151,7 +151,9 @@ def signal_plan(
         episode = source.suggested_episode
     if episode is not None:
         source.require([episode])
-    time_unit = log_unit("time", mapping.unit["time"][0]) if "time" in mapping.unit else _default_time_unit(time)
+    # stamps of ROS are whole nanoseconds; everything else is taken for seconds
+    stamps = time is not None and time.is_column and next(iter(time.weights)).endswith((":header.stamp", ":log_time"))
+    [time_unit, *_] = mapping.unit.get("time", ("ns" if stamps else "s",))
     return SignalPlan(
         joints=tuple(order["v"]),
         units=units,
@@ -159,7 +161,7 @@ def signal_plan(
         layout=layout_of(mapping, system, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
         time=time,
-        time_unit=time_unit,
+        time_unit=log_unit("time", time_unit),
         step=mapping.step,
         episode=episode,
         guessed=tuple(guessed),
@@ -201,7 +203,10 @@ def _expressions(
 def _units(mapping: ColumnMapping, joints: tuple[str, ...]) -> FrozenDict:
     """Those of joints without a robot: units that are stated decide which of them slide."""
     given = {name: [log_unit(name, unit) for unit in units] for name, units in mapping.unit.items() if name != "time"}
-    kinds = [TRANSLATION if _slides(given, index, joints) else ROTATION for index in range(len(joints))]
+    kinds = []
+    for index in range(len(joints)):  # the Dataset checks that all units agree
+        stated = [(name, _at(f"unit of {name}", units, index, joints)) for name, units in given.items()]
+        kinds.append(TRANSLATION if any(unit.si == TRANSLATION[name] for name, unit in stated) else ROTATION)
     return validated_units({name: tuple(kind[name] for kind in kinds) for name in SIGNALS} | {"time": "s"}, joints)
 
 
@@ -293,19 +298,7 @@ def _unit(
     return fitting[index][0] if fitting[index] else log_unit(signal, kinds[index] or "1")
 
 
-def _slides(given: Mapping[str, list[LogUnit]], index: int, joints: Sequence[str]) -> bool:
-    """Whether the units that are stated are those of a prismatic joint; the Dataset checks that all of them agree."""
-    stated = [(name, _at(f"unit of {name}", units, index, joints)) for name, units in given.items()]
-    return any(unit.si == TRANSLATION[name] for name, unit in stated)
-
-
 def _at(what: str, values: Sequence[Any], index: int, joints: Sequence[str]) -> Any:
     if len(values) not in (1, len(joints)):
         raise InvalidInput(f"{what} has {len(values)} entries; give one, or {len(joints)}, one per joint.")
     return values[index if len(values) > 1 else 0]
-
-
-def _default_time_unit(time: LinearExpression | None) -> LogUnit:
-    """Stamps of ROS are whole nanoseconds; everything else is taken for seconds."""
-    stamps = time is not None and time.is_column and next(iter(time.weights)).endswith((":header.stamp", ":log_time"))
-    return log_unit("time", "ns" if stamps else "s")

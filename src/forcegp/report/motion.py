@@ -14,7 +14,6 @@ from forcegp.mechanics import (
     Actuation,
     Armature,
     ConstrainedDynamics,
-    MechanicalSystem,
     ObservedWrench,
     RigidBodyBias,
     RotorInertia,
@@ -112,7 +111,10 @@ def recorded_scene(
     if system is None:
         raise InvalidInput("the dataset holds no robot; import it with one, or give a fitted model, too.")
     rows = style.window(dataset, start, seconds)
-    rows = rows.rows(_evenly(rows.time))
+    first, last = rows.time[[0, -1]]
+    steps = int(np.clip((last - first) * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(rows) - 1) or 1))
+    grid = np.linspace(first, last, steps + 1)
+    rows = rows.rows(np.unique(np.searchsorted(rows.time, grid - 1e-9).clip(0, len(rows) - 1)))
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
     drawn, doubts = link_shapes(system.robot, shapes)
     with torch.no_grad():
@@ -128,14 +130,6 @@ def recorded_scene(
     return RecordedScene(system.robot, time, rows.q, drawn, poses, arrows, paths, reach(system.robot), doubts)
 
 
-def _evenly(time: np.ndarray) -> np.ndarray:
-    """Rows nearest to an even grid of frames."""
-    duration = float(time[-1] - time[0])
-    count = int(np.clip(duration * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(time) - 1) or 1)) + 1
-    grid = np.linspace(time[0], time[-1], count)
-    return np.unique(np.searchsorted(time, grid - 1e-9).clip(0, len(time) - 1))
-
-
 def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
     """What the model found at these states: joint forces, with the laws of its system, point and contact forces."""
     prior, robot = posterior.model.prior, posterior.system.robot
@@ -149,10 +143,10 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
         else:
             force = latents.entries(which).through(point)
             groups.append(_at_point(name, _place(term, dynamics), force.mean, force.covariance))
-    laws = _laws(posterior.system, dynamics)
-    if bool(of_joints.any()) or laws is not None:
+    known_forces = [force for force in posterior.system.known_forces if not isinstance(force, NOT_SHOWN)]
+    if bool(of_joints.any()) or known_forces:
         own = latents.through(B * of_joints)
-        mean = own.mean if laws is None else own.mean + laws
+        mean = own.mean + sum(force.force(dynamics.state).expand_as(own.mean) for force in known_forces)
         title = "learned joint forces" if posterior.carries_known_forces else "friction and other joint forces"
         groups.append(_at_joints(robot, dynamics, title, mean, own.std))
     if dynamics.contacts and posterior.predicts_forces:
@@ -169,12 +163,6 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
             place = contact.position(dynamics.state.kinematics)
             groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean, force.covariance))
     return groups
-
-
-def _laws(system: MechanicalSystem, dynamics: ConstrainedDynamics) -> torch.Tensor | None:
-    """The sum (rows, nv) of the known forces that are friction, springs or offsets; None where there are none."""
-    forces = [force.force(dynamics.state) for force in system.known_forces if not isinstance(force, NOT_SHOWN)]
-    return torch.stack([force.expand_as(dynamics.state.v) for force in forces]).sum(0) if forces else None
 
 
 def _place(term: ForcePrior, dynamics: ConstrainedDynamics) -> torch.Tensor:

@@ -27,19 +27,17 @@ OPACITY = 0.6
 def viser_server(host: str = "127.0.0.1", port: int | None = None) -> Iterator[Any]:
     """A running viser server, on a free port where none is given; stopped at the end. Raises MissingExtra."""
     viser = required_extra("viser", "view", "drawing the robot")
+    if port is None:
+        with socket.socket() as probe:
+            probe.bind((host, 0))
+            port = int(probe.getsockname()[1])
     with redirect_stdout(io.StringIO()):  # where it prints its address, which results must not be mixed with
-        server = viser.ViserServer(host=host, port=_free_port(host) if port is None else port)
+        server = viser.ViserServer(host=host, port=port)
     try:
         yield server
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
-
-
-def _free_port(host: str) -> int:
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
 
 
 class SceneNodes:

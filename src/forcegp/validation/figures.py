@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from forcegp.evaluation.plots import style
 from forcegp.validation.candidates import MOTIONS
+from forcegp.validation.page import unit_of
 
 COLORS = {
     "given": (style.KNOWN_PHYSICS,),
@@ -43,7 +44,7 @@ def errors_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fig
     joints, looks = style.short_joint_names(document["joint_names"]), _looks(models)
     scores = {
         "nrmse": "Acceleration: RMSE / standard deviation of the measurement",
-        "force_rms": f"Force: RMS of M (predicted − measured acceleration) [{_unit(document, 'u')}]",
+        "force_rms": f"Force: RMS of M (predicted − measured acceleration) [{unit_of(document, 'u')}]",
     }
     lines = -(-len(joints) // MOST_COLUMNS)
     columns = -(-len(joints) // lines)
@@ -101,7 +102,7 @@ def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fi
         low, middle, high = ([rms[key] for _, rms in known] for key in ("min", "median", "max"))
         axes.plot(time, middle, label=name, **looks)
         axes.fill_between(time, low, high, color=looks["color"], alpha=0.12, linewidth=0)
-    title, label = "Motions predicted from recorded states under recorded forces", _unit(document, "q")
+    title, label = "Motions predicted from recorded states under recorded forces", unit_of(document, "q")
     style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{label}]")
     axes.set_yscale("log")
     style.plain_ticks(axes.yaxis)
@@ -123,8 +124,3 @@ def _looks(models: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         looks[name] |= {"linewidth": 1.2 - 0.35 * below, "marker": "o", "markersize": 3.0 - 0.5 * below}
         looks[name] |= {"markerfacecolor": "white" if refined else color}
     return looks
-
-
-def _unit(document: Mapping[str, Any], quantity: str) -> str:
-    units = document["units"][quantity]
-    return units if isinstance(units, str) else "/".join(dict.fromkeys(units))

@@ -41,13 +41,17 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
         inputs = tuple(sorted({*read.values()}))
         place = job_name(comparison.splits[split], seed, kind, name)
         cost = work.cost if isinstance(work, Candidate) else 1.0
-        return Job(place, f"{__name__}:compute", spec, inputs, cost, (comparison, work), _modules(work))
+        functions = (work.fit,) if isinstance(work, Candidate) else (work.identify, work.noise)
+        # where the functions are defined, which somebody else may have added
+        modules = tuple(sorted({_plain(function).__module__ for function in functions if function is not None}))
+        return Job(place, f"{__name__}:compute", spec, inputs, cost, (comparison, work), modules)
 
     for seed in range(seeds):
         for split in range(len(comparison.splits)):
             for name in sorted({*wanted, comparison.identification}):
                 work = identification_named(name)
-                if _needed(comparison, wanted, name, seed):
+                # seeds choose rows: one of all rows, and that of the mass matrix, is done once
+                if seed == 0 or (name in wanted and not work.all_rows):
                     found = job(IDENTIFICATION, name, split, seed, work, {})
                     identifications[found.name] = found
             for name, each in models.items():
@@ -60,22 +64,9 @@ def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int)
     return list(identifications.values()), fits
 
 
-def _needed(comparison: Comparison, wanted: set[str], name: str, seed: int) -> bool:
-    """Seeds choose rows: an identification of all rows, and the one of the mass matrix, is done once."""
-    if name in wanted and (seed == 0 or not identification_named(name).all_rows):
-        return True
-    return name == comparison.identification and seed == 0
-
-
 def _identification_name(comparison: Comparison, name: str, split: int, seed: int) -> str:
     seed = 0 if identification_named(name).all_rows else seed
     return job_name(comparison.splits[split], seed, IDENTIFICATION, name)
-
-
-def _modules(work: Candidate | Identification) -> tuple[str, ...]:
-    """Where the functions are defined, which somebody else may have added."""
-    functions = (work.fit,) if isinstance(work, Candidate) else (work.identify, work.noise)
-    return tuple(sorted({_plain(function).__module__ for function in functions if function is not None}))
 
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:

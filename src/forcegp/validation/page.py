@@ -1,11 +1,10 @@
 """The page of a comparison: every number on it comes from the document of results."""
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
-from forcegp.evaluation.pages import rendered
+from forcegp.evaluation.pages import alike, rendered
 from forcegp.validation.paired_tests import SCORES
 
 ALT_TEXTS = {
@@ -42,7 +41,11 @@ def page(document: Mapping[str, Any]) -> str:
         alt_texts=ALT_TEXTS,
         listed=[[name, model["kind"], model["summary"], str(model["runs"])] for name, model in models.items()],
         failures=_failures(models, document),
-        warnings=_warnings(models),
+        warnings=[
+            f"{name} ({len(found)}): {found[0][0]}"
+            for name, model in models.items()
+            for found in alike((text, name) for text in model["warnings"])
+        ],
     )
 
 
@@ -73,7 +76,7 @@ def _against(answer: Mapping[str, Any] | None) -> str:
 
 
 def _overall(models: Mapping[str, Any], document: Mapping[str, Any]) -> str:
-    force = _listed_units(document["units"]["u"])
+    force = unit_of(document, "u")
     header = ["model", "nRMSE", f"force error [{force}], rms", "mean abs", "NLPD [nats]"]
     header += ["in 95 %", "in 50 %", "fit [CPU s]"]
     errors, levels = ("nrmse", "force_rms", "force_mae", "nlpd"), {"coverage_95": 0.95, "coverage_50": 0.5}
@@ -103,7 +106,7 @@ def _range(models: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _by_joint(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Score, title and table."""
-    force = _listed_units(document["units"]["u"])
+    force = unit_of(document, "u")
     scores = (
         ("nrmse_per_joint", "Normalised error of the acceleration (RMSE / standard deviation of the target)", 3),
         ("force_rms_per_joint", f"Force-space error, rms [{force}]", 3),
@@ -165,7 +168,7 @@ def _motions(models: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str
         rows.append([_named(name, model), *cells])
     at_last = {name: {**model, "at": model["motions"]["rms_per_joint"][-1]} for name, model in moving.items()}
     return {
-        "unit": _listed_units(document["units"]["q"]),
+        "unit": unit_of(document, "q"),
         **{name: first[name] for name in ("integrator", "dt")},
         "table": markdown_table(["model", *(f"after {h:g} s" for h in first["horizons"])], rows),
         "last": first["horizons"][-1],
@@ -177,7 +180,8 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
     lines = []
     for name, model in models.items():
         for reason, runs in _reasons(model["failures"]).items():
-            lines.append(f"**{name}** failed in {len(runs)} of {_runs(model)} runs ({'; '.join(runs)}): {reason}")
+            of = model["runs"] + len(model["failures"])
+            lines.append(f"**{name}** failed in {len(runs)} of {of} runs ({'; '.join(runs)}): {reason}")
     failed = [run for run in document["identifications"] if run["error"] is not None]
     for name in dict.fromkeys(run["name"] for run in failed):
         for reason, runs in _reasons(run for run in failed if run["name"] == name).items():
@@ -185,31 +189,16 @@ def _failures(models: Mapping[str, Any], document: Mapping[str, Any]) -> list[st
     return lines
 
 
-def _runs(model: Mapping[str, Any]) -> int:
-    return model["runs"] + len(model["failures"])
-
-
-def _warnings(models: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for name, model in models.items():
-        kinds = _grouped((re.sub(r"\d[\d.e+-]*", "#", text), text) for text in model["warnings"])
-        lines += [f"{name} ({len(texts)}): {texts[0]}" for texts in kinds.values()]
-    return lines
-
-
 def _reasons(failed: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    return _grouped((run["error"], f"{run['split']}, seed {run['seed']}") for run in failed)
-
-
-def _grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
-    for key, value in pairs:
-        groups.setdefault(key, []).append(value)
+    for run in failed:
+        groups.setdefault(run["error"], []).append(f"{run['split']}, seed {run['seed']}")
     return groups
 
 
 def _named(name: str, model: Mapping[str, Any]) -> str:
-    return f"{name} ({model['runs']} of {_runs(model)} runs)" if model["failures"] else name
+    failed = len(model["failures"])
+    return f"{name} ({model['runs']} of {model['runs'] + failed} runs)" if failed else name
 
 
 def _least(values: Iterable[Mapping[str, Any] | None], level: float | None = None) -> float | None:
@@ -234,6 +223,7 @@ def _percent(value: Mapping[str, Any] | None, best: float | None = None) -> str:
     return _marked(in_percent, 1, None if best is None else 100.0 * best) + " %"
 
 
-def _listed_units(units: str | Sequence[str]) -> str:
-    """`Nm`, or `Nm and N` where joints differ."""
-    return units if isinstance(units, str) else " and ".join(dict.fromkeys(units))
+def unit_of(document: Mapping[str, Any], quantity: str) -> str:
+    """`Nm`, or `Nm or N` where joints differ."""
+    units = document["units"][quantity]
+    return units if isinstance(units, str) else " or ".join(dict.fromkeys(units))

@@ -218,16 +218,12 @@ def best_of(summary: Mapping[str, Any], runs: Runs, kinds: Sequence[str], score:
         every = np.concatenate([np.where(np.isfinite(e), e, np.nan).reshape(len(e), -1) for e in errors.values()], 1)
         if np.isfinite(every).any():
             lost = int(np.isnan(every).sum())
-            found.append((len(runs[name]) - len(errors), lost, _level(score, errors), name))
+            # the median over runs of the error over stretches; of motions the geometric mean over horizons
+            means = [np.ma.masked_invalid(each).mean(axis=1).filled(np.nan) for each in errors.values()]
+            levels = means if score == "nlpd" else [np.log(np.maximum(each, np.finfo(float).tiny)) for each in means]
+            level = float(np.median([each.mean() for each in levels]))
+            found.append((len(runs[name]) - len(errors), lost, level, name))
     return min(found)[-1] if found else None
-
-
-def _level(score: str, errors: Mapping[tuple[str, int], Float[np.ndarray, "horizons stretches"]]) -> float:
-    """The median over runs of the error over stretches; of motions the geometric mean over horizons."""
-    masked = [np.ma.masked_invalid(each) for each in errors.values()]
-    means = [each.mean(axis=1).filled(np.nan) for each in masked]
-    levels = means if score == "nlpd" else [np.log(np.maximum(each, np.finfo(float).tiny)) for each in means]
-    return float(np.median([each.mean() for each in levels]))
 
 
 def compared(score: str, challenger: str, baseline: str, runs: Runs, margin: float = MARGIN) -> PairedTest | None:

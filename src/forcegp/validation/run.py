@@ -244,13 +244,19 @@ def _document(
 ) -> dict[str, Any]:
     summary = summary_of(runs, chosen)
     units = {name: comparison.rows.units[name] for name in ("q", "u", "a")}
+    splits = []
+    for split in comparison.splits:
+        (train, test), motions = split.apply(comparison.rows), comparison.motions(split)
+        count = 0 if motions.motions is None else len(motions.motions.q)
+        sides = {"training_rows": len(train), "test_rows": len(test), "motions": count, "notes": list(motions.notes)}
+        splits.append(split.to_dict() | sides)
     return {
         "kind": "forcegp validate",
         "machine": machine(),
         "joint_names": list(comparison.rows.joint_names),
         "units": {name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
         "preparation": preparation_lines(comparison.rows.metadata),
-        "splits": [_described(comparison, split) for split in comparison.splits],
+        "splits": splits,
         "rows": len(comparison.rows),
         "points": comparison.points,
         "seeds": list(range(seeds)),
@@ -264,14 +270,6 @@ def _document(
         "against_baseline": against_baseline(summary, runs, margin),
         "runs": {name: [_brief(run) for run in each] for name, each in runs.items()},
     }
-
-
-def _described(comparison: Comparison, split: Any) -> dict[str, Any]:
-    train, test = split.apply(comparison.rows)
-    motions = comparison.motions(split)
-    count = 0 if motions.motions is None else len(motions.motions.q)
-    sides = {"training_rows": len(train), "test_rows": len(test), "motions": count, "notes": list(motions.notes)}
-    return split.to_dict() | sides
 
 
 def _brief(run: Mapping[str, Any]) -> dict[str, Any]:

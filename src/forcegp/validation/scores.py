@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from forcegp.data import Dataset, time_blocks
 from forcegp.data.configurations import space_of
 from forcegp.data.motion_records import EVEN_STEPS, RecordedMotions, recorded_motions
-from forcegp.data.preparation import plain
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
@@ -19,6 +18,7 @@ from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models import Posterior, observing
 from forcegp.robots.manifold import ConfigurationSpace
+from forcegp.summary import plain
 
 Rows = Float[np.ndarray, "rows nv"]
 Matrices = Float[np.ndarray, "rows nv nv"]

@@ -131,7 +131,9 @@ def friction_curves_figure(
         feature, unit = _draw_curve(axes, posterior, panel, truth.get(panel.latent))
         what = {"Nm": "torque [Nm]", "": "force / normal force"}.get(unit, f"force [{unit}]")
         what = f"resisting {what}" if panel.resisting < 0 else what
-        style.quiet(axes, title=titles[number], x=_label(feature), y=what)
+        label, _, own = feature.partition(" [")  # `velocity of lbr_iiwa_joint_1 [rad/s]`: the title names the joint
+        label = " [".join(filter(None, (label.split(" of ")[0], own)))
+        style.quiet(axes, title=titles[number], x=label, y=what)
     for axes in grid[len(chosen) :]:
         axes.set_visible(False)
     below = {"columns": 5 if columns > 2 else 3, "size": style.NORMAL, "markerscale": 2}
@@ -160,12 +162,6 @@ def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> lis
         own = short.get(own, own).replace("force-", "force along ")
         titles.append(f"{panel.component}: {own}" if several else own)
     return titles
-
-
-def _label(feature: str) -> str:
-    """`velocity of lbr_iiwa_joint_1 [rad/s]` -> `velocity [rad/s]`: the title names the joint."""
-    what, _, unit = feature.partition(" [")
-    return " [".join(filter(None, (what.split(" of ")[0], unit)))
 
 
 def _draw_curve(
@@ -212,6 +208,7 @@ def _draw_curve(
     room = 0.12 * max(float(values.max() - values.min()), 1e-12)
     axes.set_ylim(float(values.min()) - 1.6 * room, float(values.max()) + room)
     axes.set_xlim(at[0], at[-1])
+    axes.locator_params(axis="x", nbins=6)
     if curve is not None:
         return curve.feature_names[panel.feature], curve.unit
     slides = posterior.system.robot.joints[panel.index].type == "prismatic"

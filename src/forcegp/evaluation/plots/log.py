@@ -3,12 +3,14 @@
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import inverse_dynamics
 from forcegp.data import Dataset, Preparation, episodes_in_order, low_pass_gain, motion_spectrum, power_density
+from forcegp.data.configurations import as_vectors, space_of
 from forcegp.evaluation.plots import style
 
 DECADES = 12.0
@@ -54,16 +56,16 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
 
 def _draw_filtered(axes: Axes, frequency: np.ndarray, power: np.ndarray, step: float, preparation: Preparation) -> None:
     """A spectrum as logged and what the filter leaves of it."""
-    _draw(axes, frequency, power, style.MEASUREMENT, "as logged")
+    _draw(axes, frequency, power, "as logged", color=style.MEASUREMENT)
     if preparation.cutoff is not None:
         gain = low_pass_gain(frequency, 1.0 / step, float(preparation.cutoff), preparation.order)
-        _draw(axes, frequency, power * gain**2, style.PREDICTION, "after the filter")
+        _draw(axes, frequency, power * gain**2, "after the filter", color=style.PREDICTION)
         axes.axvline(float(preparation.cutoff), color=style.PREDICTION, linestyle="--", linewidth=1.0, label="cut-off")
     _limits(axes, frequency, power)
 
 
-def _draw(axes: Axes, frequency: np.ndarray, power: np.ndarray, color: str, label: str) -> None:
-    axes.loglog(frequency, np.maximum(power, 1e-300), color=color, linewidth=1.0, label=label)
+def _draw(axes: Axes, frequency: np.ndarray, power: np.ndarray, label: str, **look: Any) -> None:
+    axes.loglog(frequency, np.maximum(power, 1e-300), linewidth=1.0, label=label, **look)
 
 
 def _limits(axes: Axes, frequency: np.ndarray, power: np.ndarray) -> None:
@@ -94,7 +96,7 @@ def _draw_time_steps(axes: Axes, dataset: Dataset) -> None:
     axes.legend(fontsize=style.SMALL, frameon=False, loc="upper right")
 
 
-COLUMNS = 3
+COLUMNS, ENTRIES = 3, 6  # panels and names of a legend beside each other
 SECONDS = 5.0
 MOST_ROWS = 1000
 
@@ -108,8 +110,9 @@ def check_figure(report: CheckReport) -> Figure:
     nv = inputs.log.nv
     columns = min(nv, COLUMNS if nv != 4 else 2)
     grid = -(-nv // columns)
-    figure = style.new_figure(10.0, 1.75 * grid + 3.4)
-    halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7))
+    figure = style.new_figure(10.0, 1.75 * grid + 3.4 + 0.22 * -(-nv // ENTRIES))
+    entries = 0.22 * -(-nv // ENTRIES)  # inches of the legend
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.75 * grid + 0.7, 2.7 + entries))
     panels = style.joint_panels(halves[0], nv, columns)
     names = style.short_joint_names(inputs.names)
     shown = style.window(inputs.log if inputs.compared is None else inputs.compared, 0.0, SECONDS)
@@ -120,6 +123,7 @@ def check_figure(report: CheckReport) -> Figure:
     style.legend_above(halves[0], _heading(report), *(panel for panel, _ in panels), markerscale=4)
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]
     _draw_spectra(left, report, names)
+    style.legend_below(halves[1], left, columns=min(nv + 1, ENTRIES))
     _draw_time_steps(right, inputs.log)
     style.quiet(right, title="Time steps as logged", x="recorded time [s]", y="ms")
     return figure
@@ -130,7 +134,11 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     axes.margins(x=0)
     log = report.comparison
     if log is None:
-        style.draw_line(axes, shown.time, shown.q[:, joint], style.TRUTH, 1.0, "position")
+        space, label = space_of(shown), "position"
+        values = as_vectors(shown).copy()
+        values[:, space.single_rows] = space.singles(torch.tensor(shown.q)).numpy()
+        label = label if space.is_vector_space else "position; of a base its way from the first row"
+        style.draw_line(axes, shown.time, values[:, joint], style.TRUTH, 1.0, label)
         return style.joint_units(shown, "q")[joint]
     rows = log.correction.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
@@ -168,13 +176,13 @@ def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     inputs = report.inputs
     spectrum = motion_spectrum(inputs.even)
     for joint, name in enumerate(names):
-        color = style.SERIES[joint % len(style.SERIES)]
-        _draw(axes, spectrum.frequency, spectrum.acceleration_density[:, joint], color, name)
+        turn, color = divmod(joint, len(style.SERIES))
+        look = {"color": style.SERIES[color], "linestyle": ("-", "--", ":")[turn % 3]}
+        _draw(axes, spectrum.frequency, spectrum.acceleration_density[:, joint], name, **look)
     _limits(axes, spectrum.frequency, spectrum.acceleration_density)
     preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
     title = "Acceleration as logged: no filter"
     if preparation.cutoff is not None:
         axes.axvline(float(preparation.cutoff), color=style.TRUTH, linestyle="--", linewidth=1.0, label="cut-off")
         title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
-    axes.legend(fontsize=style.SMALL, frameon=False, ncols=2 if len(names) > 4 else 1, loc="best")
     style.quiet(axes, title=title, x="frequency [Hz]", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

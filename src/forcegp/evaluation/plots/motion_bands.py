@@ -55,5 +55,6 @@ def motion_bands_figure(
             style.draw_line(axes, time, signed[motion, :, joint], style.TRUTH, 1.1, label)
         axes.margins(x=0)
         style.quiet(axes, title=names[joint], y=units[joint], x="time [s]" if lowest else "")
-    style.legend_above(figure, f"Errors of positions predicted {horizon:g} s ahead", panels[0][0])
+    shown = f" ({joints} of {rows.nv} joints)" if joints < rows.nv else ""
+    style.legend_above(figure, f"Errors of positions predicted {horizon:g} s ahead{shown}", panels[0][0])
     return figure

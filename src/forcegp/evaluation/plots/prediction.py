@@ -65,9 +65,9 @@ def draw_error(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) 
         axes.plot(time, mean - rows.truth["a"][:, joint], color=style.TRUTH, linewidth=1.0)
     axes.axhline(0.0, color=style.PREDICTION, linewidth=0.8, linestyle=style.DASHED)
     axes.margins(x=0)
-    limit = 2.0 * float(np.median(outer))
-    if np.abs(mean - rows.a[:, joint]).max() < 1.5 * limit:  # equal scales where the model is right
-        axes.set_ylim(-limit, limit)
+    limit, largest = 2.0 * float(np.median(outer)), float(np.abs(mean - rows.a[:, joint]).max())
+    if largest < 1.5 * limit:  # equal scales where the model is right
+        axes.set_ylim(-max(limit, 1.05 * largest), max(limit, 1.05 * largest))
 
 
 LARGEST_ERROR = 5.0
