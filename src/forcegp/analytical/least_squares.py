@@ -149,6 +149,8 @@ MAD = 1.4826
 
 Residual = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """x -> residuals (rows, nv) and Jacobian (rows, nv, k); of the prior (p,) and (p, k)."""
+Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""x and a step -> where it leads: x + step to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +202,14 @@ def weighted_least_squares(
     held: Float[np.ndarray, "rows m nv"] | None = None,
     known: Float[np.ndarray, " nv"] | None = None,
     evaluations: int = MOST_EVALUATIONS,
+    moved: Moved = np.add,
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
     `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
     are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count. `known`
-    is sigma where it is not to be found. A round takes so many `evaluations` at most.
+    is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps follow `moved`: residuals
+    that are as good as linear along it have no curved valleys, in which searches creep.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
@@ -225,7 +229,7 @@ def weighted_least_squares(
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
-        x, nfev, converged, expected = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations)
+        x, nfev, converged, expected = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations, moved)
         total += nfev
         r, jacobian = at(x)
         before = noise
@@ -284,6 +288,7 @@ def _minimized(
     robust: bool,
     span: np.ndarray | None,
     most: int,
+    moved: Moved,
 ) -> tuple[np.ndarray, int, bool, float]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
 
@@ -299,13 +304,12 @@ def _minimized(
         diagonal = np.diag(curvature.diagonal() + 1e-12)
         step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
         step /= max(1.0, float((abs(step) / longest).max()))
-        there = np.clip(here.x + step, low, high)
-        moved = there - here.x
-        expected = -float(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
+        step = np.clip(here.x + step, low, high) - here.x
+        expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
         first = expected if first is None else first
         if abs(expected) <= 1e-3 * CONTENT or idle == 2:
             return here.x, evaluation, True, first
-        trial = _point(at, prior, there, noise, robust, span)
+        trial = _point(at, prior, moved(here.x, step), noise, robust, span)
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < CONTENT else 0

@@ -206,7 +206,11 @@ def identify_payload(
     bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
     longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
     start = np.concatenate([np.zeros(split), terms.start()])
-    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest)
+
+    def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return np.concatenate([bodies.moved(x[:split], step[:split]), x[split:] + step[split:]])
+
+    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest, moved=moved)
 
     def numbers(x: np.ndarray) -> np.ndarray:
         return _numbers(bodies.pseudo_inertias(x[:split])[-1], offset)
