@@ -20,6 +20,7 @@ prior (generalized least squares). Of joint j it has the mean square ``sum_n (1 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -229,7 +230,8 @@ def weighted_least_squares(
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
-        x, nfev, converged, expected = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations, moved)
+        point = partial(_point, at, prior, noise, robust, span)
+        x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved)
         total += nfev
         r, jacobian = at(x)
         before = noise
@@ -279,14 +281,10 @@ class _Point:
 
 
 def _minimized(
-    at: Residual,
-    prior: Residual,
+    point: Callable[[np.ndarray], _Point],
     x: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     longest: np.ndarray | float,
-    noise: np.ndarray,
-    robust: bool,
-    span: np.ndarray | None,
     most: int,
     moved: Moved,
 ) -> tuple[np.ndarray, int, bool, float]:
@@ -295,7 +293,7 @@ def _minimized(
     Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
     """
     low, high = bounds
-    here, damping, idle, first = _point(at, prior, x, noise, robust, span), 1e-4, 0, None
+    here, damping, idle, first = point(x), 1e-4, 0, None
     for evaluation in range(1, most + 1):
         held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
         free = ~held
@@ -309,7 +307,7 @@ def _minimized(
         first = expected if first is None else first
         if abs(expected) <= 1e-3 * CONTENT or idle == 2:
             return here.x, evaluation, True, first
-        trial = _point(at, prior, moved(here.x, step), noise, robust, span)
+        trial = point(moved(here.x, step))
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
@@ -322,7 +320,7 @@ def _minimized(
 
 
 def _point(
-    at: Residual, prior: Residual, x: np.ndarray, noise: np.ndarray, robust: bool, span: np.ndarray | None
+    at: Residual, prior: Residual, noise: np.ndarray, robust: bool, span: np.ndarray | None, x: np.ndarray
 ) -> _Point:
     bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
     with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
