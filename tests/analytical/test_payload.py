@@ -45,6 +45,25 @@ def found() -> PayloadEstimate:
     return identify_payload(log(loaded(), 1, noise=0.05))
 
 
+FINGER = """<joint name="{0}" type="revolute"><parent link="tool0"/><child link="{0}_link"/><axis xyz="0 0 1"/>{1}
+<limit lower="-1" upper="1" effort="9" velocity="9"/></joint><link name="{0}_link"><inertial><origin xyz=".04 0 0"/>
+<mass value=".05"/><inertia ixx="5e-5" iyy="5e-5" izz="4e-5" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+def test_the_hand_carries_the_payload_of_fingers_that_follow_each_other():
+    """On a finger, it would be inertia of the joint that drives both, and the rotor would have none."""
+    fingers = FINGER.format("left", "") + FINGER.format("right", '<mimic joint="left" multiplier="-1"/>')
+    robot = Robot.from_urdf_text(TEXT.replace("</robot>", f"{fingers}</robot>"))
+    holding = robot.with_text(loaded(text=robot.urdf_text)).with_armature([0.1] * 6 + [0.0055])
+    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 400, 7))
+    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy()
+    rows = Dataset(q=q, v=v, u=u, a=a, time=0.02 * np.arange(400), system=MechanicalSystem(robot))
+    estimate = identify_payload(rows, friction=("viscous",))
+    assert estimate.link == "tool0"
+    assert estimate.mass == pytest.approx(MASS, rel=0.01)
+    assert estimate.joints["armature.left"][0] == pytest.approx(0.0055, rel=0.05)
+
+
 def test_the_payload_is_found_with_friction_and_rotors(found):
     assert found.link == "tool0"
     assert found.mass == pytest.approx(MASS, rel=0.005)

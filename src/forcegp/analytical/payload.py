@@ -122,7 +122,7 @@ def identify_payload(
     dataset: a log with the payload: q, v, u and a, filtered alike (`forcegp.data.Preparation`), in no contact.
     system: the robot without the payload. None takes that of the dataset.
     baseline: a log of the same robot without the payload. None trusts the inertias of the URDF.
-    link: what carries it; None is the last link of the last joint, or a base that moves.
+    link: what carries it; None is the last link of the last joint that no other follows, or a base that moves.
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
     identified: what `identify_analytical` found in `dataset`, if it is there already; of use where the base moves.
@@ -267,11 +267,14 @@ def _likely(
 def _last_link(robot: Robot) -> str:
     """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file.
 
-    Of a robot whose base moves, the base.
+    Of a robot whose base moves, the base. Joints that move several bodies, as those of fingers, count as none, if there
+    are others: what fingers hold moves with the hand.
     """
     if robot.base != "fixed":
         return robot.layout.moving[0]
-    last = len(robot.layout.bodies) - 1
+    drives = [drive.joint for drive in robot.layout.drives]
+    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1]
+    last = max(alone, default=len(drives) - 1)
     return [name for name, place in robot.layout.links.items() if place.body == last][-1]
 
 
