@@ -1,5 +1,6 @@
 """`identify_payload` against payloads that Pinocchio's inverse dynamics carries."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.analytical import PayloadEstimate, body_names, identify_analytical, identify_payload
 from forcegp.data import Dataset
-from forcegp.errors import DatasetError, ForceGPError, InvalidInput
+from forcegp.errors import DatasetError, DataWarning, ForceGPError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_inertial
@@ -62,6 +63,22 @@ def test_the_hand_carries_the_payload_of_fingers_that_follow_each_other():
     assert estimate.link == "tool0"
     assert estimate.mass == pytest.approx(MASS, rel=0.01)
     assert estimate.joints["armature.left"][0] == pytest.approx(0.0055, rel=0.05)
+
+
+@pytest.mark.parametrize(("pace", "friction", "warned"), [(0.5, ("viscous", "offset"), True),
+                         (0.5, ("viscous",), False), (10.0, ("viscous", "offset"), False)])  # fmt: skip
+def test_offsets_that_look_like_weight_are_warned_of(pace, friction, warned):
+    """A lift, whose weight is as constant as an offset: the mass is that which its accelerations show."""
+    lift = FINGER.format("lift", "").replace("tool0", "pole").replace("revolute", "prismatic")
+    arm = f'<robot name="lift"><link name="pole"/>{lift}</robot>'
+    robot = Robot.from_urdf_text(arm)
+    holding = robot.with_text(replace_inertial(arm, "lift_link", 1.0, np.array([0.2, 0, 0]), INERTIA, source="a test"))
+    draw = np.random.default_rng(0)
+    q, v, a = pace * draw.normal(size=(3, 400, 1))
+    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + 0.01 * draw.normal(size=(400, 1))
+    rows = Dataset(q=q, v=v, u=u, a=a, time=0.5 * np.arange(400), system=MechanicalSystem(robot))
+    with pytest.warns(DataWarning, match="'offset'.* times as unsure") if warned else nullcontext():
+        identify_payload(rows, friction=friction, rotors=None)
 
 
 def test_the_payload_is_found_with_friction_and_rotors(found):
