@@ -34,8 +34,6 @@ ROWS = 2000
 LEAST, MOST = 1e-3, 1e2
 """Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
 of the search that goes further has a covariance that rounding makes singular."""
-FOUND = 1e-3
-"""Nats that a step has to promise, to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +71,8 @@ class NoiseLevels:
         if near is not None:
             x = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(low, high)
 
-        def at(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-            """Cost, gradient and expected curvature tr(S^-1 dS S^-1 dS') / 2."""
+        def at(x: np.ndarray) -> _Point:
+            """With the expected curvature tr(S^-1 dS S^-1 dS') / 2."""
             acceleration, force = whole * torch.as_tensor(x).exp().view_as(whole)
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
             precision = torch.cholesky_inverse(lower)
@@ -94,23 +92,9 @@ class NoiseLevels:
             )
             curvature = (2.0 * squares * squares[:, None] * curvature).numpy() + np.eye(len(x))
             slope = (squares * (left - explained)).numpy() + x - middle
-            return float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature
+            return _Point(x, float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature)
 
-        here = at(x)
-        for _ in range(MOST_EVALUATIONS):
-            free = ~(((x <= low) & (here[1] > 0.0)) | ((x >= high) & (here[1] < 0.0)))
-            step = np.zeros_like(x)
-            step[free] = -np.linalg.solve(here[2][np.ix_(free, free)], here[1][free])
-            step = (x + step).clip(low, high) - x
-            if -here[1] @ step <= FOUND:
-                break
-            trial = at(x + step)
-            while trial[0] >= here[0] and -here[1] @ step > FOUND:
-                step = 0.25 * step
-                trial = at(x + step)
-            if trial[0] >= here[0]:
-                break
-            x, here = x + step, trial
+        x, *_ = _minimized(at, x, (np.array(low), np.array(high)), np.inf, MOST_EVALUATIONS)
         acceleration, force = whole.numpy() * np.exp(x).reshape(whole.shape)
         return cls(acceleration, force)
 
@@ -286,7 +270,7 @@ def _minimized(
     bounds: tuple[np.ndarray, np.ndarray],
     longest: np.ndarray | float,
     most: int,
-    moved: Moved,
+    moved: Moved = np.add,
 ) -> tuple[np.ndarray, int, bool, float]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
 
