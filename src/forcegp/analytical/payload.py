@@ -25,6 +25,7 @@ from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
 from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
 from forcegp.analytical.identification import ROWS, identify_analytical, joint_terms
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
+from forcegp.analytical.payload_link import most_likely, possible_links
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import AnalyticalIdentification, with_terms
 from forcegp.data import Dataset
@@ -124,7 +125,8 @@ def identify_payload(
     dataset: a log with the payload: q, v, u and a, filtered alike (`forcegp.data.Preparation`), in no contact.
     system: the robot without the payload. None takes that of the dataset.
     baseline: a log of the same robot without the payload. None trusts the inertias of the URDF.
-    link: what carries it; None is the last link of the last joint that no other follows, or a base that moves.
+    link: what carries it. None is the base that moves, or the link at which joints end or part, that explains most
+        (`forcegp.analytical.payload_link`).
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
     identified: what `identify_analytical` found in `dataset`, if it is there already; of use where the base moves.
@@ -151,19 +153,16 @@ def identify_payload(
                 raise InvalidInput("identified is of another robot; give what was found in `dataset`, or leave it out.")
     robot, _ = thickened(system.robot)
     system = system.with_robot(robot)
-    link = _last_link(robot) if link is None else link
-    robot.link(link)  # raises UnknownLink
-    placement = robot.layout.links[link]
-    if placement.body < 0:
+    candidates = possible_links(robot) if link is None else (link,)
+    for name in candidates:
+        robot.link(name)  # raises UnknownLink
+    carriers = [robot.layout.links[name].body for name in candidates]
+    if min(carriers) < 0:
         raise InvalidInput(f"link {link!r} does not move, so nothing on it shows; give a moving one.")
-    offset = np.linalg.inv(robot.layout.child_frames[placement.body]) @ placement.offset
     chosen = [np.unique(np.linspace(0, len(log) - 1, min(rows, len(log))).astype(int)) for log in logs]
     q, v, u, a = (np.concatenate([getattr(log, x)[at] for log, at in zip(logs, chosen, strict=True)]) for x in "qvua")
     holds = np.repeat([1.0, 0.0][: len(logs)], [len(at) for at in chosen])
 
-    links, usual = body_pseudo_inertias(robot).cpu().numpy(), _usual(offset)
-    bodies = ConsistentBodies(usual[None] if baseline is None else np.concatenate([links, usual[None]]))
-    stated = standard_parameters(robot).reshape(-1, 10).cpu().numpy()[: len(links) if baseline is None else 0]
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     likely_a, from_noise = a, np.zeros(1)
@@ -178,14 +177,29 @@ def identify_payload(
         ]
         likely = [_likely(own, *rows) for own, rows in zip(found, states, strict=True)]
         likely_a, from_noise = (np.concatenate(x) for x in zip(*likely, strict=True))
-    regressor = recorded.regressor(likely_a, (*terms.bodies, placement.body))
-    regressor[:, :, -1] *= holds[:, None, None]
-    split, known = bodies.size, len(stated)
     windows = _Windows([log.rows(at) for log, at in zip(logs, chosen, strict=True)])
 
     def equations(forces: np.ndarray) -> np.ndarray:
         return windows.mean(recorded.without_contacts(forces))
 
+    links = body_pseudo_inertias(robot).cpu().numpy()
+    regressor = recorded.regressor(likely_a, (*terms.bodies, *carriers))
+    regressor[:, :, len(links) :] *= holds[:, None, None, None]
+    if len(candidates) > 1:
+        r, in_links, in_terms = recorded.in_torque(
+            standard_parameters(robot).cpu().numpy(), terms.start(), likely_a, regressor[:, :, : len(links)]
+        )
+        unknown = in_terms if baseline is None else np.concatenate([in_terms, in_links.reshape(*r.shape, -1)], axis=-1)
+        place = most_likely(equations(regressor[:, :, len(links) :]), equations(r + from_noise), equations(unknown))
+        regressor = np.delete(regressor, [len(links) + k for k in range(len(candidates)) if k != place], axis=2)
+    else:
+        place = 0
+    link = candidates[place]
+    offset = np.linalg.inv(robot.layout.child_frames[carriers[place]]) @ robot.layout.links[link].offset
+    usual = _usual(offset)[None]
+    bodies = ConsistentBodies(usual if baseline is None else np.concatenate([links, usual]))
+    stated = standard_parameters(robot).reshape(-1, 10).cpu().numpy()[: len(links) if baseline is None else 0]
+    split, known = bodies.size, len(stated)
     constant = equations(regressor[:, :, known:])
 
     def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -265,20 +279,6 @@ def _likely(
     recorded = RecordedRows(found.given, found.terms, q, v, u)
     likely = recorded.likely(found.parameters, found.fit.x[found.bodies.size :], a, recorded.regressor(a))
     return likely.a, likely.offset
-
-
-def _last_link(robot: Robot) -> str:
-    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file.
-
-    Of a robot whose base moves, the base. Joints that move several bodies, as those of fingers, count as none, if there
-    are others: what fingers hold moves with the hand.
-    """
-    if robot.base != "fixed":
-        return robot.layout.moving[0]
-    drives = [drive.joint for drive in robot.layout.drives]
-    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1]
-    last = max(alone, default=len(drives) - 1)
-    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
 
 
 def _usual(offset: np.ndarray) -> np.ndarray:
