@@ -7,6 +7,7 @@ import torch
 from forcegp.analytical import identify_payload
 from forcegp.analytical.payload_link import possible_links
 from forcegp.data import Dataset
+from forcegp.errors import DataWarning
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, Thrusters
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_inertial
@@ -83,3 +84,12 @@ def test_links_behind_which_joints_end_or_part():
         assert set(possible_links(Robot.from_urdf_text(text, base=base))) == names | more
     arm = text[: text.index('<joint name="right_upper"')] + "</robot>"
     assert possible_links(Robot.from_urdf_text(arm.replace(finger, ""), base="fixed")) == ("left_lower_link",)
+
+
+def test_a_payload_that_no_body_can_be_is_warned_of():
+    """The URDF's hand is too heavy: less than nothing is carried, and the trunk is the next best."""
+    lighter = replace_inertial(TWO_ARMS, "left_lower_link", 0.6, np.array([0, 0, 0.15]), 2.4e-3 * np.eye(3), source="")
+    data = rows("floating", lighter, 0.05)
+    for name in (None, "left_lower_link"):
+        with pytest.warns(DataWarning, match="no body on .* explains the log"):
+            identify_payload(data, link=name, friction=("viscous",))

@@ -14,10 +14,9 @@ are estimated, too, and an error that both logs share is not mistaken for the pa
 
 from dataclasses import dataclass
 from typing import Any, Literal
-from warnings import warn
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.stats import t as student
 
@@ -25,12 +24,13 @@ from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
 from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
 from forcegp.analytical.identification import ROWS, identify_analytical, joint_terms
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
+from forcegp.analytical.payload_doubts import warn_of_no_body, warn_of_offsets
 from forcegp.analytical.payload_link import most_likely, possible_links
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import AnalyticalIdentification, with_terms
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
-from forcegp.errors import DatasetError, DataWarning, InvalidInput, require_type, usable_arguments
+from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
@@ -42,7 +42,6 @@ LAWS = "viscous", "stribeck", "offset"
 USUAL = 0.5, 0.05  # kg; m: where the search begins, and the size of the body
 WEAK = 0.01  # weight of the prior on a payload: a factor of e in its mass costs 0.02 nats
 WINDOW = 0.4  # s
-ALIKE = 5.0  # times the error of a mass without offsets
 STRETCHES = 20  # of time; residuals of different ones count as independent
 QUANTITIES = ("mass", *(f"center_of_mass.{x}" for x in "xyz"), *(f"inertia.{x}" for x in ("xx", "yy", "zz")))
 UNITS = dict(zip(QUANTITIES, ("kg", *("m",) * 3, *("kg m^2",) * 3), strict=True))
@@ -234,7 +233,8 @@ def identify_payload(
     covariance = _jackknife(fit, windows.lengths)
     step = 1e-5 * np.eye(len(fit.x))[split - 10 : split]
     slopes = np.stack([(numbers(fit.x + d) - numbers(fit.x - d)) / 2e-5 for d in step], axis=1)
-    _warn_of_offsets(fit, np.array([name.startswith("offset.") for name in terms.names]), slopes[0])
+    warn_of_offsets(fit, np.array([name.startswith("offset.") for name in terms.names]), slopes[0])
+    warn_of_no_body(fit, constant[:, :, -1], link)
     errors = np.sqrt(np.diag(slopes @ covariance[split - 10 : split, split - 10 : split] @ slopes.T))
     of_terms = np.sqrt(np.diag(covariance)[split:]) * terms.slopes(fit.x[split:]).ravel()
     found, there = bodies.pseudo_inertias(fit.x[:split]), np.linalg.inv(offset)
@@ -307,26 +307,6 @@ def _jackknife(fit: Fit, lengths: list[int]) -> np.ndarray:
     apart = np.stack(moved) - np.mean(moved, axis=0)
     unseen = np.linalg.solve(whole, np.linalg.solve(whole, fit.prior_information).T)
     return (STRETCHES - 1) / STRETCHES * apart.T @ apart + unseen
-
-
-def _warn_of_offsets(fit: Fit, offsets: Bool[np.ndarray, " terms"], slope: Float[np.ndarray, " 10"]) -> None:
-    """Where constant torques of joints look like the weight, since postures differ little; `slope` is that of the mass.
-
-    Small errors of a model are then large ones of the mass, of which intervals hold the random part only.
-    """
-    whole, seen = fit.information + fit.prior_information, np.zeros(len(fit.x))
-    seen[len(seen) - len(offsets) - 10 : len(seen) - len(offsets)] = slope
-    held = np.append(np.ones(len(seen) - len(offsets), dtype=bool), ~offsets)
-    known = whole[np.ix_(held, held)]
-    with_offsets, without = seen @ np.linalg.solve(whole, seen), seen[held] @ np.linalg.solve(known, seen[held])
-    if with_offsets > ALIKE**2 * without:
-        warn(
-            "constant torques of the joints ('offset') look like the payload's weight in these postures: with them its "
-            f"mass is {(with_offsets / without) ** 0.5:.0f} times as unsure, and small errors of the model change it. "
-            "Leave 'offset' out (friction=('viscous', 'stribeck')), or give a baseline, or a log of more postures.",
-            DataWarning,
-            stacklevel=3,
-        )
 
 
 def _carrying(robot: Robot, link: str, payload: np.ndarray) -> Robot:

@@ -45,18 +45,18 @@ def most_likely(
     all_of_them = np.concatenate([others / size, payloads.reshape(*residual.shape, -1)], axis=-1)
     noise = np.ones(residual.shape[1])
     for _ in range(3):  # weights change what is left, a little
-        left = _left(all_of_them / noise[:, None], residual / noise)[0] * noise
+        left = left_by_least_squares(all_of_them / noise[:, None], residual / noise)[0] * noise
         noise = np.sqrt((left**2).mean(0)).clip(1e-9 * np.sqrt((residual**2).mean()) + 1e-300)
     costs = []
     for k in range(payloads.shape[2]):
         columns = np.concatenate([payloads[:, :, k], others / size], axis=-1)
-        left, found = _left(columns / noise[:, None], residual / noise)
+        left, found = left_by_least_squares(columns / noise[:, None], residual / noise)
         costs.append(0.5 * float((left**2).sum()) if found[0] > 0.0 or k == 0 else np.inf)
     best = int(np.argmin(costs))
     return best if costs[best] < costs[0] - CLEARLY else 0
 
 
-def _left(
+def left_by_least_squares(
     columns: Float[np.ndarray, "windows nv k"], residual: Float[np.ndarray, "windows nv"]
 ) -> tuple[Float[np.ndarray, "windows nv"], Float[np.ndarray, " k"]]:
     """What least squares leave of the residual, and by which numbers."""

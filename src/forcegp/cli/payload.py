@@ -39,7 +39,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
     """The log with the payload (a dataset, raw or prepared)."""
     baseline: Annotated[Path | None, DATASET, unless_given("DATA", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
-    link: Annotated[str | None, unless_given("LINK", "the last one, or a base that moves", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """The link that carries the payload; results are in its frame."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "stribeck", "offset")
     """Friction laws to estimate, as for forcegp identify."""
