@@ -291,7 +291,9 @@ def test_a_drone_without_joints(walker):
     rotors = Thrusters(frame, places, torque=(0.02, -0.02, 0.02, -0.02))
     system = MechanicalSystem(locked, (), (Actuation(), rotors, RigidBodyBias()))
     heavier = replace(system, robot=with_bodies(locked, 1.3 * body_pseudo_inertias(locked).numpy()))
-    found = identify_analytical(recorded(heavier, 200, switches=0), system)
+    log = recorded(heavier, 200, switches=0)
+    found = identify_analytical(log, system)
+    assert identify_payload(log, system).mass == pytest.approx(0.3 * locked.mass, rel=0.05)
     np.testing.assert_allclose(found.parameters.ravel(), standard_parameters(heavier.robot), atol=1e-3)
     assert found.terms.size == 0
     assert [type(force) for force in found.system.known_forces] == [type(force) for force in system.known_forces]

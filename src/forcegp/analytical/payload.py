@@ -34,7 +34,7 @@ from forcegp.errors import DatasetError, InvalidInput, require_type, usable_argu
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
-from forcegp.robots.inertia import pseudo_inertia
+from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.robots.urdf_file import replace_inertial
 from forcegp.summary import Summary
 
@@ -233,8 +233,8 @@ def identify_payload(
     covariance = _jackknife(fit, windows.lengths)
     step = 1e-5 * np.eye(len(fit.x))[split - 10 : split]
     slopes = np.stack([(numbers(fit.x + d) - numbers(fit.x - d)) / 2e-5 for d in step], axis=1)
-    warn_of_offsets(fit, np.array([name.startswith("offset.") for name in terms.names]), slopes[0])
-    warn_of_no_body(fit, constant[:, :, -1], link)
+    warn_of_offsets(fit, np.array([name.startswith("offset.") for name in terms.names], dtype=bool), slopes[0])
+    warn_of_no_body(fit, constant[:, :, -1], bodies.parameters(fit.x[:split])[-1], split, link)
     errors = np.sqrt(np.diag(slopes @ covariance[split - 10 : split, split - 10 : split] @ slopes.T))
     of_terms = np.sqrt(np.diag(covariance)[split:]) * terms.slopes(fit.x[split:]).ravel()
     found, there = bodies.pseudo_inertias(fit.x[:split]), np.linalg.inv(offset)
@@ -289,10 +289,8 @@ def _usual(offset: np.ndarray) -> np.ndarray:
 
 def _numbers(pseudo: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """`QUANTITIES` of a pseudo-inertia (4, 4) in the frame of its body, for a link at this pose in it."""
-    there = np.linalg.inv(offset) @ pseudo @ np.linalg.inv(offset).T
-    center = there[:3, 3] / there[3, 3]
-    second = there[:3, :3] - there[3, 3] * np.outer(center, center)
-    return np.array([there[3, 3], *center, *(np.trace(second) - np.diag(second))])
+    mass, center, inertia = physical_of_pseudo_inertia(np.linalg.inv(offset) @ pseudo @ np.linalg.inv(offset).T)
+    return np.array([mass, *center, *np.diag(inertia)])
 
 
 def _jackknife(fit: Fit, lengths: list[int]) -> np.ndarray:
@@ -313,7 +311,5 @@ def _carrying(robot: Robot, link: str, payload: np.ndarray) -> Robot:
     """The robot whose link has the payload of this pseudo-inertia (4, 4) added."""
     held = robot.link(link)
     whole = payload + pseudo_inertia(held.mass, np.array(held.center_of_mass), np.array(held.inertia))
-    center = whole[:3, 3] / whole[3, 3]
-    second = whole[:3, :3] - whole[3, 3] * np.outer(center, center)
-    inertia = np.trace(second) * np.eye(3) - second
-    return robot.with_text(replace_inertial(robot.urdf_text, link, whole[3, 3], center, inertia, source=robot.source))
+    parts = physical_of_pseudo_inertia(whole)
+    return robot.with_text(replace_inertial(robot.urdf_text, link, *parts, source=robot.source))

@@ -10,6 +10,7 @@ from forcegp.analytical.payload_link import CLEARLY, left_by_least_squares
 from forcegp.errors import DataWarning
 
 ALIKE = 5.0  # times the error of a mass without offsets
+OTHER = 0.01  # share of a payload's torques by which others differ
 LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
 
 
@@ -33,16 +34,20 @@ def warn_of_offsets(fit: Fit, offsets: Bool[np.ndarray, " terms"], slope: Float[
         )
 
 
-def warn_of_no_body(fit: Fit, payload: Float[np.ndarray, "windows nv 10"], link: str) -> None:
-    """Where ten free numbers in place of the payload's explain much more: no body there does.
+def warn_of_no_body(
+    fit: Fit, payload: Float[np.ndarray, "windows nv 10"], parameters: Float[np.ndarray, "10"], split: int, link: str
+) -> None:
+    """Where ten free numbers in place of the payload's `parameters` explain much more: no body there does.
 
-    Inside of what bodies can have, the best numbers are those found, and free ones explain no more.
+    Inside of what bodies can have, the best numbers are those found, and free ones explain no more. Coordinates of the
+    payload are the last ten before `split`.
     """
-    white, columns = fit.residual / fit.noise, np.concatenate([payload, fit.jacobian], axis=-1)
-    left, _ = left_by_least_squares(columns / fit.noise[:, None], white)
+    white, others = fit.residual / fit.noise, np.delete(fit.jacobian, np.s_[split - 10 : split], axis=-1)
+    left, found = left_by_least_squares(np.concatenate([payload, others], axis=-1) / fit.noise[:, None], white)
     cost = 0.5 * float((white**2).sum())
     more = cost - 0.5 * float((left**2).sum())
-    if more > max(CLEARLY, LEAST * cost):
+    other = np.linalg.norm(payload @ found[:10]) > OTHER * np.linalg.norm(payload @ parameters)
+    if other and more > max(CLEARLY, LEAST * cost):
         warn(
             f"no body on {link} explains the log: free numbers in place of its mass, centre and inertia leave "
             f"{more / cost:.0%} less. The payload is on another link, or links weigh less or otherwise than the URDF "
