@@ -10,7 +10,7 @@ from forcegp.analytical.payload_link import CLEARLY, left_by_least_squares
 from forcegp.errors import DataWarning
 
 ALIKE = 5.0  # times the error of a mass without offsets
-OTHER = 0.01  # share of a payload's torques by which others differ
+RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
 LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
 
 
@@ -43,11 +43,11 @@ def warn_of_no_body(
     payload are the last ten before `split`.
     """
     white, others = fit.residual / fit.noise, np.delete(fit.jacobian, np.s_[split - 10 : split], axis=-1)
-    left, found = left_by_least_squares(np.concatenate([payload, others], axis=-1) / fit.noise[:, None], white)
+    left, _ = left_by_least_squares(np.concatenate([payload, others], axis=-1) / fit.noise[:, None], white)
     cost = 0.5 * float((white**2).sum())
     more = cost - 0.5 * float((left**2).sum())
-    other = np.linalg.norm(payload @ found[:10]) > OTHER * np.linalg.norm(payload @ parameters)
-    if other and more > max(CLEARLY, LEAST * cost):
+    rough = np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(payload @ parameters)
+    if rough and more > max(CLEARLY, LEAST * cost):
         warn(
             f"no body on {link} explains the log: free numbers in place of its mass, centre and inertia leave "
             f"{more / cost:.0%} less. The payload is on another link, or links weigh less or otherwise than the URDF "
