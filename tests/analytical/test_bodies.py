@@ -50,6 +50,24 @@ def test_derivatives(kind):
     np.testing.assert_allclose(ours.distance(x)[1], difference(lambda at: ours.distance(at)[0], x), atol=1e-7)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_steps_are_straight_in_the_parameters_while_a_body_has_them(kind):
+    ours, rng = bodies(kind), np.random.default_rng(2)
+    x, step = 0.4 * rng.normal(size=30), 0.1 * rng.normal(size=30)
+    wanted = ours.parameters(x) + np.einsum("bpk,bk->bp", ours.derivatives(x), step.reshape(3, 10))
+    np.testing.assert_allclose(ours.parameters(ours.moved(x, step)), wanted, rtol=1e-10, atol=1e-12)
+
+
+def test_a_step_to_parameters_of_no_body_ends_at_a_body():
+    ours, step = bodies(ConsistentBodies), np.zeros(30)
+    step[[0, 15]] = -0.6, 0.1  # a mass of 1 - 2 * .6 times the first
+    there = ours.moved(np.zeros(30), step)
+    np.testing.assert_array_equal(there[:10], step[:10])
+    assert ours.parameters(there)[0, 0] == pytest.approx(np.exp(-1.2) * ours.parameters(0.0 * step)[0, 0])
+    change = ours.derivatives(0.0 * step)[1] @ step[10:20]
+    np.testing.assert_allclose(ours.parameters(there)[1], ours.parameters(0.0 * step)[1] + change, atol=1e-12)
+
+
 def test_distance_is_that_of_the_metric():
     ours, x = bodies(ConsistentBodies), 0.5 * np.random.default_rng(1).normal(size=30)
     wanted = 0.0

@@ -1,5 +1,6 @@
 """`identify_payload` against payloads that Pinocchio's inverse dynamics carries."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.analytical import PayloadEstimate, body_names, identify_analytical, identify_payload
 from forcegp.data import Dataset
-from forcegp.errors import DatasetError, ForceGPError, InvalidInput
+from forcegp.errors import DatasetError, DataWarning, ForceGPError, InvalidInput
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_inertial
@@ -43,6 +44,41 @@ def loaded(mass=MASS, text=TEXT):
 @pytest.fixture(scope="module")
 def found() -> PayloadEstimate:
     return identify_payload(log(loaded(), 1, noise=0.05))
+
+
+FINGER = """<joint name="{0}" type="revolute"><parent link="tool0"/><child link="{0}_link"/><axis xyz="0 0 1"/>{1}
+<limit lower="-1" upper="1" effort="9" velocity="9"/></joint><link name="{0}_link"><inertial><origin xyz=".04 0 0"/>
+<mass value=".05"/><inertia ixx="5e-5" iyy="5e-5" izz="4e-5" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+def test_the_hand_carries_the_payload_of_fingers_that_follow_each_other():
+    """On a finger, it would be inertia of the joint that drives both, and the rotor would have none."""
+    fingers = FINGER.format("left", "") + FINGER.format("right", '<mimic joint="left" multiplier="-1"/>')
+    robot = Robot.from_urdf_text(TEXT.replace("</robot>", f"{fingers}</robot>"))
+    holding = robot.with_text(loaded(text=robot.urdf_text)).with_armature([0.1] * 6 + [0.0055])
+    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 400, 7))
+    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy()
+    rows = Dataset(q=q, v=v, u=u, a=a, time=0.02 * np.arange(400), system=MechanicalSystem(robot))
+    estimate = identify_payload(rows, friction=("viscous",))
+    assert estimate.link == "tool0"
+    assert estimate.mass == pytest.approx(MASS, rel=0.01)
+    assert estimate.joints["armature.left"][0] == pytest.approx(0.0055, rel=0.05)
+
+
+@pytest.mark.parametrize(("pace", "friction", "warned"), [(0.5, ("viscous", "offset"), True),
+                         (0.5, ("viscous",), False), (10.0, ("viscous", "offset"), False)])  # fmt: skip
+def test_offsets_that_look_like_weight_are_warned_of(pace, friction, warned):
+    """A lift, whose weight is as constant as an offset: the mass is that which its accelerations show."""
+    lift = FINGER.format("lift", "").replace("tool0", "pole").replace("revolute", "prismatic")
+    arm = f'<robot name="lift"><link name="pole"/>{lift}</robot>'
+    robot = Robot.from_urdf_text(arm)
+    holding = robot.with_text(replace_inertial(arm, "lift_link", 1.0, np.array([0.2, 0, 0]), INERTIA, source="a test"))
+    draw = np.random.default_rng(0)
+    q, v, a = pace * draw.normal(size=(3, 400, 1))
+    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + 0.01 * draw.normal(size=(400, 1))
+    rows = Dataset(q=q, v=v, u=u, a=a, time=0.5 * np.arange(400), system=MechanicalSystem(robot))
+    with pytest.warns(DataWarning, match="'offset'.* times as unsure") if warned else nullcontext():
+        identify_payload(rows, friction=friction, rotors=None)
 
 
 def test_the_payload_is_found_with_friction_and_rotors(found):

@@ -1,5 +1,7 @@
 """Closed loops against Pinocchio's constrained dynamics, MuJoCo's constraints and dense linear algebra."""
 
+import warnings
+
 import mujoco as untyped
 import numpy as np
 import pinocchio as pin
@@ -203,6 +205,37 @@ def test_motors_at_sites_of_a_free_body_are_inputs(tmp_path):
     oracle.at(q[0].numpy(), v[0].numpy())
     np.testing.assert_allclose(system.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
     assert MechanicalSystem.from_json(system.to_json()).inputs == system.inputs
+
+
+@pytest.mark.parametrize("gear", ["0 0 1 0 0 .02", "1 2 -3 .4 .5 .6", "0 0 0 .1 .2 -.3", "0 0 0 0 0 0"])
+@pytest.mark.parametrize("base", ["", '<freejoint name="root"/>'])
+def test_rotors_on_links_that_move_are_inputs(tmp_path, base, gear):
+    """MuJoCo's joint forces: a tilting pod with a rotor under a frame of its own, and one on the body."""
+    pod = '<body name="pod" pos=".2 0 .1" euler="10 0 20"><joint name="tilt" axis="0 1 0" pos="0 .01 .02"/>'
+    pod += '<geom size=".05" mass=".3"/><body pos=".05 .02 .1" euler="30 -20 5"><site name="r2" pos="0 .1 .02"/></body>'
+    right = '<motor name="right" site="r1" gear="0 0 1 0 0 .1"/>' if base else ""
+    text = (
+        f'<mujoco><worldbody><body name="frame">{base}<geom size=".1 .2 .1" type="box"/><site name="r1" pos=".1 .1 0"/>'
+        f'{pod}</body></body></worldbody><actuator><motor name="left" site="r2" gear="{gear}"/>'
+        f'<motor name="turn" joint="tilt" gear="3"/>{right}</actuator></mujoco>'
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        system, model = system_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
+    names = ("turn", *(("right",) if base else ()), "left")
+    assert system.inputs == names
+    oracle, generator = MujocoOracle(model), torch.Generator().manual_seed(0)
+    q = system.robot.random(generator, 3)
+    v, u = (torch.randn(3, n, dtype=torch.float64, generator=generator) for n in (system.robot.nv, len(names)))
+    delivered = system.state(q, v, u).delivered
+    for k in range(3):
+        oracle.data.ctrl[[model.actuator(name).id for name in names]] = u[k].numpy()
+        oracle.at(q[k].numpy(), v[k].numpy())
+        np.testing.assert_allclose(delivered[k], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-9)
+    assert MechanicalSystem.from_json(system.to_json()).inputs == names
+    if base:
+        held = MechanicalSystem.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.3})
+        assert held.inputs == ("right", "left")
 
 
 def test_motors_that_turn_a_ball_joint_are_inputs(tmp_path):

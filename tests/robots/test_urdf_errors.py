@@ -149,6 +149,8 @@ WRONG = {
         ["link 'arm'", "mass is zero", "has no mass"],
     ),
     "negative mass": (changed('"2"', '"-2"'), errors.NonPhysicalInertia, ["link 'arm'", "-2 kg is negative"]),
+    "absurd mass": (changed('"2"', '"1e308"'), errors.NonPhysicalInertia, ["link 'arm'", "above 1e+09 kg"]),
+    "absurd inertia": (changed(IXX, 'ixx="1e300"'), errors.NonPhysicalInertia, ["link 'arm'", "above 1e+09 kg"]),
     "NaN mass": (changed('"2"', '"nan"'), errors.NonPhysicalInertia, ["link 'arm'", "not finite"]),
     "NaN inertia": (changed(IXX, 'ixx="nan"'), errors.NonPhysicalInertia, ["link 'arm'", "not finite"]),
     "negative inertia": (changed(IXX, 'ixx="-1"'), errors.NonPhysicalInertia, ["link 'arm'", "not positive definite"]),

@@ -17,6 +17,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Actuation, RigidBodyBias
 from forcegp.models import export_c, load_posterior, observing, save_posterior
 from forcegp.models.observed_wrench import _lasting
+from forcegp.priors import JointAccelerations, JointForces
 from forcegp.report.motion import recorded_scene
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -249,16 +250,24 @@ def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_a_mass_beside_unknown_thrust_is_warned_of(train):
+@pytest.mark.filterwarnings("ignore:.*never changes in the training rows")  # thrust along x and y
+@pytest.mark.parametrize("prior", [AerodynamicForce(), JointForces(), JointAccelerations()])
+def test_a_mass_beside_unknown_thrust_is_warned_of(train, prior):
     rows, body = acting(train).rows(np.arange(0, 4000, 100)), train.system.robot.link("body").inertial("mass")
     quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
     with pytest.warns(DataWarning, match="a heavier robot with as much more thrust moves the same"):
-        found = StructuredGP(train.system, AerodynamicForce()).identify(rows, body, **quick).identification
+        found = StructuredGP(train.system, prior).identify(rows, body, **quick).identification
     with pytest.warns(NumericalWarning, match="not ended at a minimum"):
         assert found.standard_errors == {"body.mass": np.inf}
-    assert "The data do not identify body.mass: an unknown share of the thrust takes its place." in found.verdict
+    assert "The data do not identify body.mass: forces of the prior do the same." in found.verdict
     assert "every" not in found.verdict
-    known = AerodynamicForce(inputs=("velocity", "drag", "angular-velocity", "attitude"))
+
+
+@pytest.mark.parametrize("inputs", [("velocity", "drag", "angular-velocity", "attitude"), ("height",)])
+def test_a_mass_beside_forces_that_are_not_in_proportion_to_thrust_is_not(train, inputs):
+    rows, body = acting(train).rows(np.arange(0, 4000, 100)), train.system.robot.link("body").inertial("mass")
+    quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
+    known = AerodynamicForce(inputs=inputs)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         StructuredGP(train.system, known).identify(rows, body, **quick)

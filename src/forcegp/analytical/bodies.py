@@ -65,6 +65,13 @@ class BodyCoordinates(ABC):
     def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
         """P of every body."""
 
+    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """x + step to first order, where parameters change by exactly their derivatives times the step, if a body can.
+
+        Torque is linear in parameters: with many rows of little noise, straight lines in x leave its narrow valley.
+        """
+        return x + step
+
     @abstractmethod
     def distance(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
         """A vector whose norm is the distance from the reference, and its Jacobian."""
@@ -105,13 +112,23 @@ class ConsistentBodies(BodyCoordinates):
 
     @override
     def pseudo_inertias(self, x: np.ndarray) -> np.ndarray:
-        factor, _ = _log_cholesky(x)
-        return self._congruent(factor @ factor.swapaxes(-1, -2))
+        return self._congruent(_log_cholesky(x)[0])
+
+    @override
+    def moved(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        inner, derivatives = _log_cholesky(x)
+        inner = inner + np.einsum("nk,nkab->nab", step.reshape(-1, 10), derivatives)
+        there, values = (x + step).reshape(-1, 10), np.linalg.eigvalsh(inner)
+        possible = values[:, 0] > DEFINITE * values[:, -1]
+        F = upper_cholesky(inner[possible])
+        scale, inside = F[:, 3, 3:], F[:, *np.transpose(_PLACES)] / F[:, 3, 3:]
+        there[possible] = np.concatenate([np.log(scale), np.log(inside[:, :3]), inside[:, 3:]], axis=1)
+        return there.ravel()
 
     @override
     def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        factor, derivatives = _log_cholesky(x)
-        values, vectors = np.linalg.eigh(factor @ factor.swapaxes(-1, -2))
+        inner, change = _log_cholesky(x)
+        values, vectors = np.linalg.eigh(inner)
         values = np.maximum(values, np.finfo(np.float64).tiny)
         logs = np.log(values)
         turned = np.swapaxes(vectors, -1, -2)
@@ -121,8 +138,6 @@ class ConsistentBodies(BodyCoordinates):
         equal = abs(gap) <= 1e-7 * (values[:, :, None] + values[:, None, :])
         mean = 0.5 * (values[:, :, None] + values[:, None, :])
         divided = np.where(equal, 1.0 / mean, (logs[:, :, None] - logs[:, None, :]) / np.where(equal, 1.0, gap))
-        change = derivatives @ factor.swapaxes(-1, -2)[:, None]
-        change = change + change.swapaxes(-1, -2)
         inside = turned[:, None] @ change @ vectors[:, None] * divided[:, None]
         moved = vectors[:, None] @ inside @ turned[:, None]
         jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved))
@@ -130,9 +145,11 @@ class ConsistentBodies(BodyCoordinates):
 
     @override
     def _pseudo_inertia_derivatives(self, x: np.ndarray) -> np.ndarray:
-        factor, derivatives = _log_cholesky(x)
-        half = derivatives @ factor.swapaxes(-1, -2)[:, None]
-        return self._congruent(half + half.swapaxes(-1, -2))
+        return self._congruent(_log_cholesky(x)[1])
+
+
+DEFINITE = 1e-9
+"""Matrices whose smallest eigenvalue is this fraction of the largest have factors in spite of rounding."""
 
 
 def upper_cholesky(matrices: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
@@ -141,7 +158,7 @@ def upper_cholesky(matrices: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n
 
 
 def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """F (n, 4, 4) and its derivatives (n, 10, 4, 4)."""
+    """F F^T (n, 4, 4) and its derivatives (n, 10, 4, 4)."""
     x = x.reshape(-1, 10)
     scale = np.exp(x[:, 0])
     F = np.zeros((len(x), 4, 4))
@@ -151,7 +168,8 @@ def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         F[:, i, j] = scale * (np.exp(x[:, k]) if i == j else x[:, k])
         derivatives[:, k, i, j] = F[:, i, j] if i == j else scale
     derivatives[:, 0] = F
-    return F, derivatives
+    half = derivatives @ F.swapaxes(-1, -2)[:, None]
+    return F @ F.swapaxes(-1, -2), half + half.swapaxes(-1, -2)
 
 
 THIN = 1e-5

@@ -20,6 +20,7 @@ prior (generalized least squares). Of joint j it has the mean square ``sum_n (1 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -33,8 +34,6 @@ ROWS = 2000
 LEAST, MOST = 1e-3, 1e2
 """Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
 of the search that goes further has a covariance that rounding makes singular."""
-FOUND = 1e-3
-"""Nats that a step has to promise, to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +71,8 @@ class NoiseLevels:
         if near is not None:
             x = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(low, high)
 
-        def at(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-            """Cost, gradient and expected curvature tr(S^-1 dS S^-1 dS') / 2."""
+        def at(x: np.ndarray) -> _Point:
+            """With the expected curvature tr(S^-1 dS S^-1 dS') / 2."""
             acceleration, force = whole * torch.as_tensor(x).exp().view_as(whole)
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
             precision = torch.cholesky_inverse(lower)
@@ -93,23 +92,9 @@ class NoiseLevels:
             )
             curvature = (2.0 * squares * squares[:, None] * curvature).numpy() + np.eye(len(x))
             slope = (squares * (left - explained)).numpy() + x - middle
-            return float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature
+            return _Point(x, float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature)
 
-        here = at(x)
-        for _ in range(MOST_EVALUATIONS):
-            free = ~(((x <= low) & (here[1] > 0.0)) | ((x >= high) & (here[1] < 0.0)))
-            step = np.zeros_like(x)
-            step[free] = -np.linalg.solve(here[2][np.ix_(free, free)], here[1][free])
-            step = (x + step).clip(low, high) - x
-            if -here[1] @ step <= FOUND:
-                break
-            trial = at(x + step)
-            while trial[0] >= here[0] and -here[1] @ step > FOUND:
-                step = 0.25 * step
-                trial = at(x + step)
-            if trial[0] >= here[0]:
-                break
-            x, here = x + step, trial
+        x, *_ = _minimized(at, x, (np.array(low), np.array(high)), np.inf, MOST_EVALUATIONS)
         acceleration, force = whole.numpy() * np.exp(x).reshape(whole.shape)
         return cls(acceleration, force)
 
@@ -149,6 +134,8 @@ MAD = 1.4826
 
 Residual = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """x -> residuals (rows, nv) and Jacobian (rows, nv, k); of the prior (p,) and (p, k)."""
+Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""x and a step -> where it leads: x + step to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +187,14 @@ def weighted_least_squares(
     held: Float[np.ndarray, "rows m nv"] | None = None,
     known: Float[np.ndarray, " nv"] | None = None,
     evaluations: int = MOST_EVALUATIONS,
+    moved: Moved = np.add,
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
     `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
     are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count. `known`
-    is sigma where it is not to be found. A round takes so many `evaluations` at most.
+    is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps follow `moved`: residuals
+    that are as good as linear along it have no curved valleys, in which searches creep.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
@@ -225,7 +214,8 @@ def weighted_least_squares(
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
-        x, nfev, converged, expected = _minimized(at, prior, x, bounds, longest, noise, robust, span, evaluations)
+        point = partial(_point, at, prior, noise, robust, span)
+        x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved)
         total += nfev
         r, jacobian = at(x)
         before = noise
@@ -275,22 +265,19 @@ class _Point:
 
 
 def _minimized(
-    at: Residual,
-    prior: Residual,
+    point: Callable[[np.ndarray], _Point],
     x: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     longest: np.ndarray | float,
-    noise: np.ndarray,
-    robust: bool,
-    span: np.ndarray | None,
     most: int,
+    moved: Moved = np.add,
 ) -> tuple[np.ndarray, int, bool, float]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
 
     Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
     """
     low, high = bounds
-    here, damping, idle, first = _point(at, prior, x, noise, robust, span), 1e-4, 0, None
+    here, damping, idle, first = point(x), 1e-4, 0, None
     for evaluation in range(1, most + 1):
         held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
         free = ~held
@@ -299,13 +286,12 @@ def _minimized(
         diagonal = np.diag(curvature.diagonal() + 1e-12)
         step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
         step /= max(1.0, float((abs(step) / longest).max()))
-        there = np.clip(here.x + step, low, high)
-        moved = there - here.x
-        expected = -float(here.gradient @ moved + 0.5 * moved @ here.curvature @ moved)
+        step = np.clip(here.x + step, low, high) - here.x
+        expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
         first = expected if first is None else first
         if abs(expected) <= 1e-3 * CONTENT or idle == 2:
             return here.x, evaluation, True, first
-        trial = _point(at, prior, there, noise, robust, span)
+        trial = point(moved(here.x, step))
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
@@ -318,7 +304,7 @@ def _minimized(
 
 
 def _point(
-    at: Residual, prior: Residual, x: np.ndarray, noise: np.ndarray, robust: bool, span: np.ndarray | None
+    at: Residual, prior: Residual, noise: np.ndarray, robust: bool, span: np.ndarray | None, x: np.ndarray
 ) -> _Point:
     bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
     with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad

@@ -24,6 +24,8 @@ from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
 from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
 from forcegp.analytical.identification import ROWS, identify_analytical, joint_terms
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
+from forcegp.analytical.payload_doubts import warn_of_no_body, warn_of_offsets
+from forcegp.analytical.payload_link import most_likely, possible_links
 from forcegp.analytical.recorded_rows import RecordedRows
 from forcegp.analytical.result import AnalyticalIdentification, with_terms
 from forcegp.data import Dataset
@@ -32,7 +34,7 @@ from forcegp.errors import DatasetError, InvalidInput, require_type, usable_argu
 from forcegp.mechanics import MechanicalSystem
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
-from forcegp.robots.inertia import pseudo_inertia
+from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.robots.urdf_file import replace_inertial
 from forcegp.summary import Summary
 
@@ -122,7 +124,8 @@ def identify_payload(
     dataset: a log with the payload: q, v, u and a, filtered alike (`forcegp.data.Preparation`), in no contact.
     system: the robot without the payload. None takes that of the dataset.
     baseline: a log of the same robot without the payload. None trusts the inertias of the URDF.
-    link: what carries it; None is the last link of the last joint, or a base that moves.
+    link: what carries it. None is the base that moves, or the link at which joints end or part, that explains most
+        (`forcegp.analytical.payload_link`).
     friction, rotors: as for `identify_analytical`.
     rows: use so many of each log at most, evenly spread.
     identified: what `identify_analytical` found in `dataset`, if it is there already; of use where the base moves.
@@ -149,19 +152,16 @@ def identify_payload(
                 raise InvalidInput("identified is of another robot; give what was found in `dataset`, or leave it out.")
     robot, _ = thickened(system.robot)
     system = system.with_robot(robot)
-    link = _last_link(robot) if link is None else link
-    robot.link(link)  # raises UnknownLink
-    placement = robot.layout.links[link]
-    if placement.body < 0:
+    candidates = possible_links(robot) if link is None else (link,)
+    for name in candidates:
+        robot.link(name)  # raises UnknownLink
+    carriers = [robot.layout.links[name].body for name in candidates]
+    if min(carriers) < 0:
         raise InvalidInput(f"link {link!r} does not move, so nothing on it shows; give a moving one.")
-    offset = np.linalg.inv(robot.layout.child_frames[placement.body]) @ placement.offset
     chosen = [np.unique(np.linspace(0, len(log) - 1, min(rows, len(log))).astype(int)) for log in logs]
     q, v, u, a = (np.concatenate([getattr(log, x)[at] for log, at in zip(logs, chosen, strict=True)]) for x in "qvua")
     holds = np.repeat([1.0, 0.0][: len(logs)], [len(at) for at in chosen])
 
-    links, usual = body_pseudo_inertias(robot).cpu().numpy(), _usual(offset)
-    bodies = ConsistentBodies(usual[None] if baseline is None else np.concatenate([links, usual[None]]))
-    stated = standard_parameters(robot).reshape(-1, 10).cpu().numpy()[: len(links) if baseline is None else 0]
     terms = joint_terms(system, friction, rotors, q, v, u, a)
     recorded = RecordedRows(system, terms, q, v, u)
     likely_a, from_noise = a, np.zeros(1)
@@ -176,14 +176,29 @@ def identify_payload(
         ]
         likely = [_likely(own, *rows) for own, rows in zip(found, states, strict=True)]
         likely_a, from_noise = (np.concatenate(x) for x in zip(*likely, strict=True))
-    regressor = recorded.regressor(likely_a, (*terms.bodies, placement.body))
-    regressor[:, :, -1] *= holds[:, None, None]
-    split, known = bodies.size, len(stated)
     windows = _Windows([log.rows(at) for log, at in zip(logs, chosen, strict=True)])
 
     def equations(forces: np.ndarray) -> np.ndarray:
         return windows.mean(recorded.without_contacts(forces))
 
+    links = body_pseudo_inertias(robot).cpu().numpy()
+    regressor = recorded.regressor(likely_a, (*terms.bodies, *carriers))
+    regressor[:, :, len(links) :] *= holds[:, None, None, None]
+    if len(candidates) > 1:
+        r, in_links, in_terms = recorded.in_torque(
+            standard_parameters(robot).cpu().numpy(), terms.start(), likely_a, regressor[:, :, : len(links)]
+        )
+        unknown = in_terms if baseline is None else np.concatenate([in_terms, in_links.reshape(*r.shape, -1)], axis=-1)
+        place = most_likely(equations(regressor[:, :, len(links) :]), equations(r + from_noise), equations(unknown))
+        regressor = np.delete(regressor, [len(links) + k for k in range(len(candidates)) if k != place], axis=2)
+    else:
+        place = 0
+    link = candidates[place]
+    offset = np.linalg.inv(robot.layout.child_frames[carriers[place]]) @ robot.layout.links[link].offset
+    usual = _usual(offset)[None]
+    bodies = ConsistentBodies(usual if baseline is None else np.concatenate([links, usual]))
+    stated = standard_parameters(robot).reshape(-1, 10).cpu().numpy()[: len(links) if baseline is None else 0]
+    split, known = bodies.size, len(stated)
     constant = equations(regressor[:, :, known:])
 
     def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -206,7 +221,11 @@ def identify_payload(
     bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
     longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
     start = np.concatenate([np.zeros(split), terms.start()])
-    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest)
+
+    def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return np.concatenate([bodies.moved(x[:split], step[:split]), x[split:] + step[split:]])
+
+    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest, moved=moved)
 
     def numbers(x: np.ndarray) -> np.ndarray:
         return _numbers(bodies.pseudo_inertias(x[:split])[-1], offset)
@@ -214,6 +233,8 @@ def identify_payload(
     covariance = _jackknife(fit, windows.lengths)
     step = 1e-5 * np.eye(len(fit.x))[split - 10 : split]
     slopes = np.stack([(numbers(fit.x + d) - numbers(fit.x - d)) / 2e-5 for d in step], axis=1)
+    warn_of_offsets(fit, np.array([name.startswith("offset.") for name in terms.names], dtype=bool), slopes[0])
+    warn_of_no_body(fit, constant[:, :, -1], bodies.parameters(fit.x[:split])[-1], split, link)
     errors = np.sqrt(np.diag(slopes @ covariance[split - 10 : split, split - 10 : split] @ slopes.T))
     of_terms = np.sqrt(np.diag(covariance)[split:]) * terms.slopes(fit.x[split:]).ravel()
     found, there = bodies.pseudo_inertias(fit.x[:split]), np.linalg.inv(offset)
@@ -260,17 +281,6 @@ def _likely(
     return likely.a, likely.offset
 
 
-def _last_link(robot: Robot) -> str:
-    """The link of the last joint that lies furthest along it: of links fixed to it the last one of the file.
-
-    Of a robot whose base moves, the base.
-    """
-    if robot.base != "fixed":
-        return robot.layout.moving[0]
-    last = len(robot.layout.bodies) - 1
-    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
-
-
 def _usual(offset: np.ndarray) -> np.ndarray:
     """A usual payload on the link at this pose (4, 4), in the frame of its body."""
     mass, size = USUAL
@@ -279,10 +289,8 @@ def _usual(offset: np.ndarray) -> np.ndarray:
 
 def _numbers(pseudo: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """`QUANTITIES` of a pseudo-inertia (4, 4) in the frame of its body, for a link at this pose in it."""
-    there = np.linalg.inv(offset) @ pseudo @ np.linalg.inv(offset).T
-    center = there[:3, 3] / there[3, 3]
-    second = there[:3, :3] - there[3, 3] * np.outer(center, center)
-    return np.array([there[3, 3], *center, *(np.trace(second) - np.diag(second))])
+    mass, center, inertia = physical_of_pseudo_inertia(np.linalg.inv(offset) @ pseudo @ np.linalg.inv(offset).T)
+    return np.array([mass, *center, *np.diag(inertia)])
 
 
 def _jackknife(fit: Fit, lengths: list[int]) -> np.ndarray:
@@ -303,7 +311,5 @@ def _carrying(robot: Robot, link: str, payload: np.ndarray) -> Robot:
     """The robot whose link has the payload of this pseudo-inertia (4, 4) added."""
     held = robot.link(link)
     whole = payload + pseudo_inertia(held.mass, np.array(held.center_of_mass), np.array(held.inertia))
-    center = whole[:3, 3] / whole[3, 3]
-    second = whole[:3, :3] - whole[3, 3] * np.outer(center, center)
-    inertia = np.trace(second) * np.eye(3) - second
-    return robot.with_text(replace_inertial(robot.urdf_text, link, whole[3, 3], center, inertia, source=robot.source))
+    parts = physical_of_pseudo_inertia(whole)
+    return robot.with_text(replace_inertial(robot.urdf_text, link, *parts, source=robot.source))

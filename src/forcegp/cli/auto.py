@@ -60,7 +60,7 @@ class Auto(Resuming, Import):
     """Continue although the log contains mistakes."""
     models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=MODEL_PARTS)] = ()
     """What is compared, as for forcegp validate."""
-    link: Annotated[str | None, unless_given("LINK", "the last one, or a base that moves", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """Where a payload may be."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter. auto: the one that predicts held-out torques best."""

@@ -39,7 +39,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
     """The log with the payload (a dataset, raw or prepared)."""
     baseline: Annotated[Path | None, DATASET, unless_given("DATA", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
-    link: Annotated[str | None, unless_given("LINK", "the last one, or a base that moves", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """The link that carries the payload; results are in its frame."""
     friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "stribeck", "offset")
     """Friction laws to estimate, as for forcegp identify."""
@@ -101,7 +101,8 @@ def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
     tables: list[Any] = [columns(title, ["", "", "std. error", "95 % interval", ""], rows)]
     joints = list(dict.fromkeys(name.partition(".")[2] for name in found.joints))
     fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
-    rows = [[joint, *(f"{found.joints[f'{field}.{joint}'][0]:.3g}" for field in fields)] for joint in joints]
+    each = [[found.joints[f"{field}.{joint}"] for field in fields] for joint in joints]
+    rows = [[joint, *(f"{x:.3g} ± {e:.2g}" for x, e in row)] for joint, row in zip(joints, each, strict=True)]
     header = ["joint", *(field.replace("_", "\n") for field in fields)]
     slides = any(found.system.robot.joint(joint).type == "prismatic" for joint in joints)
     units = "Nm or N, rad/s or m/s and kg m² or kg" if slides else "Nm, rad/s and kg m²"

@@ -100,8 +100,8 @@ class MechanicalSystem(Summary):
         """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping and dry friction of the file
-        enter as known forces only where listed. By default u are joint forces; where motors act at sites of a free
-        body, such as rotors, or turn a ball joint, u are the inputs of all motors.
+        enter as known forces only where listed. By default u are joint forces; where motors act at sites of bodies,
+        such as rotors, or turn a ball joint, u are the inputs of all motors, those of bodies that are not free last.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
         contacts = [
@@ -114,13 +114,14 @@ class MechanicalSystem(Summary):
             )
         ]
         if known_forces is None:
-            known_forces = (Actuation(), RigidBodyBias())
-            moving = set(robot.joint_names)  # without those that are locked
-            motors = [x for x in found.thrusters if moving & set(x[1])]
-            if any(moving & set(column) - set(robot.single_joint_names) for _, column in motors):
-                names, columns = zip(*motors, strict=True)
-                matrix = [[column.get(joint, 0.0) for column in columns] for joint in robot.joint_names]
-                known_forces = (Actuation(matrix, names), RigidBodyBias())
+            actuation, moving = Actuation(), set(robot.joint_names)  # without those that are locked
+            motors = [each for each in found.motors if moving & set(each.column)]
+            pushing = [each for each in found.motors if each.link and robot.frame(each.link)[0] >= 0]
+            if pushing or any(moving & set(each.column) - set(robot.single_joint_names) for each in motors):
+                matrix = [[each.column.get(joint, 0.0) for each in motors] for joint in robot.joint_names]
+                actuation = Actuation(matrix, tuple(each.name for each in motors))
+            thrusters = (Thrusters.of_wrench(each.link, each.wrench, each.name) for each in pushing)
+            known_forces = (actuation, *thrusters, RigidBodyBias())
         return cls(robot, tuple(contacts), known_forces, baumgarte)
 
     def to_mjcf(self, path: str | Path | None = None) -> str:

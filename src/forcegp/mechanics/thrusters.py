@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -59,6 +60,16 @@ class Thrusters(LinkForce):
     axes: Sequence[float] | Sequence[Sequence[float]] | Tensor = (0.0, 0.0, 1.0)
     power: int = 1
     names: tuple[str, ...] = ()
+
+    @classmethod
+    def of_wrench(cls, frame: str, wrench: Sequence[float], name: str) -> "Thrusters":
+        """One that does this per unit of u: force [N], and torque [Nm] about the origin of the link, in its axes."""
+        force, torque = np.split(np.array(wrench), 2)
+        thrust = float(np.linalg.norm(force))
+        along = force if thrust else torque
+        axis = along / np.linalg.norm(along) if along.any() else np.array([0.0, 0.0, 1.0])
+        place = np.cross(axis, torque) / thrust if thrust else np.zeros(3)  # a lever makes the rest
+        return cls(frame, [place.tolist()], thrust, float(torque @ axis), axis.tolist(), names=(name,))
 
     @override
     def bound_to(self, robot: Robot) -> "Thrusters":

@@ -180,6 +180,13 @@ def pseudo_inertia(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray)
     return out
 
 
+def physical_of_pseudo_inertia(pseudo: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The inverse of :func:`pseudo_inertia`."""
+    mass, center = float(pseudo[3, 3]), pseudo[:3, 3] / pseudo[3, 3]
+    second = pseudo[:3, :3] - mass * np.outer(center, center)
+    return mass, center, np.trace(second) * np.eye(3) - second
+
+
 def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> str | None:
     """What makes these inertial parameters physically impossible, or ``None`` if a body can have them.
 

@@ -29,6 +29,19 @@ class LoopDescription:
 
 
 @dataclass(frozen=True)
+class Motor:
+    """What one unit of an actuator's input does: joint forces by joint, or a wrench on a link.
+
+    The wrench is a force [N] and a torque [Nm] about the origin of the link, in its axes.
+    """
+
+    name: str
+    column: dict[str, float]
+    link: str = ""
+    wrench: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
 class Translation:
     """A compiled MJCF file as what a :class:`~forcegp.robots.Robot` is made of."""
 
@@ -37,8 +50,8 @@ class Translation:
     armature: dict[str, float]
     locked: dict[str, float]
     loops: tuple[LoopDescription, ...] = ()
-    thrusters: tuple[tuple[str, dict[str, float]], ...] = ()
-    """The motors, if some act on a free body or a ball joint: name, and joint forces per unit of input by joint."""
+    motors: tuple[Motor, ...] = ()
+    """All, if some act at sites of bodies or turn a ball joint."""
 
 
 class CompiledModel:
@@ -73,13 +86,13 @@ class CompiledModel:
                 frame = self._named(name, self.links)
                 self._fixed(body, frame, self._pose(self.model.site_pos[site], self.model.site_quat[site]))
         loops = tuple(self._loops())
-        thrusters = self._thrusters() if self.for_system else ()
-        self._note_losses(bool(thrusters))
+        motors = self._motors() if self.for_system else ()
+        self._note_losses(bool(motors))
         disabled = self.model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_GRAVITY)
         gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)
         text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
         locked = {self.joints[joint]: value for joint, value in self.locked.items()}
-        return Translation(text, gravity, self._rotor_inertias(), locked, loops, thrusters)
+        return Translation(text, gravity, self._rotor_inertias(), locked, loops, motors)
 
     @staticmethod
     def _named(name: str, taken: set[str]) -> str:
@@ -191,8 +204,8 @@ class CompiledModel:
         kinds = (model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator])
         return not any(kinds)
 
-    def _thrusters(self) -> tuple[tuple[str, dict[str, float]], ...]:
-        """Motors whose joint forces no posture changes, where some act at sites of a free body or turn a ball joint.
+    def _motors(self) -> tuple[Motor, ...]:
+        """All motors, where some act at sites of bodies that move or turn a ball joint; at sites as wrenches.
 
         Of an actuator with a law of its own, such as a servo, the input is the force on its joint, under the joint's
         name. What drives no single joint, such as a tendon, is left out.
@@ -200,13 +213,14 @@ class CompiledModel:
         model, found, taken, needed = self.model, [], set[str](), False
         for k in range(model.nu):
             gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])
+            link, wrench = "", ()
             name, motor = model.actuator(k).name or f"actuator_{k + 1}", self._is_motor(k)
             at_site = model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_SITE and model.actuator_trnid[k][1] < 0
             joints = [joint for joint in range(model.njnt) if k in self._actuators_of(joint)]
             if joints and model.jnt_type[joints[0]] >= 2 and joints[0] not in {*self.couplings, *self.locked}:
                 name = name if motor else self.joints[joints[0]]
                 column = {self.joints[joints[0]]: gain * float(gear[0]) if motor else 1.0}
-                if not motor and (name, column) in found:  # a second law of this joint
+                if not motor and Motor(name, column) in found:  # a second law of this joint
                     continue
             elif motor and at_site:
                 site = model.actuator_trnid[k][0]
@@ -215,12 +229,14 @@ class CompiledModel:
                     pose = self._pose(model.body_pos[body], model.body_quat[body]) @ pose
                     body = model.body_parentid[body]
                 first = model.body_jntadr[body]
-                if not body or model.jnt_type[first] != 0:
+                if not body:
                     return ()
-                force = pose[:3, :3] @ gear[:3]
-                wrench = [*force, *(pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force))]
-                names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
-                column, needed = dict(zip(names, (gain * float(x) for x in wrench), strict=True)), True
+                force = gain * pose[:3, :3] @ gear[:3]
+                torque = gain * pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force)
+                link, wrench, column, needed = self.bodies[body], (*force.tolist(), *torque.tolist()), {}, True
+                if model.jnt_type[first] == 0:
+                    names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
+                    link, wrench, column = "", (), dict(zip(names, wrench, strict=True))
             elif motor and joints and self._turns_ball(k):  # about axes of the body, as its velocity
                 names = [f"{self.joints[joints[0]]}.{each}" for each in MOTIONS["spherical"].velocities]
                 column, needed = dict(zip(names, (gain * float(x) for x in gear[:3]), strict=True)), True
@@ -228,7 +244,7 @@ class CompiledModel:
                 return ()
             else:
                 continue
-            found.append((self._named(name, taken), column))
+            found.append(Motor(self._named(name, taken), column, link, wrench))
         return tuple(found) if needed else ()
 
     def _turns_ball(self, k: int) -> bool:
@@ -321,7 +337,7 @@ class CompiledModel:
     def _lose(self, what: str, where: str) -> None:
         self.problems.ignore(f"left out: {what}", where, what)
 
-    def _note_losses(self, thrusters: bool) -> None:
+    def _note_losses(self, motors: bool) -> None:
         """Note what acts on the joints in MuJoCo and not here."""
         model, site = self.model, self.mujoco.mjtTrn.mjTRN_SITE
 
@@ -344,8 +360,8 @@ class CompiledModel:
         for k in range(model.nu):
             if not self._is_motor(k):
                 self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
-            elif not (thrusters and model.actuator_trntype[k] == site) and not any(
-                k in self._actuators_of(joint) and (model.jnt_type[joint] >= 2 or (thrusters and self._turns_ball(k)))
+            elif not (motors and model.actuator_trntype[k] == site) and not any(
+                k in self._actuators_of(joint) and (model.jnt_type[joint] >= 2 or (motors and self._turns_ball(k)))
                 for joint in range(model.njnt)
             ):
                 self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")

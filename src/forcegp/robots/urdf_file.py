@@ -28,6 +28,8 @@ from forcegp.robots.urdf import RobotDescription, parse_urdf
 from forcegp.robots.xml_text import numbers, without_comments
 
 UNREADABLE = "\ufffd"
+HEAVIEST = 1e9
+"""kg and kg m^2, of one link: far from where products of inertias overflow."""
 LARGEST_FILE = 16 << 20
 """Bytes; robot files have some hundred thousand."""
 
@@ -236,13 +238,15 @@ def with_chosen_inertias(
             continue
         bare, center = bool(np.isnan(inertial.inertia).all()), inertial.center_of_mass
         given = np.zeros((3, 3)) if bare else inertial.inertia
-        objection = physical_objection(inertial.mass, center, given)
+        heavy = HEAVIEST < max(inertial.mass, np.abs(given).max()) < np.inf
+        objection = f"its mass or inertia is above {HEAVIEST:.0e} kg or kg m^2" if heavy else None
+        objection = objection or physical_objection(inertial.mass, center, given)
         seen = f"{source}: no physical body has the inertia of link {name!r}: {objection}"
         if objection is None and bare:
             seen = f"{source}: link {name!r} has a mass and its <inertial> no <inertia>"
         elif objection is None:
             continue
-        if not (inertial.mass >= 0.0 and np.isfinite([inertial.mass, *given.flat, *center]).all()):
+        if heavy or not (inertial.mass >= 0.0 and np.isfinite([inertial.mass, *given.flat, *center]).all()):
             problems.broken.add(name)
             links[name] = None  # what follows is computed without numbers that are not finite
             problems.errors.append(NonPhysicalInertia(seen, f"{IN_THE_FILE}."))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.errors import InvalidInput, SimulationError
+from forcegp.robots.xml_text import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.trajectory import FlatTable, Table
 
@@ -227,7 +228,7 @@ def with_tool_sphere(urdf: str, link: str, point: Sequence[float]) -> str:
     if body is None:
         raise InvalidInput(f"the URDF has no link {link!r} to put the tool's sphere on.")
     collision = ElementTree.SubElement(body, "collision")
-    ElementTree.SubElement(collision, "origin", rpy="0 0 0", xyz=" ".join(repr(float(entry)) for entry in point))
+    ElementTree.SubElement(collision, "origin", rpy="0 0 0", xyz=numbers(point))
     geometry = ElementTree.SubElement(collision, "geometry")
     ElementTree.SubElement(geometry, "sphere", radius=repr(SPHERE_RADIUS))
     return ElementTree.tostring(root, encoding="unicode")

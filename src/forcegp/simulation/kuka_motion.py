@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.errors import MissingExtra, RobotModelError, SimulationError
+from forcegp.robots.xml_text import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import (
     BulletContact,
@@ -64,7 +65,7 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     _write_inertial(base, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     joint = (
         f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
-        f'<origin rpy="0 0 0" xyz="{_numbers((0.0, 0.0, config.base_height))}"/></joint>'
+        f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, config.base_height))}"/></joint>'
     )
     root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
@@ -78,13 +79,9 @@ def _write_inertial(
 ) -> None:
     ixx, iyy, izz = map(float, moments)
     inertial[:] = ElementTree.fromstring(
-        f'<inertial><origin rpy="0 0 0" xyz="{_numbers(center_of_mass)}"/><mass value="{float(mass)}"/>'
+        f'<inertial><origin rpy="0 0 0" xyz="{numbers(center_of_mass)}"/><mass value="{float(mass)}"/>'
         f'<inertia ixy="0" ixz="0" iyz="0" ixx="{ixx}" iyy="{iyy}" izz="{izz}"/></inertial>'
     )
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
 
 
 STEPS_PER_REPORT = 240

@@ -17,7 +17,7 @@ from forcegp.data import Dataset
 from forcegp.errors import NumericalError
 from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, fixed_point
 from forcegp.robots import Robot, parameters_from_physical
-from forcegp.robots.inertia import pseudo_inertia
+from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.simulation.recording import RATE, recorded
 from forcegp.simulation.scenarios import QuadrupedConfig
 
@@ -65,10 +65,7 @@ def _loaded(robot: Robot, payload: float) -> Robot:
     size = payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])
     total = pseudo_inertia(trunk.mass, np.array(trunk.center_of_mass), np.array(trunk.inertia))
     total = total + pseudo_inertia(payload, np.array(PLACE), size)
-    mass, center = total[3, 3], total[:3, 3] / total[3, 3]
-    central = total[:3, :3] - mass * np.outer(center, center)
-    inertia = np.trace(central) * np.eye(3) - central
-    values = (torch.as_tensor(x, dtype=torch.float64) for x in (mass, center, inertia))
+    values = (torch.as_tensor(x, dtype=torch.float64) for x in physical_of_pseudo_inertia(total))
     return robot.with_inertials({"trunk": parameters_from_physical(*values)})
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 import forcegp.mechanics
 from forcegp.simulation.bullet import ArmState
@@ -242,13 +242,4 @@ def rotation_vector(aim: Float[np.ndarray, "4"], present: Float[np.ndarray, "4"]
 
     `q` and `-q` are the same orientation; without choosing the sign the tool would turn the long way round.
     """
-    x, y, z, w = aim.tolist()
-    a, b, c, d = (present * (-1.0, -1.0, -1.0, 1.0)).tolist()  # the conjugate
-    real = w * d - x * a - y * b - z * c
-    imaginary = np.array([w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a, w * c + x * b - y * a + z * d])
-    if real < 0:
-        real, imaginary = -real, -imaginary
-    sine = math.sqrt(float(imaginary @ imaginary))
-    if sine < 1e-12:
-        return 2.0 * imaginary
-    return 2.0 * math.atan2(sine, real) / sine * imaginary
+    return (Rotation.from_quat(aim) * Rotation.from_quat(present).inv()).as_rotvec()

@@ -308,7 +308,7 @@ class Identification(Summary):
         other = ""
         if self.confounded:
             names, other = ", ".join(self.confounded), "other "
-            begin += f"The data do not identify {names}: an unknown share of the thrust takes its place. "
+            begin += f"The data do not identify {names}: forces of the prior do the same. "
         if not self.weak_directions:
             rest = len(self.units) > len(self.confounded)
             return f"{begin}{f'The data identify every {other}parameter that was learned.' if rest else ''}".strip()

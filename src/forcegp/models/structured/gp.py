@@ -30,7 +30,7 @@ from forcegp.models.search import (
 from forcegp.models.structured.marginal_likelihood import StructuredModel
 from forcegp.models.structured.physical_start import physical_start
 from forcegp.models.structured.posterior import StructuredPosterior
-from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts, warn_of_thrust
+from forcegp.models.structured.prior_checks import check_distance, check_prior, warn_of_contacts, warn_of_imitations
 from forcegp.models.structured.refinement import (
     fit_with_refined_loads,
     independent_rows,
@@ -317,7 +317,7 @@ class StructuredGP(StructuredModel):
                 objective, search.starts(kernels.initial_parameters() | learned_noise, fixed)
             )
             return fitted.condition(training, result.parameters | fixed, result, {**described, **of_search})
-        confounded = tuple(f"{link}.mass" for link in warn_of_thrust(self.prior, search.learn))
+        confounded = warn_of_imitations(likelihood, search.learn)
         strength = search.prior_strength
         physical, kernels, path = physical_start(search.learn, likelihood, learned_noise | fixed, strength)
         kernels = with_variance_priors(kernels) if search.hyperprior else kernels

@@ -4,16 +4,16 @@ import warnings
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, contact_doubts
 from forcegp.errors import ContactError, ContactWarning, DataWarning, InvalidInput
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models.identification.physical_parameters import Learned
+from forcegp.models.identification.physical_parameters import Learned, PhysicalParameters
 from forcegp.models.structured.components import term_slices
 from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, checked_values
 from forcegp.models.training_data import CONSTANT, TrainingData
-from forcegp.priors import BaseWrench, ForcePrior
 from forcegp.robots.structure import LinkInertia
 from forcegp.summary import listed
 
@@ -196,20 +196,64 @@ def warn_of_contacts(system: MechanicalSystem, dataset: Dataset) -> None:
         warnings.warn(str(doubt), ContactWarning, stacklevel=4)
 
 
-def warn_of_thrust(prior: ForcePrior, learned: Learned | Sequence[Learned]) -> tuple[str, ...]:
-    """Warn where masses are learned beside an unknown share of the thrust: c times both accelerate the same.
+IMITATED = 0.01
+"""Share of what a parameter does to the accelerations that is too small to be seen beside the forces of a prior."""
+CHANGE = 1e-4
+"""Of scaled parameters, for what they do."""
+TAKES_PART = 0.1
+"""Share of the largest part from which on an input is named."""
 
-    Returns their links.
+
+def warn_of_imitations(likelihood: MarginalLikelihood, learned: Learned | Sequence[Learned]) -> tuple[str, ...]:
+    """Warn of inertias of a robot whose base moves that forces of the prior can stand for; returns their names.
+
+    Where forces that are linear in inputs of the prior change all rows as a parameter does, no motion shows it: a
+    heavier drone with as much more thrust moves the same. Rows with as few equations as such forces have coefficients
+    show nothing of that.
     """
-    each = learned if isinstance(learned, Sequence) else (learned,)
-    masses = tuple(one.link for one in each if isinstance(one, LinkInertia) and "mass" in one.parts)
-    for term in prior.summands():
-        free = {"thrust", "actuation"} & set(term.inputs if isinstance(term, BaseWrench) else ())
-        if masses and free:
-            _warn(
-                f"the mass of {', '.join(masses)} is learned beside {type(term).__name__}, which depends on "
-                f"{' and '.join(sorted(free))}: a heavier robot with as much more thrust moves the same, so no motion "
-                "shows the mass. Where the thrust is known, leave that input out (inputs=...); else keep the mass."
-            )
-            return masses
-    return ()
+    links = [one for one in (learned if isinstance(learned, Sequence) else (learned,)) if isinstance(one, LinkInertia)]
+    robot = likelihood.system.robot
+    if robot.space.is_vector_space or not links or not likelihood.prior.latent_names(robot):
+        return ()
+    physical = PhysicalParameters.of(likelihood.system, links)
+    in_values = torch.as_tensor(torch.autograd.functional.jacobian(physical.values, physical.zero))
+
+    def accelerations(s: Tensor) -> Tensor:
+        return likelihood.dynamics(physical.tensors(s)).acceleration_map().offset.flatten()
+
+    with torch.no_grad():
+        forces, inputs = _linear_forces(likelihood)
+        steps = CHANGE * torch.eye(len(in_values), dtype=forces.dtype, device=forces.device)
+        scaled = torch.stack([accelerations(step) - accelerations(-step) for step in steps], -1)
+        change = scaled @ torch.linalg.inv(in_values)
+        parts = torch.linalg.lstsq(forces, change, driver="gelsd").solution
+        left, size = (torch.linalg.vector_norm(x, dim=0) for x in (change - forces @ parts, change))
+    imitated = ((left <= IMITATED * size) & (size > INVISIBLE * size.max())).tolist()
+    names = tuple(name for name, hidden in zip(physical.names, imitated, strict=True) if hidden)
+    if not names or len(forces) <= forces.shape[1]:
+        return ()
+    share = parts[:, imitated].abs().amax(1)
+    which = list(dict.fromkeys(inputs[k] for k in torch.nonzero(share >= TAKES_PART * share.max())[:, 0].tolist()))
+    _warn(
+        f"{', '.join(names)}: forces of the prior in proportion to {_few(which)} move the robot just as another value "
+        "does (a heavier robot with as much more thrust moves the same), so no motion shows it. Where they are known, "
+        "leave these inputs out (inputs=...); else keep the value."
+    )
+    return names
+
+
+def _linear_forces(likelihood: MarginalLikelihood) -> tuple[Float[Tensor, "equations n"], list[str]]:
+    """Columns of unit length: accelerations of all rows by forces that are linear in one input; their inputs.
+
+    Constant forces belong to them, but where inputs are only scaled, since zero means something there.
+    """
+    prior, robot, dynamics = likelihood.prior, likelihood.system.robot, likelihood.dynamics()
+    W, labels, scalings = dynamics.H @ prior.mixing(dynamics), prior.feature_names(robot), prior.scalings(robot)
+    columns, inputs = [], list[str]()
+    for k, z in enumerate(prior.features(dynamics)):
+        ways = {scalings[k]} if isinstance(scalings[k], str) else {*scalings[k]}
+        constant = [] if ways == {"scale"} and z.shape[-1] else ["a constant"]
+        inputs += [*(labels[k] if labels else (f"feature {j}" for j in range(z.shape[-1]))), *constant]
+        columns.append(W[:, :, k, None] * torch.cat([z, z.new_ones(len(z), len(constant))], -1)[:, None])
+    forces = torch.cat(columns, -1).flatten(0, 1)
+    return forces / torch.linalg.vector_norm(forces, dim=0).clamp_min(torch.finfo(forces.dtype).tiny), inputs
