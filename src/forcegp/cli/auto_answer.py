@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
 import forcegp
@@ -11,6 +12,7 @@ import forcegp.checks
 import forcegp.data
 from forcegp.cli.import_log import stance_text
 from forcegp.cli.terminal import number
+from forcegp.summary import listed
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
 FIXED, MOVING = "torque-all", "both-all"  # how the robot is identified
@@ -120,10 +122,19 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
             against = "" if urdf is None or best == "analytical" else f", with the URDF alone by {urdf:.2g}"
             if urdf is None and score is _motion and "analytical" in models:
                 against = "; with the URDF alone they diverge"
-            worse = error is not None and error >= 1.0
-            doubt = f" But no acceleration at all has a lower error: nRMSE {error:.3g}." if worse else ""
+            doubt = _no_better_than_rest(models[best], dataset) if error is not None and error >= 1.0 else ""
             return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}.{doubt}"
     return f"Trust the model “{name}”."
+
+
+def _no_better_than_rest(model: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
+    """Which joints make the mean error of the acceleration larger than that of no acceleration at all."""
+    each = zip(dataset.joint_names, (error["median"] for error in model["nrmse_per_joint"]), strict=True)
+    errors = {name: error for name, error in each if error is not None}
+    above = [f"{name} {error:.3g}" for name, error in errors.items() if error >= 1.0]
+    others = [error for error in errors.values() if error < 1.0]
+    rest = f"; in the median {median(others):.2g} at the others" if others else ""
+    return f" But no acceleration at all has a lower error at {listed(above)} (nRMSE{rest})."
 
 
 def _motion(model: Mapping[str, Any] | None) -> float | None:
