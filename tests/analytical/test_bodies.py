@@ -1,8 +1,10 @@
 """Coordinates of bodies: derivatives by finite differences, distances by their definition, links that share a body."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
+from scipy.optimize import minimize_scalar
 from tests.models.arm import URDF
 from tests.robots.robot_models import TREE
 
@@ -56,6 +58,33 @@ def test_distance_is_that_of_the_metric():
     for found, start in zip(ours.pseudo_inertias(x), ours.pseudo_inertias(np.zeros(30)), strict=True):
         wanted += float(squared_distance(log_cholesky(found), log_cholesky(start)))
     assert (ours.distance(x)[0] ** 2).sum() == pytest.approx(wanted, rel=1e-9)
+
+
+def test_mass_that_no_motion_shows_lies_where_the_distance_is_least():
+    """A point of mass between two links, as Pinocchio writes it, against a search along this one line."""
+    ours, x = bodies(ConsistentBodies), 0.3 * np.random.default_rng(2).normal(size=30)
+    points = np.array([0.1, 0.02, -0.05]), np.array([0.0, -0.03, 0.04])
+    unseen = np.zeros((30, 1))
+    for body, (sign, point) in enumerate(zip((1, -1), points, strict=True)):
+        mass = pin.Inertia(1.0, point, np.zeros((3, 3))).toDynamicParameters()
+        unseen[10 * body : 10 * body + 10, 0] = sign * mass
+    start, reference = ours.pseudo_inertias(x), ours.pseudo_inertias(np.zeros(30))
+
+    def cost(mass):
+        total = 0.0
+        for body, sign in ((0, 1), (1, -1)):
+            at = np.append(points[body], 1.0)
+            pseudo = start[body] + sign * mass * np.outer(at, at)
+            if np.linalg.eigvalsh(pseudo)[0] <= 0.0:
+                return 1e9
+            total += float(squared_distance(log_cholesky(pseudo), log_cholesky(reference[body])))
+        return total
+
+    wanted = min(np.linspace(-3, 3, 601), key=cost)
+    wanted = minimize_scalar(cost, bounds=(wanted - 0.01, wanted + 0.01), method="bounded").x
+    found = ours.parameters(ours.nearest(x, unseen)) - ours.parameters(x)
+    assert abs(wanted) > 0.01
+    np.testing.assert_allclose(found.ravel(), wanted * unseen[:, 0], atol=1e-4 * abs(wanted))
 
 
 def test_equal_eigenvalues_have_a_derivative():

@@ -362,6 +362,34 @@ def test_feet_that_carry_and_are_flagged_as_swinging_are_named(walker):
         identify_analytical(replace(log, u=lifted, a=0.0 * log.a))
 
 
+LINK = """<link name="{}"><inertial><origin xyz="0 0 {}"/><mass value="{}"/>
+<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+HINGE = """<joint name="{}" type="continuous"><parent link="{}"/><child link="{}"/><origin xyz="{}"/>
+<axis xyz="{}"/></joint>"""
+
+
+def test_masses_of_links_that_motions_do_not_show_stay_those_of_the_file():
+    """A flying arm that carries .4 kg: mass on the axis of a joint may belong to either link, and the prior decides."""
+
+    def flying(load):
+        links = LINK.format("body", 0.01, 2.5, 0.04, 0.05, 0.07), LINK.format("upper", -0.1, 0.3, 0.002, 0.002, 0.0004)
+        fore = pin.Inertia(0.2, np.array([0, 0, -0.08]), np.diag([0.001, 0.001, 0.0002]))
+        fore += pin.Inertia(load, np.array([0, 0, -0.2]), load * np.diag([0.0015, 0.0015, 0.001]))
+        inertia = np.diag(fore.inertia)
+        hinges = HINGE.format("shoulder", "body", "upper", "0.05 0 -0.05", "0 1 0")
+        hinges += HINGE.format("elbow", "upper", "fore", "0 0 -0.2", "1 0 0")
+        last = LINK.format("fore", fore.lever[2], fore.mass, *inertia)
+        robot = Robot.from_urdf_text(f'<robot name="r">{"".join(links)}{last}{hinges}</robot>', base="floating")
+        return MechanicalSystem(robot, (), (Actuation(np.eye(8), tuple("xyzabcse")), RigidBodyBias()))
+
+    log = recorded(flying(0.4), 2000, noise=1e-3, switches=0)
+    found = identify_analytical(log, flying(0.0), friction=(), rotors=None)
+    assert found.fit.settled
+    masses, errors = found.parameters[:, 0], [found.standard_errors[f"{n}.m"] for n in ("body", "upper", "fore")]
+    np.testing.assert_allclose(masses[:2], [2.5, 0.3], atol=0.1)
+    assert (abs(masses - [2.5, 0.3, 0.6]) < 3.0 * np.array(errors)).all()
+
+
 @pytest.mark.parametrize(("drag", "warned"), [(0.0, False), (2.0, True)])
 def test_ground_friction_of_a_base_in_a_plane_is_no_mass(drag, warned):
     """Newton's law for a plate of 5 kg in its own axes, under forces on it and friction against its velocity."""

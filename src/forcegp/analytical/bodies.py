@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import norm
 from scipy.linalg import block_diag
 from typing_extensions import override
 
@@ -36,6 +37,9 @@ for _k, (_i, _j) in enumerate(zip(_ROWS, _COLUMNS, strict=True)):
     _SYMMETRIC[_k, _i, _j] = _SYMMETRIC[_k, _j, _i] = 1.0 if _i == _j else 0.5**0.5
 # places of d1, d2, d3, s12, s23, s13, t1, t2, t3 in the log-Cholesky factor
 _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+
+MOST_MOVES, NO_MOVE = 30, 1e-6
+"""Steps towards the reference, and the change of a coordinate, or share of a step, that ends them."""
 
 
 class BodyCoordinates(ABC):
@@ -60,6 +64,10 @@ class BodyCoordinates(ABC):
     def derivatives(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10 10"]:
         """Derivatives of each body's standard parameters (second axis) in its coordinates (third)."""
         return self._standard(self._pseudo_inertia_derivatives(x)).swapaxes(-1, -2)
+
+    def nearest(self, x: Float[np.ndarray, " k"], unseen: Float[np.ndarray, "k m"]) -> Float[np.ndarray, " k"]:
+        """The coordinates nearest to the reference among those reached along `unseen` directions of the parameters."""
+        return x
 
     @abstractmethod
     def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
@@ -127,6 +135,35 @@ class ConsistentBodies(BodyCoordinates):
         moved = vectors[:, None] @ inside @ turned[:, None]
         jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved))
         return np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel(), jacobian
+
+    @override
+    def nearest(self, x: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+        # least squares in x creep along such directions, which are curves there and straight lines of the parameters
+        for _ in range(MOST_MOVES):
+            distance, slope = self.distance(x)
+            along = slope @ np.linalg.solve(block_diag(*self.derivatives(x)), unseen)
+            step = unseen @ np.linalg.lstsq(along, -distance)[0]
+            at, share = self.parameters(x), 1.0
+            there = self._coordinates(at + step.reshape(at.shape))
+            while share > NO_MOVE and (there is None or norm(self.distance(there)[0]) > norm(distance)):
+                share *= 0.5
+                there = self._coordinates(at + share * step.reshape(at.shape))
+            if there is None or share <= NO_MOVE or norm(there - x) < NO_MOVE:
+                return x
+            x = there
+        return x
+
+    def _coordinates(self, parameters: Float[np.ndarray, "n 10"]) -> Float[np.ndarray, " k"] | None:
+        """None where a body is impossible."""
+        inverse = np.linalg.inv(self.factors)
+        pseudo = (parameters @ np.linalg.pinv(self._to_standard).T).reshape(-1, 4, 4)
+        try:
+            F = upper_cholesky(inverse @ pseudo @ inverse.swapaxes(-1, -2))
+        except np.linalg.LinAlgError:
+            return None
+        scaled = np.stack([F[:, i, j] / F[:, 3, 3] for i, j in _PLACES], axis=1)
+        scaled[:, :3] = np.log(scaled[:, :3])
+        return np.concatenate([np.log(F[:, 3, 3:]), scaled], axis=1).ravel()
 
     @override
     def _pseudo_inertia_derivatives(self, x: np.ndarray) -> np.ndarray:

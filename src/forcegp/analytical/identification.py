@@ -33,6 +33,9 @@ SEARCHES = 20
 """Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
 STEPS = 6
 """Evaluations in each, since the next one begins with other accelerations; twice as many after a search in vain."""
+UNSEEN, SOME = 1e-9, 500
+"""Relative size of what no motion shows: mass on the axis of a joint belongs to either of its links, for
+instance; and the rows of which it is found."""
 REACHED = 0.02
 """They end where a step is to lower the cost by fewer nats per coordinate: each is within a fifth of its error."""
 
@@ -135,6 +138,11 @@ def identify_analytical(
         jacobian[..., split:] = in_terms
         return r, jacobian
 
+    in_parameters = block_diag(*bodies.derivatives(np.zeros(split)))
+    some = regressor[:: -(-len(regressor) // SOME)].reshape(-1, split) @ in_parameters
+    _, sizes, directions = np.linalg.svd(some, full_matrices=len(some) < split)
+    unseen = in_parameters @ directions[np.count_nonzero(sizes > UNSEEN * sizes.max()) :].T
+
     center, spread = terms.prior()
     weight = prior_strength**0.5
 
@@ -161,6 +169,7 @@ def identify_analytical(
             options: dict[str, Any] = {"known": np.ones(a.shape[1]), "evaluations": steps}
         else:
             options = {"robust": robust, "held": held if likelihood == "torque" else None, "progress": progress}
+        start = np.concatenate([bodies.nearest(start[:split], unseen), start[split:]])
         return weighted_least_squares(white, prior, start, bounds, longest=longest, **options)
 
     def search_with_noise_in_both(x: np.ndarray) -> tuple[Fit, NoiseLevels]:
