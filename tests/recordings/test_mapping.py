@@ -229,7 +229,7 @@ ARM = (
 def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
     columns = {"time": np.arange(3.0), "pos_shoulder": np.zeros(3), "eff_shoulder": np.zeros(3)}
     source = open_source(write_text(tmp_path / "log.csv", columns))
-    with pytest.raises(InvalidInput, match=r"no columns for q .*named after finger \(--lock"):
+    with pytest.raises(InvalidInput, match=r"no columns for q .*named after finger \(`locked`"):
         signal_plan(ColumnMapping(), source, MechanicalSystem(Robot.from_urdf_text(ARM)))
     held = MechanicalSystem(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
     assert signal_plan(ColumnMapping(), source, held).guessed[1] == "u = eff_shoulder"  # as ROS abbreviates effort

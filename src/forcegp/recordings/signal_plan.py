@@ -126,12 +126,12 @@ def signal_plan(
             raise InvalidInput(
                 f"no columns for {signal} ({why}); name them with --{signal}"
                 + (
-                    f", in the order {', '.join(log[signal])} (angles: --orientation)"
+                    f", in the order {', '.join(log[signal])} (angles: `orientation`)"
                     if robot is not None and robot.space.groups
                     else ""
                 )
                 + f". {source.path} has {listed(source.columns(), MOST_NAMES)}"
-                + f"; no column is named after {listed(lacking)} (--lock holds what was not recorded)"
+                + f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
                 * (0 < len(lacking) < len(joints))
                 + "."
             )
