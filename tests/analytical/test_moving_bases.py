@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from scipy.linalg import null_space
+from scipy.linalg import eigh, null_space
 from tests.mechanics.test_thrusters import DRONE
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
@@ -374,6 +374,42 @@ def test_feet_that_carry_and_are_flagged_as_swinging_are_named(walker):
     lifted[:, -2:] = 0.0
     with pytest.warns(DataWarning, match="9.* m/s.2 on average: what holds it up .* Check flags of stance"):
         identify_analytical(replace(log, u=lifted, a=0.0 * log.a))
+
+
+LINK = """<link name="{}"><inertial><origin xyz="0 0 {}"/><mass value="{}"/>
+<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+HINGE = """<joint name="{}" type="continuous"><parent link="{}"/><child link="{}"/><origin xyz="{}"/>
+<axis xyz="{}"/></joint>"""
+
+
+def test_masses_of_links_that_motions_do_not_show_stay_those_of_the_file():
+    """A flying arm that carries 2 kg: mass on the axis of a joint may belong to either link, and the prior decides."""
+
+    def flying(load):
+        links = LINK.format("body", 0.01, 2.5, 0.04, 0.05, 0.07), LINK.format("upper", -0.1, 0.3, 0.002, 0.002, 0.0004)
+        fore = pin.Inertia(0.2, np.array([0, 0, -0.08]), np.diag([0.001, 0.001, 0.0002]))
+        fore += pin.Inertia(load, np.array([0, 0, -0.2]), load * np.diag([0.0015, 0.0015, 0.001]))
+        inertia = np.diag(fore.inertia)
+        hinges = HINGE.format("shoulder", "body", "upper", "0.05 0 -0.05", "0 1 0")
+        hinges += HINGE.format("elbow", "upper", "fore", "0 0 -0.2", "1 0 0")
+        last = LINK.format("fore", fore.lever[2], fore.mass, *inertia)
+        robot = Robot.from_urdf_text(f'<robot name="r">{"".join(links)}{last}{hinges}</robot>', base="floating")
+        return MechanicalSystem(robot, (), (Actuation(np.eye(8), tuple("xyzabcse")), RigidBodyBias()))
+
+    log = recorded(flying(2.0), 2000, noise=1e-3, switches=0)
+    found = identify_analytical(log, flying(0.0), friction=(), rotors=None)
+    assert found.fit.settled
+    np.testing.assert_allclose(found.parameters[:2, 0], [2.5, 0.3], atol=0.1)
+    bodies, at = found.bodies, found.bodies.pseudo_inertias(found.fit.x[: found.bodies.size])
+    reference, shoulder = bodies.pseudo_inertias(np.zeros(bodies.size)), ((0.05, 0, -0.05, 1), (0, 0, 0, 1))
+
+    def distance(mass):  # affine-invariant, of what moves the same
+        moved = at + np.stack(
+            [sign * mass * np.outer(p, p) for sign, p in zip((1, -1), shoulder, strict=True)] + [0 * at[0]]
+        )
+        return sum((np.log(eigh(*pair, eigvals_only=True)) ** 2).sum() for pair in zip(moved, reference, strict=True))
+
+    assert distance(0.0) < min(distance(0.02), distance(-0.02))
 
 
 @pytest.mark.parametrize(("drag", "warned"), [(0.0, False), (2.0, True)])

@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.recordings.log_files import JOINTS, motion, table, write_text
 
+from forcegp import MechanicalSystem, Robot
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings import ColumnMapping, mapping_text, open_source, read_mapping
 from forcegp.recordings.column_names import expanded, guessed_columns, guessed_time, listed, parse_expression
 from forcegp.recordings.mapping import UNITS, by_quantity, factors_of, log_unit, mapping_of
+from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
 
@@ -213,3 +215,30 @@ def test_a_joint_is_not_found_in_a_longer_name(tmp_path):
     names = [f"q_joint{index}" for index in range(1, 12)]
     source = open_source(write_text(tmp_path / "log.csv", {name: np.arange(3.0) for name in names}))
     assert guessed_columns("q", ("joint1", "joint11"), source) == ("q_joint1", "q_joint11")
+
+
+BODY = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
+JOINT = """<link name="{1}">{2}</link><joint name="{0}" type="continuous"><parent link="base"/><child link="{1}"/>
+<axis xyz="0 1 0"/></joint>"""
+ARM = (
+    f'<robot name="arm"><link name="base">{BODY}</link>'
+    f"{JOINT.format('shoulder', 'arm', BODY)}{JOINT.format('finger', 'tip', BODY)}</robot>"
+)
+
+
+def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
+    columns = {"time": np.arange(3.0), "pos_shoulder": np.zeros(3), "eff_shoulder": np.zeros(3)}
+    source = open_source(write_text(tmp_path / "log.csv", columns))
+    with pytest.raises(InvalidInput, match=r"no columns for q .*named after finger \(`locked`"):
+        signal_plan(ColumnMapping(), source, MechanicalSystem(Robot.from_urdf_text(ARM)))
+    held = MechanicalSystem(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
+    assert signal_plan(ColumnMapping(), source, held).guessed[1] == "u = eff_shoulder"  # as ROS abbreviates effort
+
+
+def test_the_order_of_columns_of_a_base_is_stated(tmp_path):
+    columns = {name: np.zeros(3) for name in ("time", "x", "y", "yaw", "q_shoulder", "q_finger")}
+    source = open_source(write_text(tmp_path / "log.csv", columns))
+    with pytest.raises(InvalidInput, match=r"in the order base.x, base.y, base.yaw, shoulder, finger"):
+        signal_plan(
+            ColumnMapping(orientation="angles"), source, MechanicalSystem(Robot.from_urdf_text(ARM, base="planar"))
+        )

@@ -119,10 +119,11 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
 
 
 def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """A base that floats and does not fall, although no foot, thruster or known force of the system carries it."""
+    """A base that no foot, wheel, thruster or known force of the system moves, although it does not fall or drives."""
     robot, groups = system.robot, system.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
-    if not groups or groups[0].kind != "floating" or not weight:
+    planar = bool(groups) and groups[0].kind == "planar"
+    if not planar and (not groups or groups[0].kind != "floating" or not weight):
         return
     complete, feet = dataset.u.shape[1] == len(system.inputs), {contact.switch for contact in system.touching}
     if None in feet or (feet and not complete):
@@ -131,19 +132,32 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     if flags.any(1).mean() > 0.5:  # the median window shows less of flight
         return
     group = groups[0]
-    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][3:], MOST_FORCES)
+    linear = 2 if planar else 3
+    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][linear:], MOST_FORCES)
     inputs = dataset.u if complete else np.zeros((len(dataset), len(system.inputs)))
     q, v, u, a = (windows.of_signal(x).to(robot.device) for x in (dataset.q, dataset.v, inputs, dataset.a))
 
     def missing(inputs: Tensor) -> Tensor:
         """The linear part of M a less what the system knows of, in the axes of the base, in N."""
         dynamics = system.dynamics(q, v, inputs)
-        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :3].cpu()
+        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :linear].cpu()
 
     def size(force: Tensor) -> float:
         return float(torch.linalg.vector_norm(windows.mean(force), dim=-1).median())
 
     found, thrusters = size(missing(u)), sorted(thruster_columns(system)) if complete else []
+    if planar:
+        needed = size(robot.mass * a[:, group.rows][:, :linear].cpu())
+        if found > CARRIED * needed:
+            yield look(
+                subject="base force",
+                seen=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the system explains "
+                f"(its acceleration takes {needed:.3g} N); masses found from this log would be wrong.",
+                remedy="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
+                "For the arm alone, record it while the base stands, and leave out --base and the columns of the base.",
+                numbers={"force": found, "needed": needed},
+            )
+        return
     if found <= CARRIED * weight:
         return
     numbers, weighs = {"force": found, "weight": weight}, f"(the robot weighs {weight:.3g} N)"

@@ -85,11 +85,16 @@ def _choices(pattern: str, inside: str, joints: Sequence[str]) -> list[str]:
 WORDS = {
     "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
     "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
-    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "joint_torque", "joint_effort"},
+    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
     "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
     "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
 }
 """What the rest of a column's name, beside that of the joint, must mean."""
+
+
+def named_after(joint: str) -> re.Pattern[str]:
+    """Matches the joint's name where no letter or digit continues it."""
+    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])")
 
 
 def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple[str, ...] | None:
@@ -97,7 +102,7 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
     templates: dict[tuple[str, str], dict[str, str]] = {}
     for column in source.columns():
         for joint in joints:
-            for found in re.finditer(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])", column):
+            for found in named_after(joint).finditer(column):
                 around = column[: found.start()], column[found.end() :]
                 templates.setdefault(around, {})[joint] = column
     fitting = [

@@ -12,7 +12,14 @@ import forcegp.robots
 from forcegp.data import FrozenDict
 from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, units_for, validated_units
 from forcegp.errors import InvalidInput
-from forcegp.recordings.column_names import LinearExpression, expanded, guessed_columns, guessed_time, parse_expression
+from forcegp.recordings.column_names import (
+    LinearExpression,
+    expanded,
+    guessed_columns,
+    guessed_time,
+    named_after,
+    parse_expression,
+)
 from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping, LogUnit, log_unit
 from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, layout_of
 from forcegp.recordings.source import Columns, Source
@@ -115,9 +122,18 @@ def signal_plan(
         found["u"] = [*found.get("u", ()), *[LACKING] * switches]
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
         if signal not in found and (system is None or log[signal]):
+            lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
             raise InvalidInput(
-                f"no columns for {signal} ({why}); name them with --{signal}. "
-                f"{source.path} has {listed(source.columns(), MOST_NAMES)}."
+                f"no columns for {signal} ({why}); name them with --{signal}"
+                + (
+                    f", in the order {', '.join(log[signal])} (angles: `orientation`)"
+                    if robot is not None and robot.space.groups
+                    else ""
+                )
+                + f". {source.path} has {listed(source.columns(), MOST_NAMES)}"
+                + f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
+                * (0 < len(lacking) < len(joints))
+                + "."
             )
     if system is None and not joints:
         example = ",".join(f"joint{index + 1}" for index in range(len(found["q"])))
