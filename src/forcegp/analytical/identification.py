@@ -19,6 +19,7 @@ from forcegp.data import Dataset, thruster_columns
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.mechanics import MechanicalSystem
+from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
 Inertias = Literal["consistent", "free"]
@@ -99,7 +100,7 @@ def identify_analytical(
                 f"prior_strength is {prior_strength}; it must be > 0, since data never determine all of it."
             )
         require_type("robust", robust, bool)
-        rows = min(ROWS, EQUATIONS // system.robot.nv) if rows is None else rows
+        rows = rows_at_most(system.robot) if rows is None else rows
         if whole_number("rows", rows, 0) < 1:
             raise InvalidInput(f"rows is {rows}; it must be at least 1.")
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(rows, len(dataset))).astype(int))
@@ -208,6 +209,11 @@ def identify_analytical(
     if not system.robot.space.is_vector_space:
         _warn_of_what_holds_it_up(found, recorded, a)
     return found
+
+
+def rows_at_most(robot: Robot) -> int:
+    """Rows that are used where the caller gives no number."""
+    return min(ROWS, EQUATIONS // robot.nv)
 
 
 def joint_terms(

@@ -12,6 +12,7 @@ that stand are left out before (`recorded_rows`). Without a `baseline` the links
 are estimated, too, and an error that both logs share is not mistaken for the payload.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from scipy.stats import t as student
 
 from forcegp.analytical.bodies import ConsistentBodies, thickened, with_bodies
 from forcegp.analytical.identifiability import body_pseudo_inertias, standard_parameters
-from forcegp.analytical.identification import ROWS, identify_analytical, joint_terms
+from forcegp.analytical.identification import identify_analytical, joint_terms, rows_at_most
 from forcegp.analytical.least_squares import Fit, weighted_least_squares
 from forcegp.analytical.payload_doubts import warn_of_no_body, warn_of_offsets
 from forcegp.analytical.payload_link import most_likely, possible_links
@@ -114,8 +115,9 @@ def identify_payload(
     link: str | None = None,
     friction: tuple[str, ...] = LAWS,
     rotors: Literal["armature", "rotor"] | None = "armature",
-    rows: int = ROWS,
+    rows: int | None = None,
     identified: AnalyticalIdentification | None = None,
+    progress: Callable[[int, float], None] | None = None,
 ) -> PayloadEstimate:
     """Mass, centre of mass and inertia of a payload on `link`, with friction and rotor inertia estimated along.
 
@@ -127,8 +129,9 @@ def identify_payload(
     link: what carries it. None is the base that moves, or the link at which joints end or part, that explains most
         (`forcegp.analytical.payload_link`).
     friction, rotors: as for `identify_analytical`.
-    rows: use so many of each log at most, evenly spread.
+    rows: use so many of each log at most, evenly spread; None as for `identify_analytical`.
     identified: what `identify_analytical` found in `dataset`, if it is there already; of use where the base moves.
+    progress: called by `identify_analytical`, which is most of the work where the base moves.
 
     Standard errors come from leaving out each twentieth of the logs in turn (block jackknife; Kuensch 1989, "The
     jackknife and the bootstrap for general stationary observations"), so that errors of the friction law, which last,
@@ -144,6 +147,7 @@ def identify_payload(
             require_rows(name, log, system.robot.joint_names, "the robot")
             if len(log) < 10 * STRETCHES:
                 raise DatasetError(f"{name} has {len(log)} rows; a payload needs {10 * STRETCHES} or more.")
+        rows = rows_at_most(system.robot) if rows is None else rows
         if whole_number("rows", rows, 0) < 10 * STRETCHES:
             raise InvalidInput(f"rows is {rows}; it must be at least {10 * STRETCHES}.")
         if identified is not None:
@@ -169,7 +173,7 @@ def identify_payload(
         parts = np.split(np.arange(len(a)), np.flatnonzero(np.diff(holds)) + 1)
         states = [(q[at], v[at], u[at], a[at]) for at in parts]
         found = [
-            identify_analytical(log, system, friction=friction, rotors=rotors, likelihood="both")
+            identify_analytical(log, system, friction=friction, rotors=rotors, likelihood="both", progress=progress)
             if identified is None or log is not dataset
             else identified
             for log in logs

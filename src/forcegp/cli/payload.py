@@ -13,6 +13,7 @@ import forcegp
 import forcegp.analytical
 from forcegp.atomic_files import write_json, write_text
 from forcegp.cli.command import DATASET, Overwriting, listed, unless_given
+from forcegp.cli.identify import rounds_reported
 from forcegp.cli.input_options import SYSTEM_FILE, PreparationOptions, RobotOptions
 from forcegp.cli.learning_options import friction_laws
 from forcegp.cli.terminal import Terminal, columns
@@ -57,8 +58,9 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
         notes: list[str] = []
         system, rows = self._rows(terminal, self.data, notes)
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
-        with terminal.progress("identifying"):
-            found = forcegp.analytical.identify_payload(rows, system, baseline=baseline, link=self.link, friction=laws)
+        with terminal.progress("identifying", may_end_early=True) as report:
+            how: dict[str, Any] = {"link": self.link, "friction": laws, "progress": rounds_reported(report)}
+            found = forcegp.analytical.identify_payload(rows, system, baseline=baseline, **how)
         content = {"data": str(self.data), **found.to_dict()}
         if self.out is not None:
             given = {"command": self.words("baseline", "link", "friction", "cutoff", "delay")}
