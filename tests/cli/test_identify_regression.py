@@ -70,7 +70,8 @@ def test_the_report_and_least_squares_that_belong_to_no_robot(forcegp, folder):
     assert not (folder / "numbers" / "identified.urdf").exists()
     assert "coulomb [Nm]" in done.stdout
     assert "base parameters, condition number" in done.stdout
-    assert "Directions that the prior decides" in done.stdout
+    assert "Directions of single bodies that the prior decides" in done.stdout
+    assert "together it decides" in done.stdout  # of a fixed arm always some
     row = next(line for line in done.stdout.splitlines() if line.split()[:1] == ["hand"])
     assert re.search(r"\d ± \S+( +-?\d+\.\d ± \S+,?){3} +\d+ of 10", row), row
 

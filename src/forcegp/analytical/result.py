@@ -148,7 +148,10 @@ class AnalyticalIdentification(Summary):
 
     @cached_property
     def weak_directions(self) -> tuple[tuple[str, float], ...]:
-        """Bodies and the number of their ten directions of which the data hold less than the prior, worst first."""
+        """Bodies and the number of their ten directions of which the data hold less than the prior, worst first.
+
+        The other bodies count as known: mass on the axis of a joint may still belong to either link.
+        """
         out = []
         for body, name in enumerate(body_names(self.given.robot)):
             own = slice(10 * body, 10 * body + 10)

@@ -200,7 +200,11 @@ def _report_of_regression(
         f"{content['cpu_seconds']:.1f} s CPU{'' if content['converged'] else ', not converged'}."
     )
     weak = ", ".join(f"{name} ({count:.0f} of 10)" for name, count in found.weak_directions)
-    lines = [summary, f"Directions that the prior decides, not the data: {weak or 'none'}."]
+    numbers = 10 * len(forcegp.analytical.body_names(found.given.robot))
+    lines = [summary, f"Directions of single bodies that the prior decides, not the data: {weak or 'none'}."]
+    if base.rank < numbers:
+        shared = "mass on the axis of a joint may belong to either of its links"
+        lines.append(f"Of all bodies' {numbers} numbers together it decides {numbers - base.rank}: {shared}.")
     if found.given.robot.base != "fixed":
         lines.append("Mass of all bodies: {:.4g} ± {:.2g} kg, ± standard error.".format(*found.total_mass))
     if found.thickened:
