@@ -103,7 +103,8 @@ def test_documents_of_any_shape_are_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize(
-    "text", ["q: !!timestamp x\n", "step: []\n", "step: [1, 2]\n", "step: !!int ''\n", "- " * 5000 + "a"]
+    "text",
+    ["q: !!timestamp x\n", "step: []\n", "step: [1, 2]\n", "step: !!int ''\n", "- " * 5000 + "a", "step: " + "9" * 900],
 )
 def test_mappings_of_any_shape_are_refused(tmp_path, text):
     (tmp_path / "log.yaml").write_text(text)
@@ -210,6 +211,7 @@ WRONG = {
     "KukaSurfaceConfig": {"null_space_joints": None},
     "WeakForm": {"signal": np.ones(3)},
     "Coefficients": {"joints": 5},
+    "JointFriction": {"joints": torch.tensor(5.0)},
 }
 
 

@@ -148,6 +148,7 @@ class FunctionalPosterior(FactorizedPosterior):
             S = functionals.covariance(kernels(terms.features))
             factor = factorize(lambda: 0.5 * (S + S.mT))
             alpha = factor.solve(functionals.t.reshape(-1, 1))
-            beta = torch.cat([functionals.back(c, alpha) for c in range(terms.W.shape[-1])], dim=-1)
+            each = (functionals.back(c, alpha) for c in range(terms.W.shape[-1]))
+            beta = torch.cat([alpha.new_zeros(len(terms.W), 0), *each], dim=-1)  # known forces alone have no latent
         system = FunctionalSystem(functionals, factor, alpha[:, 0], beta)
         return cls(kernels, tuple(z.detach() for z in terms.features), system)

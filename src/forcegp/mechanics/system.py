@@ -1,7 +1,7 @@
 """`MechanicalSystem`: a robot, its contacts and the known forces, as one immutable value that files can carry."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,7 @@ from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface
 from forcegp.mechanics.thrusters import FADES, OBSERVED, ObservedWrench, Thrusters
 from forcegp.mechanics.wheels import WHEEL, RollingContact
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import Inertials, JointValues, Positions
+from forcegp.robots.arguments import Inertials, JointValues, Positions, is_sequence
 from forcegp.robots.mjcf import is_mjcf
 from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.urdf_file import read_text
@@ -61,10 +61,10 @@ class MechanicalSystem(Summary):
             require_type("baumgarte", self.baumgarte, Baumgarte)
         for name, kind in (("contacts", Contact), ("known_forces", KnownForce)):
             given = getattr(self, name)
-            values = tuple(given) if isinstance(given, Iterable) else (given,)
+            values = tuple(given) if is_sequence(given) else (given,)
             nested = (value if isinstance(value, tuple | list) else (value,) for value in values)
             values = tuple(each for several in nested for each in several)
-            if not isinstance(given, Iterable) or not all(isinstance(value, kind) for value in values):
+            if not is_sequence(given) or not all(isinstance(value, kind) for value in values):
                 raise InvalidInput(f"{name} is {given!r}; give a sequence of {kind.__name__} objects.")
             object.__setattr__(self, name, values)
         object.__setattr__(self, "known_forces", tuple(force.bound_to(self.robot) for force in self.known_forces))

@@ -2,7 +2,7 @@
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from itertools import accumulate, pairwise
 from typing import Any, Literal
@@ -17,6 +17,7 @@ from forcegp.errors import InvalidInput
 from forcegp.mechanics import ConstrainedDynamics, MechanicalSystem
 from forcegp.priors.kernels import kernel_of
 from forcegp.robots import Robot
+from forcegp.robots.arguments import is_sequence
 
 Scaling = Literal["standardize", "scale", "none"]
 """How a model prepares the features of a latent for its kernel, from the training points: shift to mean 0 and divide by
@@ -108,7 +109,7 @@ class SumPrior(ForcePrior):
     terms: tuple[ForcePrior, ...]
 
     def __post_init__(self) -> None:
-        given = tuple(self.terms) if isinstance(self.terms, Iterable) else (self.terms,)
+        given: tuple[Any, ...] = tuple(self.terms) if is_sequence(self.terms) else (self.terms,)
         if not all(isinstance(term, ForcePrior) for term in given):
             kinds = ", ".join(type(term).__name__ for term in given)
             raise InvalidInput(

@@ -1,7 +1,7 @@
 """Priors at the joints: on all of (q, v, u), of forces or accelerations, one function per joint, and no force."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal
@@ -19,6 +19,7 @@ from forcegp.priors.basic_kernels import periodic
 from forcegp.priors.force_prior import ExpressedKernels, ForcePrior, Scaling
 from forcegp.priors.kernels import check_kernel
 from forcegp.robots import Robot
+from forcegp.robots.arguments import is_sequence
 
 UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "a": ("rad/s^2", "m/s^2"), "u": ("Nm", "N")}
 """Of positions, velocities, accelerations and forces, for joints that turn and joints that slide."""
@@ -111,7 +112,7 @@ def as_names(given: object) -> tuple[Any, ...]:
     """One name, or several, as a tuple; empty for what is neither."""
     if isinstance(given, str):
         return (given,)
-    return tuple(given) if isinstance(given, Iterable) else ()
+    return tuple(given) if is_sequence(given) else ()
 
 
 def state_labels(robot: Robot) -> dict[str, tuple[str, ...]]:

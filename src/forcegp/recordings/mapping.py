@@ -392,5 +392,5 @@ def _number(key: str, value: Any) -> float:
         if isinstance(value, bool):
             raise ValueError
         return float(value)
-    except (TypeError, ValueError):
-        raise InvalidInput(f"{key} is {value!r}; give a number.") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidInput(f"{key} is {value!r:.60}; give a number.") from None

@@ -6,8 +6,8 @@ other numbers than were meant is refused: text, dates, booleans, complex numbers
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -18,6 +18,11 @@ from forcegp.errors import ForceGPError, InvalidInput, UnknownJoint, require_kno
 
 LARGEST = 2**63 - 1
 """Of the integers that every library takes."""
+
+
+def is_sequence(given: object) -> TypeGuard[Iterable[Any]]:
+    """Whether there is something to iterate over; tensors and arrays without dimensions only look so."""
+    return isinstance(given, Iterable) and getattr(given, "ndim", 1) != 0
 
 
 def real_array(name: str, given: Any, kinds: str = "fiu", error: type[ForceGPError] = InvalidInput) -> np.ndarray:
