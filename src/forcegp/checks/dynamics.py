@@ -20,7 +20,7 @@ LEAST_SHARE = 0.02  # of the mass of the last link and of the moving inertia: le
 
 
 def dynamics_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
-    """Payload at the last link, rotor inertia and friction, from a log with the errors corrected that were found."""
+    """Payload, rotor inertia and friction, from a log with the errors corrected that were found."""
     if inputs.prepared is None or inputs.contacts:
         return
     rows = log.correction.applied(inputs.prepared.dataset)
