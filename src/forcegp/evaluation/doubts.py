@@ -107,10 +107,12 @@ def poor_scores(posterior: Posterior, dataset: Dataset, scores: Mapping[str, Any
         if scores.get(name) is None or not (inside.mean() < FEWEST_INSIDE or inside.min() < least):
             continue
         places = [f"{names[joint]} {inside[joint]:.0%}" for joint in np.argsort(inside) if inside[joint] < least]
-        of = f" ({listed(places)})" if places else ""
+        hidden = inside.mean() >= FEWEST_INSIDE
+        of = f"{', but fewer at some joints' if hidden else ''} ({listed(places)})" if places else ""
+        there = " at these" if hidden else ""
         yield (
-            f"the 95 % intervals hold {inside.mean():.0%} of the {what}{of}: the model is "
-            "overconfident; a force is missing, the noise is larger than stated, or these motions are new to it"
+            f"the 95 % intervals hold {inside.mean():.0%} of the {what}{of}: the model is overconfident{there}; "
+            "a force is missing, the noise is larger than stated, or these motions are new to it"
         )
 
 
