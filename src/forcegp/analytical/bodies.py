@@ -65,11 +65,15 @@ class BodyCoordinates(ABC):
     def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
         """P of every body."""
 
-    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """x + step to first order, where parameters change by exactly their derivatives times the step, if a body can.
+    def moved(self, x: Float[np.ndarray, " n"], step: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """x + step to first order; x are these coordinates, then any others, which change by the step.
 
-        Torque is linear in parameters: with many rows of little noise, straight lines in x leave its narrow valley.
+        Parameters change by exactly their derivatives times the step, if a body can. Torque is linear in them: with
+        many rows of little noise, straight lines in x leave its narrow valley.
         """
+        return np.concatenate([self._moved(x[: self.size], step[: self.size]), x[self.size :] + step[self.size :]])
+
+    def _moved(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         return x + step
 
     @abstractmethod
@@ -115,7 +119,7 @@ class ConsistentBodies(BodyCoordinates):
         return self._congruent(_log_cholesky(x)[0])
 
     @override
-    def moved(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def _moved(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         inner, derivatives = _log_cholesky(x)
         inner = inner + np.einsum("nk,nkab->nab", step.reshape(-1, 10), derivatives)
         there, values = (x + step).reshape(-1, 10), np.linalg.eigvalsh(inner)

@@ -148,9 +148,6 @@ def identify_analytical(
     longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
     bounds = np.concatenate([np.full(split, -np.inf), low]), np.concatenate([np.full(split, np.inf), high])
 
-    def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.concatenate([bodies.moved(x[:split], step[:split]), x[split:] + step[split:]])
-
     def search(
         start: np.ndarray,
         whitening: np.ndarray | None = None,
@@ -165,7 +162,7 @@ def identify_analytical(
             options: dict[str, Any] = {"known": np.ones(a.shape[1]), "evaluations": steps}
         else:
             options = {"robust": robust, "held": held if likelihood == "torque" else None, "progress": progress}
-        return weighted_least_squares(white, prior, start, bounds, longest=longest, moved=moved, **options)
+        return weighted_least_squares(white, prior, start, bounds, longest=longest, moved=bodies.moved, **options)
 
     def search_with_noise_in_both(x: np.ndarray) -> tuple[Fit, NoiseLevels]:
         noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, not robust

@@ -188,6 +188,7 @@ def identify_payload(
     links = body_pseudo_inertias(robot).cpu().numpy()
     regressor = recorded.regressor(likely_a, (*terms.bodies, *carriers))
     regressor[:, :, len(links) :] *= holds[:, None, None, None]
+    place = 0
     if len(candidates) > 1:
         r, in_links, in_terms = recorded.in_torque(
             standard_parameters(robot).cpu().numpy(), terms.start(), likely_a, regressor[:, :, : len(links)]
@@ -195,8 +196,6 @@ def identify_payload(
         unknown = in_terms if baseline is None else np.concatenate([in_terms, in_links.reshape(*r.shape, -1)], axis=-1)
         place = most_likely(equations(regressor[:, :, len(links) :]), equations(r + from_noise), equations(unknown))
         regressor = np.delete(regressor, [len(links) + k for k in range(len(candidates)) if k != place], axis=2)
-    else:
-        place = 0
     link = candidates[place]
     offset = np.linalg.inv(robot.layout.child_frames[carriers[place]]) @ robot.layout.links[link].offset
     usual = _usual(offset)[None]
@@ -226,10 +225,7 @@ def identify_payload(
     longest = np.concatenate([np.full(split, bodies.longest_step), terms.longest_steps])
     start = np.concatenate([np.zeros(split), terms.start()])
 
-    def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.concatenate([bodies.moved(x[:split], step[:split]), x[split:] + step[split:]])
-
-    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest, moved=moved)
+    fit = weighted_least_squares(residual, prior, start, bounds, longest=longest, moved=bodies.moved)
 
     def numbers(x: np.ndarray) -> np.ndarray:
         return _numbers(bodies.pseudo_inertias(x[:split])[-1], offset)

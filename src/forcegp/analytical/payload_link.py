@@ -11,7 +11,7 @@ CLEARLY = 10.0
 """Nats by which another link must explain more than the usual one."""
 
 
-def usual_link(robot: Robot) -> str:
+def _usual_link(robot: Robot) -> str:
     """A base that moves, else of the last joint the last link of the file.
 
     Joints that move several bodies, as those of fingers, count as none, if there are others: what fingers hold moves
@@ -25,7 +25,7 @@ def usual_link(robot: Robot) -> str:
 
 def possible_links(robot: Robot) -> tuple[str, ...]:
     """The usual one, then those behind which chains of joints end or part: hands, feet, trunks."""
-    usual, children = usual_link(robot), np.bincount([body for body in robot.layout.parents if body >= 0])
+    usual, children = _usual_link(robot), np.bincount([body for body in robot.layout.parents if body >= 0])
     ends = [body for body in _alone(robot) if body >= len(children) or children[body] != 1]
     at_usual = robot.layout.links[usual].body
     return (usual, *(robot.layout.bodies[body].child for body in ends if body != at_usual))
@@ -41,15 +41,14 @@ def most_likely(
     Joints are weighted by what payloads on all links together leave. The first link is taken but where another one
     explains `CLEARLY` more.
     """
-    size = np.sqrt((others**2).sum((0, 1), keepdims=True)).clip(1e-300)
-    all_of_them = np.concatenate([others / size, payloads.reshape(*residual.shape, -1)], axis=-1)
+    all_of_them = np.concatenate([others, payloads.reshape(*residual.shape, -1)], axis=-1)
     noise = np.ones(residual.shape[1])
     for _ in range(3):  # weights change what is left, a little
         left = left_by_least_squares(all_of_them / noise[:, None], residual / noise)[0] * noise
         noise = np.sqrt((left**2).mean(0)).clip(1e-9 * np.sqrt((residual**2).mean()) + 1e-300)
     costs = []
     for k in range(payloads.shape[2]):
-        columns = np.concatenate([payloads[:, :, k], others / size], axis=-1)
+        columns = np.concatenate([payloads[:, :, k], others], axis=-1)
         left, found = left_by_least_squares(columns / noise[:, None], residual / noise)
         costs.append(0.5 * float((left**2).sum()) if found[0] > 0.0 or k == 0 else np.inf)
     best = int(np.argmin(costs))

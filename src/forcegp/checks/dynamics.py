@@ -27,7 +27,7 @@ def dynamics_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     try:
         late = estimate_delay(rows, log.robot).significant
         rows = shifted(rows, np.full(rows.nv, late))
-        with warnings.catch_warnings():  # offsets that hide a payload make its standard error large: no finding
+        with warnings.catch_warnings():  # of what hides a payload: the finding states what it rests on
             warnings.simplefilter("ignore", DataWarning)
             found = identify_payload(rows, MechanicalSystem(log.robot), rows=ROWS)
     except (ForceGPError, np.linalg.LinAlgError):

@@ -7,10 +7,10 @@ from typing import Any
 from forcegp.evaluation.metrics import formatted, markdown_table, number
 
 
-def alike(told: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
+def alike(texts: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
     """Texts and what they are about, in groups whose texts differ in numbers alone."""
     groups: dict[str, list[tuple[str, Any]]] = {}
-    for text, about in told:
+    for text, about in texts:
         groups.setdefault(re.sub(r"\d[\d.e+-]*", "#", text), []).append((text, about))
     return list(groups.values())
 

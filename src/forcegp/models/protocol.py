@@ -47,8 +47,6 @@ class Posterior(MotionModel, Summary, ABC):
     """
 
     model: Any  # the Model, of which every subclass names its own
-    training: TrainingData
-    """The rows that the model was trained on."""
     parameters: Mapping[str, Tensor]
     settings: Mapping[str, Any]
     result: OptimizationResult
@@ -61,6 +59,11 @@ class Posterior(MotionModel, Summary, ABC):
     def system(self) -> MechanicalSystem:
         """The robot, contacts and known forces."""
         return self.model.system
+
+    @property
+    @abstractmethod
+    def training(self) -> TrainingData:
+        """The rows that the model was trained on."""
 
     @property
     @abstractmethod

@@ -136,7 +136,7 @@ class IndependentPosterior(Posterior):
 
     @property
     @override
-    def training(self) -> TrainingData:  # type: ignore[override]  # a field there, read only
+    def training(self) -> TrainingData:
         return self.likelihood.training
 
     @property

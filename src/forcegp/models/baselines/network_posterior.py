@@ -90,11 +90,16 @@ class NetworkPosterior(Posterior):
     """
 
     model: NetworkModel
-    training: TrainingData
+    data: TrainingData
     parameters: Mapping[str, Tensor]
     result: OptimizationResult
     settings: Mapping[str, Any]
     predicts_forces: ClassVar[bool] = False
+
+    @property
+    @override
+    def training(self) -> TrainingData:
+        return self.data
 
     @property
     @override

@@ -84,7 +84,7 @@ class StructuredPosterior(Posterior):
 
     @property
     @override
-    def training(self) -> TrainingData:  # type: ignore[override]  # a field there, read only
+    def training(self) -> TrainingData:
         return self.likelihood.training
 
     @property
