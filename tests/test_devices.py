@@ -16,8 +16,6 @@ from forcegp.mechanics import CoulombJointFriction, ViscousJointFriction
 from forcegp.models import (
     IndependentGP,
     MarginalLikelihood,
-    NetworkEnsemble,
-    NeuralNetwork,
     StructuredGP,
     TrainingData,
     load_posterior,
@@ -218,13 +216,11 @@ def test_inducing_points_on_the_pretended_device():
         torch.testing.assert_close(found.covariance.inner, expected.covariance, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("model", [IndependentGP, NeuralNetwork, NetworkEnsemble])
-def test_other_models_on_the_pretended_device(model):
-    data = arm_data(24, seed=5)
-    settings, how = ({}, {"restarts": 1, "options": QUICK}) if model is IndependentGP else ({"steps": 3}, {})
-    expected = model(data.system, **settings).fit(data, **how)
+def test_independent_processes_on_the_pretended_device():
+    data, how = arm_data(24, seed=5), {"restarts": 1, "options": QUICK}
+    expected = IndependentGP(data.system).fit(data, **how)
     with pretend_device():
-        fitted = model(data.system.to(PRETEND), **settings).fit(data, **how)
+        fitted = IndependentGP(data.system.to(PRETEND)).fit(data, **how)
         for posterior in (fitted, expected.to(PRETEND)):
             mean = posterior.predict(data.q[:3], data.v[:3], data.u[:3]).mean
             torch.testing.assert_close(

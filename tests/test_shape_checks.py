@@ -26,7 +26,6 @@ from forcegp import (
     IndependentGP,
     JointForces,
     JointFriction,
-    NetworkEnsemble,
     NoForces,
     Noise,
     StructuredGP,
@@ -63,7 +62,6 @@ def whole_way() -> None:
         free = replace(data, system=data.system.with_contacts(()), truth={}) if compiled else data
         identify_analytical(free, friction=("viscous",)).scores(free)
         compare_priors(data, {"one": prior, "none": NoForces()}, points=20, restarts=1)
-        evaluate(NetworkEnsemble(data.system, steps=2).fit(data), data)
         evaluate(IndependentGP(data.system).fit(data, points=20, restarts=1), data)
         posterior = StructuredGP(data.system, prior, noise=Noise(0.05)).fit(data, points=64, restarts=1)
         evaluate(posterior, data)

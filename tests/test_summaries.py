@@ -10,7 +10,6 @@ from tests.models.arm import arm_data, arm_system
 from forcegp import (
     Coefficients,
     IndependentGP,
-    NeuralNetwork,
     StructuredGP,
     ViscousJointFriction,
     check,
@@ -41,7 +40,6 @@ def shown(data):
         "Dataset": data,
         "StructuredPosterior": posterior,
         "IndependentPosterior": IndependentGP(data.system).fit(data, **quick),
-        "NetworkPosterior": NeuralNetwork(data.system, steps=3).fit(data),
         "Prediction": prediction,
         "Gaussian": prediction.unknown_force,
         "Evaluation": evaluate(posterior, arm_data(10, 1)),
@@ -61,7 +59,6 @@ FACTS = {
     "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
     "StructuredPosterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
     "IndependentPosterior": ["learned from: 20 rows"],
-    "NetworkPosterior": ["learned from: 20 rows"],
     "Prediction": ["batch: (20,)", "entries: 3", "forces: multiplier, contact_force, unknown_force"],
     "Gaussian": ["batch: (20,)", "largest std"],
     "Evaluation": ["rows: 10", "mae: ", "noise floor 0.0399", "coverage 95: ", "warnings: "],
@@ -133,8 +130,8 @@ def test_batches_of_several_dimensions_and_single_states(shown, data):
     assert torch.equal(whole[..., 2].mean, whole.mean[:, 2])  # never an entry of the acceleration
     single = posterior.predict(data.q[0], data.v[0], data.u[0])
     assert torch.equal(single[...].mean, single.mean)
-    network = shown["NetworkPosterior"].predict(data.q, data.v, data.u)
-    assert network[2].unknown_force is None
+    black_box = shown["IndependentPosterior"].predict(data.q, data.v, data.u)
+    assert black_box[2].unknown_force is None
 
 
 def test_states_that_are_not_there(shown):
@@ -146,12 +143,11 @@ def test_states_that_are_not_there(shown):
 
 def test_models_without_forces_state_that_they_have_no_components(shown, data):
     state = (data.q, data.v, data.u)
-    for name in ("IndependentPosterior", "NetworkPosterior"):
-        for call in (
-            lambda model: model.components(*state),
-            lambda model: model.curve("friction"),
-            lambda model: model.with_contacts([]),
-            lambda model: model.with_robot(data.system.robot),
-        ):
-            with pytest.raises(ForceGPError, match=r"^a .*; (use|fit) "):
-                call(shown[name])
+    for call in (
+        lambda model: model.components(*state),
+        lambda model: model.curve("friction"),
+        lambda model: model.with_contacts([]),
+        lambda model: model.with_robot(data.system.robot),
+    ):
+        with pytest.raises(ForceGPError, match=r"^a .*; (use|fit) "):
+            call(shown["IndependentPosterior"])

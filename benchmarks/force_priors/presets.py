@@ -23,7 +23,7 @@ SEARCH = FitSettings(restarts={"0": 4, "200": 2, "400": 1}, iterations=200, tole
 FORCES: dict[str, Any] = {"data": DATA, "settings": SEARCH, "seeds": SEEDS}
 
 SMALL_DATA = DataSettings(train_seconds=5.0, rows=200, test_seconds=5.0, every=12)
-SMALL_SEARCH = FitSettings(restarts={"0": 1}, iterations=15, tolerance={"0": 1e-6}, network_steps=100)
+SMALL_SEARCH = FitSettings(restarts={"0": 1}, iterations=15, tolerance={"0": 1e-6})
 SMALL: dict[str, Any] = {"data": SMALL_DATA, "settings": SMALL_SEARCH, "seeds": (201,)}
 
 PRESETS: dict[str, tuple[ForceExperiment, ...]] = {

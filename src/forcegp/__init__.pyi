@@ -49,8 +49,6 @@ from .models import Noise as Noise
 from .models import Coefficients as Coefficients
 from .models import StructuredGP as StructuredGP
 from .models import IndependentGP as IndependentGP
-from .models import NeuralNetwork as NeuralNetwork
-from .models import NetworkEnsemble as NetworkEnsemble
 from .models import save_posterior as save_posterior
 from .models import load_posterior as load_posterior
 from .models import casadi_function as casadi_function

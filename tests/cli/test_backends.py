@@ -33,7 +33,7 @@ def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
         (("--backend", "dask"), "no backend 'dask'; choose serial, joblib"),
         (("--jobs", 0), "jobs is 0; give"),
         (("--backend", "serial", "--jobs", 2), "choose joblib"),
-        (("--model", "neural-network", "--backend", "joblib"), "--backend means nothing to --model neural-network"),
+        (("--model", "analytical", "--backend", "joblib"), "--backend means nothing to --model analytical"),
     ],
 )
 def test_options_that_cannot_be_meant_are_one_line(folder, words, message, monkeypatch, capsys):

@@ -1,7 +1,6 @@
 """The commands from end to end on real files."""
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import os
@@ -92,23 +91,21 @@ MODELS = {
     "unconstrained": ("--iterations", "3", "--restarts", "1"),
     "analytical": ("--noise", "learned"),
     "independent-gp": ("--iterations", "3", "--restarts", "2"),
-    "neural-network": ("--iterations", "40"),
-    "ensemble": ("--iterations", "40", "--points", "60"),
 }
 
 
-DRAWN = ("unconstrained", "ensemble")
+DRAWN = ("unconstrained", "independent-gp")
 """One that finds forces and one that does not; pictures take most of the time."""
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_is_fitted_scored_and_shown_by_the_same_commands(workshop, forcegp, tmp_path, model):
     run, figures = tmp_path / "run", tmp_path / "figures"
-    words = (*(() if model == "ensemble" else ("--points", "15")), *MODELS[model])
-    fitted = forcegp("fit", "train.h5", "--model", model, *words, "--out", run, "--json", folder=workshop)
+    words = ("--model", model, "--points", 15, *MODELS[model])
+    fitted = forcegp("fit", "train.h5", *words, "--out", run, "--json", folder=workshop)
     assert fitted.returncode == 0, fitted.stderr
     summary = json.loads(fitted.stdout)
-    assert summary["points"] == (60 if model == "ensemble" else 15)
+    assert summary["points"] == 15
     config = json.loads((run / "config.json").read_text())
     assert config["options"]["model"] == model
     assert config["options"]["mean"] == ("analytical" if model == "structured" else None)
@@ -118,7 +115,7 @@ def test_every_model_is_fitted_scored_and_shown_by_the_same_commands(workshop, f
     scores = json.loads(done.stdout)
     assert scores["model"] == summary["model"] == load_posterior(run).description
     assert len(scores["mae_per_joint"]) == 7
-    black_box = model in ("independent-gp", "neural-network", "ensemble")
+    black_box = model == "independent-gp"
     assert (scores["unknown_force_mae"] is None) == (scores["multiplier_mae"] is None) == black_box
     assert (scores["constraint_error"] > 1e-6) == black_box
     if model in DRAWN:
@@ -128,18 +125,6 @@ def test_every_model_is_fitted_scored_and_shown_by_the_same_commands(workshop, f
     shown = forcegp("evaluate", run, "test.h5", "--every", 40, folder=workshop)
     assert shown.returncode == 0, shown.stderr
     assert summary["model"] in shown.stdout
-
-
-def test_networks_take_all_rows_by_default_and_estimate_a_noise_that_is_not_stated(workshop, forcegp, tmp_path):
-    data = dataclasses.replace(Dataset.load(workshop / "train.h5"), noise_std=None)
-    data.save(tmp_path / "bare.h5")
-    words = ("--model", "neural-network", "--iterations", 50, "--out", "run")
-    done = forcegp("fit", "bare.h5", *words, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "neural network, learned from 480 points" in done.stdout
-    posterior = load_posterior(tmp_path / "run")
-    assert posterior.model.noise is None
-    assert posterior.model.steps == posterior.result.evaluations == 50
 
 
 def test_testing_on_the_training_data_is_said(workshop, forcegp):

@@ -58,7 +58,7 @@ def test_more_rows_than_memory_holds_is_one_line(forcegp, folder):
         (("--engine", "fast"), "engine"),
         (("--learning-points", "1"), "learning_points is 1"),
         (("--model", "independent-gp", "--engine", "inducing"), "--engine means nothing to --model independent-gp"),
-        (("--model", "ensemble", "--learning-points", "9"), "--learning-points means nothing to --model ensemble"),
+        (("--model", "analytical", "--learning-points", "9"), "--learning-points means nothing to --model analytical"),
     ],
 )
 def test_what_is_wrong_is_one_line(capsys, folder, monkeypatch, words, message):

@@ -24,7 +24,7 @@ def refused(words):
 @pytest.mark.parametrize(
     ("words", "field", "entries"),
     [
-        ("validate x.h5 --out r --models analytical,ensemble", "models", ("analytical", "ensemble")),
+        ("validate x.h5 --out r --models analytical,joint", "models", ("analytical", "joint")),
         (
             "validate x.h5 --out r --models a@identified:viscous,load,joint:inputs=q/v,kernel=k,b/motions",
             "models",

@@ -52,7 +52,7 @@ def test_an_identification_refined_on_motions(forcegp, folder):
     [
         (("fit", "log.h5", "--motions", 0, "--points", 20), "--motions is 0; give the length"),
         (("fit", "log.h5", "--motions", 99, "--points", 20), "no stretch of 99 s has equal steps"),
-        (("fit", "log.h5", "--model", "neural-network", "--motions", 1), "--motions means nothing to"),
+        (("fit", "log.h5", "--model", "independent-gp", "--motions", 1), "--motions means nothing to"),
         (("identify", "log.h5", "--model", "least-squares", "--motions", 1), "use --model consistent"),
         (("identify", "log.h5", "--model", "analytical", "--motions", 1), "use forcegp fit --motions"),
     ],

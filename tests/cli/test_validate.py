@@ -126,9 +126,9 @@ def test_the_same_command_goes_on_and_another_is_refused(forcegp, found, folder)
 def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder):
     words = ["validate", "raw.h5", "--robot", "arm.urdf", "--out", "raw", "--seeds", 1, *QUICK]
     words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.05]
-    done = forcegp(*words, "--models", "analytical,ensmble", folder=folder)
+    done = forcegp(*words, "--models", "analytical,indepndent-gp", folder=folder)
     assert done.returncode == 2
-    assert "did you mean 'ensemble'" in done.stderr
+    assert "did you mean 'independent-gp'" in done.stderr
     done = forcegp(*words, "--models", "analytical,payload:frame=hand", folder=folder)
     assert done.returncode == 0, done.stderr
     assert re.search(r"analytical\s+\d+\.\d+", done.stdout)

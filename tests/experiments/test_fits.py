@@ -5,7 +5,7 @@ import json
 import pytest
 
 from forcegp.data import farthest_rows
-from forcegp.experiments.fits import MODELS, NETWORKS, FitSettings, fit_series, fit_to_all, fitted
+from forcegp.experiments.fits import MODELS, FitSettings, fit_series, fitted
 
 SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, tolerance={"0": 1e-6, "400": 1e-5})
 
@@ -18,12 +18,6 @@ def test_the_largest_key_that_does_not_exceed_the_points_counts(points, restarts
     assert SETTINGS.of(points) == {"restarts": restarts, "iterations": 50, "tolerance": tolerance}
     stored = json.loads(json.dumps(SETTINGS.of(points)))
     assert stored == SETTINGS.of(points)
-
-
-def test_networks_are_told_their_steps_only_where_the_preset_has_some():
-    stated = FitSettings({"0": 1}, 5, {"0": 1e-6}, network_steps=100)
-    specs = [fit_to_all(NETWORKS[0], "data/seed3", 3, settings).spec for settings in (SETTINGS, stated)]
-    assert [spec.get("steps") for spec in specs] == [None, 100]
 
 
 def test_a_series_begins_where_the_fit_with_fewer_points_ended():
@@ -41,6 +35,6 @@ def test_a_series_begins_where_the_fit_with_fewer_points_ended():
 def test_every_model_of_the_experiments_can_be_fitted(motion, model):
     """A few steps each; `analytical-fitted` is identified, and once a change of `fit` stopped it without a test."""
     rows = farthest_rows(motion, 20)
-    search = {"steps": 2} if model in NETWORKS else {"restarts": 1, "iterations": 2, "tolerance": 1e-2}
+    search = {"restarts": 1, "iterations": 2, "tolerance": 1e-2}
     posterior = fitted({"model": model, "seed": 0, **search}, rows)
     assert posterior.predict(motion.q[:2], motion.v[:2], motion.u[:2]).mean.shape == (2, 7)

@@ -282,10 +282,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda **k: forcegp.IndependentGP(**k).fit(INPUTS.data, **FIT),
         lambda: {"system": INPUTS.data.system, "inputs": ("q",), "noise": None},
     ),
-    "NeuralNetwork": (
-        lambda **k: forcegp.NeuralNetwork(**k).fit(INPUTS.data),
-        lambda: {"system": INPUTS.data.system, "width": 3, "steps": 2, "batch": 5, "rate": 0.01},
-    ),
     "OptimizerOptions": (
         _options,
         lambda: {

@@ -28,7 +28,7 @@ FILES = (
     "log.npz",
     "log.mcap",
 )
-NAMES = "carried network nowhere train.h5/x . .. hostile.pkl loop out.h5 out carried/model.json - -x ~"
+NAMES = "carried independent nowhere train.h5/x . .. hostile.pkl loop out.h5 out carried/model.json - -x ~"
 AIR = ("aerodynamic", "aerodynamic:frame=body", "aerodynamic:observe=0", "aerodynamic:observe=-1", "aerodynamic:")
 AIR += ("aerodynamic:observe=nan", "aerodynamic:frame=x", "aerodynamic:observe", "aerodynamic+aerodynamic")
 AIR += ("aerodynamic:height=1", "aerodynamic:inputs=x", "aerodynamic + base-wrench", "floating", "planar", "spherical")
@@ -152,7 +152,7 @@ def check(case: Line, folder: Path) -> None:
     words = words_of(case)
     if words[0] in ("simulate", "demo", "reproduce", "validate") and words[0] == case.command:
         words = [word for word in words if word not in LARGE] + ["--none-such", "1"]  # a run takes seconds to hours
-    for name in (*FILES, "carried", "network"):
+    for name in (*FILES, "carried", "independent"):
         source = INPUTS.folder / name
         (shutil.copytree if source.is_dir() else shutil.copyfile)(source, folder / name)
     (folder / "hostile.pkl").write_bytes(hostile_pickle())

@@ -32,13 +32,13 @@ from forcegp.mechanics import (
     fixed_point,
     loop_point,
 )
-from forcegp.models import IndependentGP, NeuralNetwork, Noise, StructuredGP, save_posterior
+from forcegp.models import IndependentGP, Noise, StructuredGP, save_posterior
 from forcegp.priors.named import named_prior
 from forcegp.robots import Robot
 from forcegp.simulation import QuadrotorConfig
 from forcegp.simulation.quadrotor import simulate_quadrotor
 
-MODELS = ("structured", "carried", "independent", "network")
+MODELS = ("structured", "carried", "independent")
 QUICK = OptimizerOptions(iterations=2)
 INPUTS: Any = SimpleNamespace(folder=None)
 """`folder` with the files below, `data`, `posterior`, `predictor`; filled by `make`."""
@@ -60,7 +60,6 @@ def make(folder: Path) -> None:
         "structured": structured,
         "carried": plain.with_system(MechanicalSystem(heavier, data.system.contacts, data.system.known_forces)),
         "independent": IndependentGP(data.system).fit(data, points=8, restarts=1, options=QUICK),
-        "network": NeuralNetwork(data.system, width=4, steps=2).fit(data),
     }
     for name, model in models.items():
         save_posterior(model, folder / name)

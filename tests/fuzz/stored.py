@@ -18,7 +18,6 @@ from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, XML_EDITS, Damage, damag
 
 from forcegp import MechanicalSystem, load_posterior
 from forcegp.atomic_files import write_digests
-from forcegp.models import NeuralNetwork  # noqa: F401  KINDS needs it
 
 TENSORS = "tensors.safetensors"
 CHANGES = {

@@ -191,7 +191,6 @@ WRONG = {
     "ToolForces": {"axes": np.ones(3)},
     "Baumgarte": {"omega": 2**63},
     "Baumgarte ": {"omega": 1e308},
-    "NeuralNetwork": {"width": 2**63},
     "Payload": {"moments": np.ones(3)},
     "named_prior": {"expression": 5},
     "Preparation": {"order": 2, "trim": 10**30, "delay": 10**30},

@@ -10,7 +10,7 @@ from tests.models.arm import arm_data, arm_system
 from forcegp.data import time_blocks
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions, negative_log_likelihood
-from forcegp.models import IndependentGP, NeuralNetwork, Noise, StructuredGP
+from forcegp.models import IndependentGP, Noise, Posterior, StructuredGP
 from forcegp.priors import JointAccelerations, NoForces
 
 QUICK = OptimizerOptions(iterations=15)
@@ -98,6 +98,7 @@ def test_rows_beside_each_other_in_time_flatter_a_model_that_only_remembers():
     assert posterior.leave_out(blocks).total < posterior.leave_out().total
 
 
-def test_a_network_cannot_leave_rows_out(train):
-    with pytest.raises(InvalidInput, match="a neural network would have to be trained again"):
-        NeuralNetwork(train.system, steps=2).fit(train).leave_out()
+def test_a_model_without_a_closed_form_says_so(train):
+    posterior = IndependentGP(train.system).fit(train, restarts=1, options=OptimizerOptions(iterations=1))
+    with pytest.raises(InvalidInput, match="would have to be trained again"):
+        Posterior.leave_out(posterior)

@@ -10,9 +10,9 @@ from tests.models.arm import arm_data, arm_system
 
 from forcegp import (
     Dataset,
+    IndependentGP,
     JointFriction,
     MechanicalSystem,
-    NeuralNetwork,
     NoForces,
     Robot,
     StructuredGP,
@@ -217,9 +217,9 @@ def test_what_cannot_be_refined_is_refused(along_the_law):
     zero = StructuredGP(slide(1.0, 1.0), mean="zero", noise=QUIET).fit(short, points=20, restarts=1)
     with pytest.raises(InvalidInput, match="fit with mean='analytical'"):
         zero.refined_on_motions(along_the_law)
-    network = NeuralNetwork(slide(1.0, 1.0), steps=5).fit(short)
+    black_box = IndependentGP(slide(1.0, 1.0)).fit(short, points=20, restarts=1)
     with pytest.raises(InvalidInput, match="no forces that motions could refine"):
-        network.refined_on_motions(along_the_law)
+        black_box.refined_on_motions(along_the_law)
     learned = StructuredGP(slide(1.0, 1.0), NoForces(), noise=QUIET).identify(
         short, learn=[slide(1.0, 1.0).robot.link("cart").inertial("mass")], restarts=1
     )

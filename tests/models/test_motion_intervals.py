@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from tests.models import floating_arm
-from tests.models.test_motion_fit import QUIET, bump, line, recording, slide
+from tests.models.test_motion_fit import QUIET, bump, recording, slide
 
-from forcegp import JointFriction, NeuralNetwork, NoForces, StructuredGP, load_posterior, save_posterior
+from forcegp import IndependentGP, JointFriction, NoForces, StructuredGP, load_posterior, save_posterior
 from forcegp.data.motion_records import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.rollout_scores import interval_about, rollout_errors
@@ -86,9 +86,9 @@ def test_recordings_that_cannot_teach_it_are_refused(log):
         plain.calibrated_on_motions(log, (9.0,))
     with pytest.raises(InvalidInput, match="horizons are"):
         plain.calibrated_on_motions(log, (0.0,))
-    network = NeuralNetwork(slide(3.0, 4.0), steps=2).fit(recording(line, 3, 1.0))
+    black_box = IndependentGP(slide(3.0, 4.0)).fit(log, points=20, restarts=1)
     with pytest.raises(InvalidInput, match="take a StructuredGP or an analytical model"):
-        network.calibrated_on_motions(log)
+        black_box.calibrated_on_motions(log)
     swapped = replace(log.rows(np.arange(len(log))[::-1]), system=log.system)
     with pytest.raises(InvalidInput, match="not in the order of time"):
         plain.calibrated_on_motions(swapped, HORIZONS)

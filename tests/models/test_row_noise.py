@@ -18,8 +18,6 @@ from forcegp.inference import OptimizerOptions
 from forcegp.models import (
     IndependentGP,
     MarginalLikelihood,
-    NetworkEnsemble,
-    NeuralNetwork,
     Noise,
     StructuredGP,
     TrainingData,
@@ -196,15 +194,6 @@ def test_independent_processes_weigh_rows_by_their_noise(train):
         covariance = K + torch.diag(t.noise_std[:, joint] ** 2)
         total -= multivariate_normal(np.zeros(20), covariance.numpy()).logpdf(t.a[:, joint].numpy())
     assert fitted.negative_log_likelihood == pytest.approx(total, rel=1e-9)
-
-
-@pytest.mark.parametrize("network", [NeuralNetwork, NetworkEnsemble])
-def test_networks_take_the_level_alone(train, network):
-    level = dataclasses.replace(train, noise_std=train.noise_level)
-    one, other = (network(train.system, steps=20).fit(rows, seed=1) for rows in (train, level))
-    torch.testing.assert_close(one.noise_std, torch.tensor(train.noise_level), rtol=1e-12, atol=0)
-    states = train.q, train.v, train.u
-    torch.testing.assert_close(one.predict(*states).mean, other.predict(*states).mean, rtol=0, atol=0)
 
 
 def test_a_noise_that_only_data_can_tell_is_none_without_them():

@@ -40,7 +40,7 @@ def test_unknown_laws_are_named(name):
         candidates([name], given_system())
 
 
-@pytest.mark.parametrize("name", ["analytical/motions", "independent-gp/motions", "ensemble/motions"])
+@pytest.mark.parametrize("name", ["analytical/motions", "independent-gp/motions"])
 def test_models_without_anything_to_refine_are_refused(name):
     with pytest.raises(InvalidInput, match="no physics to refine on motions, or is the one that was given"):
         candidates([name], given_system())

@@ -63,7 +63,7 @@ class Fit(ModelOptions):
         prior_note, correlation_note, intervals_note = None, None, None
         if command.model == "structured" and not command.prior:
             command, prior_note = self._with_prior(command, dataset, system)
-        model = make_model(command, system.to(self.device), dataset)
+        model = make_model(command, system.to(self.device))
         # of functions of few inputs, inducing points stand for any number of rows
         few = isinstance(model, forcegp.StructuredGP) and forcegp.priors.has_few_inputs(model.prior, system.robot)
         all_rows = few and observe is None and command.points is None and command.engine in ("auto", "inducing")
@@ -110,9 +110,7 @@ def fit_with_progress(
     terminal: Terminal, model: Any, dataset: forcegp.Dataset, *, name: str = "fitting", **how: Any
 ) -> Any:
     """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
-    # networks have no options, but steps of their own
-    options: forcegp.inference.OptimizerOptions | None = how.get("options")
-    steps = model.steps if options is None else options.iterations
+    steps = how["options"].iterations
     wanted = how.get("restarts", 1)
     restarts = forcegp.models.default_restarts(how["points"]) if wanted is None else wanted
     with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
@@ -187,7 +185,7 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
         **({"engine": settings["engine_reason"]} if "engine_reason" in settings else {}),
         **({"refined": settings["refined"]} if "refined" in settings else {}),
         "restarts": posterior.settings.get("restarts", 1),
-        "iterations": len(result.history) - 1 if "optimizer" in posterior.settings else result.evaluations,
+        "iterations": len(result.history) - 1,
         "evaluations": result.evaluations,
         "converged": result.converged,
         "status": result.status,

@@ -18,18 +18,17 @@ from forcegp.cli.command import FIELDS, listed, numbers_of, unless_given
 from forcegp.cli.learning_options import LearningOptions
 from forcegp.errors import InvalidInput
 
-ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp", "neural-network", "ensemble"]
+ModelName = Literal["structured", "unconstrained", "analytical", "independent-gp"]
 
 LearnFrom = Literal["accelerations", "weak-form"]
 
-POINTS, NETWORK_POINTS = 200, 10_000
-POINTS_HINT = f"{POINTS}; all for functions of one or two inputs, as friction of the joints; networks {NETWORK_POINTS}"
+POINTS = 200
+POINTS_HINT = f"{POINTS}; all for functions of one or two inputs, as friction of the joints"
 PREFERRED = "joint-friction, in contact tool-friction, in flight aerodynamic, unless left-out rows prefer another"
 PRIORS = "NAME[:FIELD=VALUE,...],..."
 WINDOW = 0.1
 """Length of a window where none is given, in s."""
 ITERATIONS = 200
-ITERATIONS_HINT = f"{ITERATIONS}; networks 5000, ensembles 3000"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +55,7 @@ class ModelOptions(FitOptions):
     model: ModelName = "structured"
     """structured: Gaussian processes on the unknown forces, inside the dynamics and contacts that are known.
     unconstrained: on the acceleration that the robot would have without contacts. analytical: known physics alone.
-    independent-gp: one Gaussian process per joint, without physics. neural-network: one small network.
-    ensemble: several networks with variances."""
+    independent-gp: one Gaussian process per joint, without physics."""
     points: Annotated[int | None, unless_given("N", POINTS_HINT, int)] = None
     """Train on N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N as far as
     --engine is exact."""
@@ -82,15 +80,14 @@ class ModelOptions(FitOptions):
     motions: Annotated[float | None, unless_given("S", "none", float)] = None
     """After the fit, refine friction, inertias and unknown forces on the recorded positions, over windows of S seconds.
     See docs/how-to/motions.md."""
-    iterations: Annotated[int | None, unless_given("N", ITERATIONS_HINT, int)] = None
-    """Most L-BFGS iterations of each start, or training steps of a network."""
+    iterations: Annotated[int, arg(metavar="N")] = ITERATIONS
+    """Most L-BFGS iterations of each start."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
     measured_torque: bool = False
     """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""
 
 
-NETWORKS = ("neural-network", "ensemble")
 SEARCHED = ("structured", "unconstrained", "independent-gp")
 """Models with kernels, whose parameters are searched for from several starts."""
 
@@ -121,35 +118,18 @@ def resolved(command: Options) -> Options:
                 f"{given[0].partition('=')[0]} means nothing to --model {command.model}; leave it out, or choose "
                 f"{' or '.join(models)}."
             )
-    if command.model in NETWORKS and command.noise == "learned":
-        raise InvalidInput(
-            f"--noise learned means nothing to --model {command.model}: it estimates the noise where the dataset does "
-            "not state it; leave --noise out, or give SIGMA."
-        )
     if command.window is not None and command.learn_from == "accelerations":
         raise InvalidInput("--window means nothing to accelerations; add --learn-from weak-form, or leave it out.")
-    network = command.model in NETWORKS
     changes: dict[str, Any] = {}
     if command.points is None and command.model != "structured":  # there the prior decides
-        changes["points"] = NETWORK_POINTS if network else POINTS
-    if command.iterations is None and not network:
-        changes["iterations"] = ITERATIONS
+        changes["points"] = POINTS
     if command.model == "structured":
         changes["mean"] = command.mean or "analytical"
     return replace(command, **changes)
 
 
-def make_model(
-    command: ModelOptions, system: forcegp.MechanicalSystem, dataset: forcegp.Dataset
-) -> forcegp.models.Model:
+def make_model(command: ModelOptions, system: forcegp.MechanicalSystem) -> forcegp.models.Model:
     """The model of a resolved command."""
-    if command.model in NETWORKS:
-        # None where neither SIGMA nor the dataset states it: the network then estimates it
-        unknown = command.noise == "dataset" and dataset.noise_std is None
-        noise = None if unknown else resolved_noise(command.noise)
-        steps = {} if command.iterations is None else {"steps": command.iterations}
-        network = forcegp.NeuralNetwork if command.model == "neural-network" else forcegp.NetworkEnsemble
-        return network(system, noise, **steps)
     # no dataset states the noise of windows: it is learned unless it is a number
     learned = command.noise == "dataset" and command.learn_from != "accelerations"
     noise = resolved_noise("learned" if learned else command.noise, command.force_noise)
@@ -170,9 +150,6 @@ def make_model(
 
 def search_arguments(command: ModelOptions, points: int) -> dict[str, Any]:
     """What `fit` of the model of a resolved command takes besides the data and so many points."""
-    if command.model in NETWORKS:
-        return {"seed": command.seed}
-    assert command.iterations is not None, "a resolved command has iterations"
     observe = window_observation(command.learn_from, command.window)
     rows: dict[str, Any] = {}
     if observe is not None:

@@ -49,8 +49,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     auto: a quarter of the episodes, or with one episode blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
     """Seconds of training rows left out beside held-out blocks."""
-    models: Annotated[tuple[str, ...], listed("NAME,...", "all but single networks", goes_on=MODEL_PARTS)] = ()
-    """analytical: the robot as given. identified-METHOD. independent-gp, neural-network, ensemble: without physics.
+    models: Annotated[tuple[str, ...], listed("NAME,...", "some of every kind", goes_on=MODEL_PARTS)] = ()
+    """analytical: the robot as given. identified-METHOD. independent-gp: without physics.
     PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
     identified. NAME/motions: refined on the motions of the training rows."""
     identification: Annotated[str, arg(metavar="METHOD")] = "auto"

@@ -16,7 +16,6 @@ from forcegp.experiments.fits import (
     ANALYTICAL,
     GAUSSIAN_PROCESSES,
     MODELS,
-    NETWORKS,
     FitSettings,
     all_name,
     fit_name,
@@ -49,7 +48,7 @@ class Fig2b(Experiment):
     few_points: int
     settings: FitSettings
     models: tuple[str, ...] = GAUSSIAN_PROCESSES
-    on_all_rows: tuple[str, ...] = (*ANALYTICAL, *NETWORKS)
+    on_all_rows: tuple[str, ...] = ANALYTICAL
 
     def seeds_of(self, points: int) -> tuple[int, ...]:
         """The seeds of one point of the curve."""
@@ -64,7 +63,7 @@ class Fig2b(Experiment):
                 points = [count for count in self.points if seed in self.seeds_of(count)]
                 out += fit_series(model, job.name, seed, points, self.settings)
         for model in self.on_all_rows:
-            out += [fit_to_all(model, data[seed].name, seed, self.settings) for seed in self.seeds_many_points]
+            out += [fit_to_all(model, data[seed].name, seed) for seed in self.seeds_many_points]
         return out
 
     @override

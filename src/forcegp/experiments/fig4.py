@@ -15,13 +15,13 @@ from forcegp.evaluation.pages import rendered
 from forcegp.experiments.experiment import Experiment, Row, stored_arrays
 from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from forcegp.experiments.figures import rollouts_figure
-from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series, fit_to_all
+from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series
 from forcegp.jobs import Job, JobStore
 
 TASKS = "forcegp.experiments.fig4_jobs"
 _name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed
 _truth_name = "fig4/truth/seed{}".format
-BLACK_BOXES = ("gp", "neural-network")
+BLACK_BOXES = ("gp",)
 WITHOUT_CONSTRAINT = ("none", "projected")  # variants of models without a constraint, and so cannot be stabilised by it
 
 
@@ -36,7 +36,7 @@ class Fig4(Experiment):
     starts: int
     seconds: tuple[float, ...]
     settings: FitSettings
-    models: tuple[str, ...] = (*BLACK_BOXES, *GAUSSIAN_PROCESSES[1:])
+    models: tuple[str, ...] = GAUSSIAN_PROCESSES
 
     @override
     def jobs(self) -> list[Job]:
@@ -46,10 +46,7 @@ class Fig4(Experiment):
             rolled = {"data": data.name, "starts": self.starts, "seconds": list(self.seconds)}
             out += [data, Job(_truth_name(seed), f"{TASKS}:truth", rolled, (data.name,), 20.0)]
             for model in self.models:
-                if model == "neural-network":
-                    series = [fit_to_all(model, data.name, seed, self.settings)]
-                else:
-                    series = fit_series(model, data.name, seed, self.points, self.settings)
+                series = fit_series(model, data.name, seed, self.points, self.settings)
                 out += series
                 fit = series[-1].name
                 for control in CONTROLS:
@@ -154,7 +151,6 @@ class Fig4(Experiment):
             count=count,
             starts=self.starts,
             seeds=len(self.seeds),
-            training_rows=self.data.rows,
             twins=twins,
             frequency=FREQUENCY,
             head=["model", *header, "diverged"],

@@ -25,9 +25,7 @@ from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS
 from forcegp.experiments.fig2c_jobs import MODELS as ESTIMATING_MODELS
 from forcegp.experiments.fits import MODELS
 
-COLORS = dict(
-    zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET, SERIES[3], SERIES[5]), strict=True)
-)
+COLORS = dict(zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET), strict=True))
 """One colour per model, the same in every figure."""
 
 PANELS = (

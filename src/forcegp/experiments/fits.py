@@ -16,16 +16,7 @@ from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import Job, JobStore
 from forcegp.mechanics import MechanicalSystem, ViscousJointFriction
-from forcegp.models import (
-    Coefficients,
-    IndependentGP,
-    NetworkEnsemble,
-    NeuralNetwork,
-    Noise,
-    StructuredGP,
-    load_posterior,
-    save_posterior,
-)
+from forcegp.models import Coefficients, IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
 from forcegp.priors import JointAccelerations, NoForces
 from forcegp.simulation.kuka_motion import TOOL_LINK
 
@@ -61,15 +52,12 @@ MODELS = {
     "s-gp-mean": ModelKind("S-GP + analytical mean", StructuredGP),
     "analytical": ModelKind("analytical model", _analytical),
     "analytical-fitted": ModelKind("analytical model, fitted", _analytical_with_friction, _physical_parameters),
-    "neural-network": ModelKind("neural network 21-80-7", NeuralNetwork),
-    "ensemble": ModelKind("network ensemble", NetworkEnsemble),
 }
 """The analytical model has the true parameters; fitted, its tool's mass and centre of mass and a viscous friction of
 every joint are estimated by maximum likelihood. The level of the noise is learned by both.
 """
 
 GAUSSIAN_PROCESSES = ("gp", "s-gp-38", "s-gp", "s-gp-mean")
-NETWORKS = ("neural-network", "ensemble")
 ANALYTICAL = ("analytical", "analytical-fitted")
 MODEL = "model"  # the folder of the fitted model inside its job
 
@@ -86,7 +74,6 @@ class FitSettings:
     restarts: Mapping[str, int]
     iterations: int
     tolerance: Mapping[str, float]
-    network_steps: int | None = None
 
     def of(self, points: int) -> dict[str, Any]:
         """The settings for this many points, as a job's spec holds them."""
@@ -112,11 +99,9 @@ def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings
     return jobs
 
 
-def fit_to_all(model: str, data: str, seed: int, settings: FitSettings) -> Job:
-    """A network or an analytical model on all training rows of the data job."""
+def fit_to_all(model: str, data: str, seed: int) -> Job:
+    """An analytical model on all training rows of the data job."""
     spec = {"model": model, "data": data, "points": None, "seed": seed, "start": None}
-    if model in NETWORKS and settings.network_steps is not None:  # else it has its own number of training steps
-        spec["steps"] = settings.network_steps
     return Job(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
 
 
@@ -143,8 +128,6 @@ def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] 
     kind = MODELS[spec["model"]]
     assert train.system is not None
     model = kind.make(train.system)
-    if "steps" in spec:
-        model = replace(model, steps=spec["steps"])
     more = dict(kind.fit_arguments(model.system))
     if "iterations" in spec:
         more["options"] = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])

@@ -26,7 +26,7 @@ PAPER_DATA = DataSettings(train_seconds=200.0, rows=10_000, test_seconds=100.0, 
 SMOKE_DATA = DataSettings(train_seconds=10.0, rows=400, test_seconds=12.0, every=12)
 
 PAPER_SEARCH = FitSettings(restarts={"0": 4, "200": 2, "400": 1}, iterations=200, tolerance={"0": 1e-6, "1000": 1e-5})
-SMOKE_SEARCH = FitSettings(restarts={"0": 1}, iterations=15, tolerance={"0": 1e-6}, network_steps=100)
+SMOKE_SEARCH = FitSettings(restarts={"0": 1}, iterations=15, tolerance={"0": 1e-6})
 
 # Seeds that served no choice made elsewhere in this project.
 PAPER_SEEDS = (101, 102, 103, 104, 105)

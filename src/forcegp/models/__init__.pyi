@@ -1,8 +1,5 @@
 from .baselines.independent_gp import IndependentGP as IndependentGP
 from .baselines.independent_posterior import IndependentPosterior as IndependentPosterior
-from .baselines.network_ensemble import NetworkEnsemble as NetworkEnsemble
-from .baselines.network_posterior import NetworkPosterior as NetworkPosterior
-from .baselines.neural_network import NeuralNetwork as NeuralNetwork
 from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .identification.identification import Identification as Identification

@@ -23,8 +23,6 @@ from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.mechanics import MechanicalSystem
 from forcegp.models.baselines.independent_gp import IndependentGP
-from forcegp.models.baselines.network_ensemble import NetworkEnsemble
-from forcegp.models.baselines.neural_network import NeuralNetwork
 from forcegp.models.protocol import Model, Posterior
 from forcegp.models.structured.gp import StructuredGP
 from forcegp.models.training_data import Noise, TrainingData
@@ -52,14 +50,9 @@ def _read(name: str, value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-NETWORK = ("noise", "width", "steps", "batch", "rate")
 KINDS = {
     "forcegp structured posterior": StoredKind(StructuredGP, ("mean", "prior", "noise")),
     "forcegp independent posterior": StoredKind(IndependentGP, ("noise", "inputs")),
-    "forcegp neural network": StoredKind(NeuralNetwork, NETWORK),
-    "forcegp network ensemble": StoredKind(
-        NetworkEnsemble, (*NETWORK, "members", "depth", "weight_decay", "beta", "held_out")
-    ),
 }
 """Name in `model.json` -> how a model of that kind is stored."""
 

@@ -20,7 +20,7 @@ from forcegp.errors import FitError, InvalidInput
 from forcegp.evaluation import all_rows_at_once, allowing_for_correlation, usual_prior, with_force_noise
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import MechanicalSystem
-from forcegp.models import IndependentGP, NetworkEnsemble, NeuralNetwork, Noise, Posterior, StructuredGP
+from forcegp.models import IndependentGP, Noise, Posterior, StructuredGP
 from forcegp.priors import NoForces, has_few_inputs, named_prior
 from forcegp.validation.comparison import (
     DEFAULT_IDENTIFICATION,
@@ -49,7 +49,7 @@ class Training:
     given: the system as it was given.
     identified: the systems identified from the same rows, by the name of the identification; a text where it
         failed.
-    seed: of the search and of random weights.
+    seed: of the search.
     restarts, iterations: of the search for hyper-parameters; None leaves them to the model.
     force_noise: where a learned noise of the joint forces begins [Nm or N]; None is none.
     measured_torque: whether predictions account for the noise of their u (`Noise`).
@@ -148,10 +148,6 @@ def _fit_independent(training: Training) -> Posterior:
     return model.fit(training.rows, **training.search)  # type: ignore[arg-type]  # keywords of one dictionary
 
 
-def _fit_network(kind: type[NeuralNetwork] | type[NetworkEnsemble], training: Training) -> Posterior:
-    return kind(training.given).fit(training.rows, seed=training.seed)
-
-
 def _fit_motions(fit: Callable[[Training], Posterior], training: Training) -> Posterior:
     assert training.recording is not None, "a comparison gives all training rows"
     return fit(training).refined_on_motions(training.recording, training.seconds)
@@ -164,15 +160,6 @@ CANDIDATES: dict[str, Candidate] = {
     "independent-gp": Candidate(
         "one Gaussian process per joint on (q, v, u), without physics", "black box", _fit_independent, cost=5.0
     ),
-    "neural-network": Candidate(
-        "one small network on (q, v, u), without physics", "black box", partial(_fit_network, NeuralNetwork), cost=5.0
-    ),
-    "ensemble": Candidate(
-        "an ensemble of five networks on (q, v, u), without physics",
-        "black box",
-        partial(_fit_network, NetworkEnsemble),
-        cost=20.0,
-    ),
 }
 """Models by name. Identified systems and Gaussian processes on forces need no entry, see `candidate`."""
 
@@ -184,7 +171,6 @@ DEFAULT_MODELS = (
     "identified-acceleration-all",
     "identified-acceleration-all/motions",
     "independent-gp",
-    "ensemble",
     f"{RESIDUAL}@identified",
     "joint@identified",
     "joint-friction@identified",
@@ -200,7 +186,7 @@ def default_models(system: MechanicalSystem) -> tuple[str, ...]:
     identified = f"{IDENTIFIED}{resolved_identification(DEFAULT_IDENTIFICATION, system)}"
     if thruster_columns(system) or not system.robot.single_joint_names:
         physics = ("analytical", identified)
-        return (*physics, "independent-gp", "ensemble", RESIDUAL, usual_prior(system))
+        return (*physics, "independent-gp", RESIDUAL, usual_prior(system))
     fixed = system.robot.space.is_vector_space
     named = (name.replace(DEFAULT_MODELS[1], identified) for name in DEFAULT_MODELS)
     return tuple(name for name in named if fixed or not name.endswith(MOTIONS))

@@ -1,1 +1,1 @@
-"""Models without physics to compare with: one Gaussian process per joint, networks."""
+"""Models without physics to compare with: one Gaussian process per joint."""
