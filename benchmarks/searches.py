@@ -16,9 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.large_data import recording
+from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODELS
 from forcegp import Dataset, StructuredGP
 from forcegp.data import farthest_rows
-from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS
 from forcegp.priors import named_prior
 
 SEEDS = (11, 12, 13, 14, 15)

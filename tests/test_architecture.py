@@ -64,7 +64,6 @@ PACKAGES = {
 PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}
 PACKAGES["validation"] = set(PACKAGES) - {"simulation"}
 PACKAGES["report"] = set(PACKAGES) - {"simulation"}
-PACKAGES["experiments"] = set(PACKAGES)
 PACKAGES["cli"] = set(PACKAGES)
 PACKAGES["__main__"] = {"cli"}
 
@@ -79,7 +78,7 @@ IMPORTED_WHERE_USED = {
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),
     "pybullet": (),
-    "matplotlib": ("forcegp.evaluation.plots", "forcegp.report", "forcegp.experiments", "forcegp.validation.figures"),
+    "matplotlib": ("forcegp.evaluation.plots", "forcegp.report", "forcegp.validation.figures"),
     "joblib": (),
     "rosbags": (),
     "tyro": ("forcegp.cli",),

@@ -6,13 +6,13 @@ import shlex
 from pathlib import Path
 
 from benchmarks.force_pictures import PICTURES
+from benchmarks.paper import published
+from benchmarks.paper.fits import MODELS
 from tests.examples import run_example
 from tests.prose import sentences, words
 
 from forcegp import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.cli.main import parse_arguments
-from forcegp.experiments import published
-from forcegp.experiments.fits import MODELS
 from forcegp.priors import KERNELS, NAMED_PRIORS, named_prior
 
 

@@ -126,8 +126,7 @@ def test_what_does_not_fit_must_be_refused_by_the_function_itself():
 
 
 SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
-ARMS = {"control/informative_motions", "experiments/fig4_jobs", "simulation/bullet", "simulation/joint_friction"}
-ARMS |= {"simulation/kuka_motion"}
+ARMS = {"control/informative_motions", "simulation/bullet", "simulation/joint_friction", "simulation/kuka_motion"}
 """Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""
 
 

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from benchmarks.force_priors.presets import PAGE, PRESETS
+from benchmarks.paper.reproduction import ALL, experiments_of, reproduce
 from forcegp.errors import ForceGPError
-from forcegp.experiments.reproduction import ALL, experiments_of, reproduce
 from forcegp.parallel import Joblib
 
 

@@ -20,8 +20,11 @@ from benchmarks.force_priors.trials import (
     trial_name,
     trials_on,
 )
+from benchmarks.paper import published
+from benchmarks.paper.experiment import medians
+from benchmarks.paper.figures import draw_range
 from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.evaluation.metrics import formatted, markdown_table, medians
+from forcegp.evaluation.metrics import formatted, markdown_table
 from forcegp.evaluation.plots.style import (
     MEASUREMENT,
     PREDICTION,
@@ -32,8 +35,6 @@ from forcegp.evaluation.plots.style import (
     plain_ticks,
     quiet,
 )
-from forcegp.experiments import published
-from forcegp.experiments.figures import draw_range
 from forcegp.jobs import JobStore
 from forcegp.models import load_posterior
 

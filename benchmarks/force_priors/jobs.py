@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.paper.data import farthest, simulated
+from benchmarks.paper.fits import MODEL, START_FRICTION, search_report
 from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
-from forcegp.experiments.data import farthest, simulated
-from forcegp.experiments.fits import MODEL, START_FRICTION, search_report
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.mechanics import CoulombJointFriction, ViscousJointFriction

@@ -13,9 +13,9 @@ from benchmarks.force_priors.experiments import (
     UnilateralContact,
 )
 from benchmarks.force_priors.trials import ForceExperiment
-from forcegp.experiments.experiment import DataSettings
-from forcegp.experiments.fits import FitSettings
-from forcegp.experiments.reproduction import TRIAL, Page
+from benchmarks.paper.experiment import DataSettings
+from benchmarks.paper.fits import FitSettings
+from benchmarks.paper.reproduction import TRIAL, Page
 
 SEEDS = (301, 302, 303, 304, 305)  # served no choice of a prior or kernel
 DATA = DataSettings(train_seconds=60.0, rows=400, test_seconds=60.0, every=4)

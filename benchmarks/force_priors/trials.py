@@ -10,11 +10,11 @@ from typing import Any
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.metrics import formatted, in_columns, markdown_table, median_and_range, medians
+from benchmarks.paper.data import TEST_SEED
+from benchmarks.paper.experiment import Experiment, Row, in_columns, medians
+from benchmarks.paper.fits import FitSettings, fit_cost
+from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range
 from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, plain_ticks, quiet
-from forcegp.experiments.data import TEST_SEED
-from forcegp.experiments.experiment import Experiment, Row
-from forcegp.experiments.fits import FitSettings, fit_cost
 from forcegp.jobs import Job, JobStore
 
 _SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -48,7 +48,7 @@ SCENARIOS = {name: fields for name, (_, fields) in _SCENARIOS.items()}
 """Name -> fields of `KukaSurfaceConfig`."""
 
 LABELS = {name: label for name, (label, _) in _SCENARIOS.items()}  # what pages call them
-TASKS = "benchmarks.force_priors.jobs"
+TASKS, CODE = "benchmarks.force_priors.jobs", ("benchmarks.paper.fits",)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,8 @@ class ForceExperiment(Experiment):
                 }
                 after = (train.name, *(job.name for job in tests.values()))
                 cost = 0.3 * fit_cost("s-gp", trial.points, spec)
-                for job in (train, *tests.values(), Job(trial_name(trial, seed), f"{TASKS}:fit", spec, after, cost)):
+                fit = Job(trial_name(trial, seed), f"{TASKS}:fit", spec, after, cost, code=CODE)
+                for job in (train, *tests.values(), fit):
                     out[job.name] = job
         return list(out.values())
 
@@ -154,7 +155,8 @@ class ForceExperiment(Experiment):
             "every": self.data.every,
         }
         kind = "train" if training else "test"
-        return Job(f"force-data/{scenario}/{kind}/seed{seed}", f"{TASKS}:simulate", spec, cost=0.15 * spec["seconds"])
+        name, cost = f"force-data/{scenario}/{kind}/seed{seed}", 0.15 * spec["seconds"]
+        return Job(name, f"{TASKS}:simulate", spec, cost=cost, code=CODE)
 
 
 trial_name = "force-fits/{0.name}/seed{1}".format  # where the job of a trial and a seed lies

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from benchmarks.force_priors import jobs as force_jobs
-from tests.experiments.oracle import Tool
-from tests.experiments.stored_jobs import keep
+from tests.benchmarks.oracle import Tool
+from tests.benchmarks.stored_jobs import keep
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput

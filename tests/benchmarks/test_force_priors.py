@@ -8,8 +8,8 @@ import pytest
 from benchmarks.force_priors.__main__ import main
 from benchmarks.force_priors.presets import PAGE, PRESETS
 from benchmarks.force_priors.trials import SCENARIOS, Trial
+from benchmarks.paper.reproduction import as_csv, report
 
-from forcegp.experiments.reproduction import as_csv, report
 from forcegp.jobs import Job
 
 EXPERIMENTS = [experiment.name for experiment in PRESETS["smoke"]]

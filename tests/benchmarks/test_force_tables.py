@@ -13,11 +13,11 @@ from benchmarks.force_priors.trials import (
     score_table,
     trial_name,
 )
-from tests.experiments.stored_jobs import keep
+from benchmarks.paper.experiment import DataSettings
+from benchmarks.paper.fits import FitSettings
+from tests.benchmarks.stored_jobs import keep
 
 from forcegp.evaluation.metrics import median_and_range
-from forcegp.experiments.experiment import DataSettings
-from forcegp.experiments.fits import FitSettings
 from forcegp.jobs import JobStore
 
 DATA = DataSettings(train_seconds=3.0, rows=50, test_seconds=2.0, every=5)

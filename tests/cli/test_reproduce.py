@@ -10,7 +10,7 @@ from tests.cli.reproductions import Reproduced
 
 FIGURES = ("fig2b", "fig2c", "fig3", "fig4")
 
-# minutes of fits; tests/experiments covers the cells, test_executable.py the command
+# minutes of fits; tests/benchmarks covers the cells, test_executable.py the command
 pytestmark = pytest.mark.nightly
 
 

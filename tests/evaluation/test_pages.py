@@ -6,6 +6,6 @@ from jinja2 import UndefinedError
 from forcegp.evaluation.pages import rendered
 
 
-def test_a_template_that_is_not_given_its_values_is_refused():
+def test_a_template_that_is_not_given_its_values_is_refused(repository):
     with pytest.raises(UndefinedError):
-        rendered("validation/report.md.jinja", source={})
+        rendered(repository / "src/forcegp/validation/report.md.jinja", source={})

@@ -34,12 +34,12 @@ def test_a_changed_line_of_the_package_changes_it(toolbox, name):
 
 
 def test_a_module_without_package_counts_by_itself(toolbox):
-    before = now("forcegp.experiments.fits", "alone")
-    assert before != now("forcegp.experiments.fits")
+    before = now("forcegp.jobs.job", "alone")
+    assert before != now("forcegp.jobs.job")
     (toolbox / "neighbour.py").write_text("x = 1\n")
-    assert now("forcegp.experiments.fits", "alone") == before
+    assert now("forcegp.jobs.job", "alone") == before
     (toolbox / "alone.py").write_text("x = 1\n")
-    assert now("forcegp.experiments.fits", "alone") != before
+    assert now("forcegp.jobs.job", "alone") != before
 
 
 def test_modules_without_source_count_by_name():
@@ -47,6 +47,6 @@ def test_modules_without_source_count_by_name():
 
 
 def test_equal_in_every_process():
-    code = "from forcegp.jobs import code_digest; print(code_digest('forcegp.experiments.fits'))"
+    code = "from forcegp.jobs import code_digest; print(code_digest('forcegp.jobs.job'))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == code_digest("forcegp.experiments.fits") + "\n"
+    assert done.stdout == code_digest("forcegp.jobs.job") + "\n"

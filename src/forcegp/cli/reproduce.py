@@ -1,5 +1,6 @@
-"""`forcegp reproduce`: every figure and number of the paper, from one command."""
+"""`forcegp reproduce`: every figure and number of the paper, by `benchmarks/paper` of the repository."""
 
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,15 +9,16 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-import forcegp.experiments
 from forcegp.cli.command import BackendOptions, Resuming, listed, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
+EXPERIMENTS = Path("benchmarks", "paper", "reproduction.py")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce(Resuming, BackendOptions):
-    """Compute figures of Rath, Geist, Trimpe (2021) beside the published values.
+    """Compute figures of Rath, Geist, Trimpe (2021) beside the published values. Needs a clone of the repository.
 
     FIGURE is fig2b, fig2c, fig3, fig4 or all. Finished work is kept in the folder; after an interruption the same
     command resumes.
@@ -46,23 +48,25 @@ class Reproduce(Resuming, BackendOptions):
         """Compute what is missing and write all summaries."""
         if any(seed < 0 for seed in self.seed_list):
             raise InvalidInput(f"--seed-list is {self.seed_list}; give numbers of at least 0.")
+        root = _repository()
         backend = self._backend("joblib")
-
         start = time.monotonic()
-        experiments = forcegp.experiments.experiments_of(self.preset, self.figure)
+        if root not in sys.path:
+            sys.path.insert(0, root)
+        from benchmarks.paper.reproduction import PAPER_PAGE, experiments_of, reproduce
+
+        experiments = experiments_of(self.preset, self.figure)
         if self.points:
             experiments = tuple(experiment.with_points(self.points) for experiment in experiments)
         if self.seed_list:
             experiments = tuple(experiment.with_seeds(self.seed_list) for experiment in experiments)
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
-            summaries = forcegp.experiments.reproduce(
+            summaries = reproduce(
                 experiments, self.preset, out, command=self._command(), docs=self.docs, backend=backend, progress=report
             )
-        page = forcegp.experiments.PAPER_PAGE
-        terminal.show(
-            f"{out / page.file(experiments)} reports the results; figures, JSON and CSV are in {out / page.name}."
-        )
+        page, beside = out / PAPER_PAGE.file(experiments), out / PAPER_PAGE.name
+        terminal.show(f"{page} reports the results; figures, JSON and CSV are in {beside}.")
         terminal.note(f"{time.monotonic() - start:.0f} s")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
 
@@ -70,3 +74,14 @@ class Reproduce(Resuming, BackendOptions):
         """The command line that gives the same numbers."""
         words = ["forcegp reproduce", self.figure, "--preset", self.preset, *self.words("points", "seed_list")]
         return " ".join(words)
+
+
+def _repository() -> str:
+    """The clone that this package, or the current folder, belongs to. Raises InvalidInput where neither is one."""
+    for root in (Path(__file__).resolve().parents[3], Path.cwd()):
+        if (root / EXPERIMENTS).is_file():
+            return str(root)
+    raise InvalidInput(
+        "the experiments of the paper are not in the package but in its repository; run `git clone "
+        "https://github.com/forcegp/forcegp`, and the same command in the folder of that clone."
+    )

@@ -94,20 +94,6 @@ def median_and_range(values: Iterable[float | None]) -> dict[str, Any] | None:
     return {"median": statistics.median(numbers), "min": min(numbers), "max": max(numbers), "values": numbers}
 
 
-def medians(results: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, Any]:
-    """`median_and_range` of these entries over results; None for an entry that a result lacks."""
-    return {name: median_and_range(each.get(name) for each in results) for name in names}
-
-
-def in_columns(scores: Mapping[str, Mapping[str, Any] | None]) -> dict[str, float | None]:
-    """`NAME_median`, `NAME_min` and `NAME_max` of every score, for a flat table."""
-    return {
-        f"{name}_{part}": None if score is None else score[part]
-        for name, score in scores.items()
-        for part in ("median", "min", "max")
-    }
-
-
 def formatted(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
     """`.0831 (.0825–.0847)` of a median with its range, `.0831` of a number, a dash of nothing."""
     if value is None:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
@@ -15,16 +16,15 @@ def alike(texts: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
     return list(groups.values())
 
 
-def rendered(template: str, **values: Any) -> str:
-    """The text of a template, `validation/report.md.jinja` in the package; one blank line between paragraphs.
+def rendered(template: Path, **values: Any) -> str:
+    """The text of a template; one blank line between paragraphs.
 
     Templates have the filters `formatted`, `number` and `table` (header and rows) beside Jinja's own. What a template
     asks for and is not given raises jinja2.UndefinedError.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import Environment, StrictUndefined
 
-    pages = Environment(
-        loader=PackageLoader("forcegp", ""), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     pages.filters |= {"formatted": formatted, "number": number, "table": lambda rows, head: markdown_table(head, rows)}
-    return re.sub(r"\n{3,}", "\n\n", pages.get_template(template).render(values)).strip() + "\n"
+    text = pages.from_string(template.read_text(encoding="utf-8"))
+    return re.sub(r"\n{3,}", "\n\n", text.render(values)).strip() + "\n"

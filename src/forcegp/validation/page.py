@@ -1,6 +1,7 @@
 """The page of a comparison: every number on it comes from the document of results."""
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from forcegp.evaluation.metrics import formatted, markdown_table, number
@@ -31,7 +32,7 @@ def page(document: Mapping[str, Any]) -> str:
             "motions": _motions(finished, document),
         }
     return rendered(
-        "validation/report.md.jinja",
+        Path(__file__).with_name("report.md.jinja"),
         **document,
         **tables,
         finished=finished,

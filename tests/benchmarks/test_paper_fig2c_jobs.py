@@ -3,10 +3,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from tests.experiments.oracle import Tool
+from benchmarks.paper.fig2c import _found_at
+from benchmarks.paper.fig2c_jobs import CENTER_BOUND, CENTER_OFFSET, MASS_BOUND, MASS_OFFSET, wrong_system
+from tests.benchmarks.oracle import Tool
 
-from forcegp.experiments.fig2c import _found_at
-from forcegp.experiments.fig2c_jobs import CENTER_BOUND, CENTER_OFFSET, MASS_BOUND, MASS_OFFSET, wrong_system
 from forcegp.simulation.kuka_motion import TOOL_LINK
 
 

@@ -4,21 +4,22 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.metrics import in_columns, median_and_range, number
+from benchmarks.paper.experiment import Experiment, Row, in_columns, stored_arrays
+from benchmarks.paper.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
+from benchmarks.paper.figures import rollouts_figure
+from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series
+from forcegp.evaluation.metrics import median_and_range, number
 from forcegp.evaluation.pages import rendered
-from forcegp.experiments.experiment import Experiment, Row, stored_arrays
-from forcegp.experiments.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
-from forcegp.experiments.figures import rollouts_figure
-from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series
 from forcegp.jobs import Job, JobStore
 
-TASKS = "forcegp.experiments.fig4_jobs"
+TASKS = "benchmarks.paper.fig4_jobs"
 _name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed
 _truth_name = "fig4/truth/seed{}".format
 BLACK_BOXES = ("gp",)
@@ -146,7 +147,7 @@ class Fig4(Experiment):
         }
         header = (f"{name}, {second} s [{unit}]" for name, unit in columns for second in seconds)
         return rendered(
-            "experiments/fig4.md.jinja",
+            Path(__file__).with_name("fig4.md.jinja"),
             **summary,
             count=count,
             starts=self.starts,

@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
+from forcegp.evaluation.metrics import median_and_range
 from forcegp.jobs import Job, JobStore
 
 Row = dict[str, str | int | float | None]
@@ -34,7 +35,7 @@ class DataSettings:
         seconds = self.train_seconds + self.test_seconds
         cost = SIMULATION_COST * seconds + 2e-5 * self.rows * self.train_seconds
         spec = {"seed": seed, **dataclasses.asdict(self)}
-        return Job(f"data/seed{seed}", "forcegp.experiments.data:simulate", spec, cost=cost)
+        return Job(f"data/seed{seed}", "benchmarks.paper.data:simulate", spec, cost=cost)
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,20 @@ class Experiment(ABC):
     @abstractmethod
     def section(self, summary: Mapping[str, Any]) -> str:
         """Markdown for docs/paper/reproduction.md, without title and pictures; every number comes from the summary."""
+
+
+def medians(results: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, Any]:
+    """`median_and_range` of these entries over results; None for an entry that a result lacks."""
+    return {name: median_and_range(each.get(name) for each in results) for name in names}
+
+
+def in_columns(scores: Mapping[str, Mapping[str, Any] | None]) -> dict[str, float | None]:
+    """`NAME_median`, `NAME_min` and `NAME_max` of every score, for a flat table."""
+    return {
+        f"{name}_{part}": None if score is None else score[part]
+        for name, score in scores.items()
+        for part in ("median", "min", "max")
+    }
 
 
 def stored_arrays(results: JobStore, job: str, file: str) -> dict[str, np.ndarray]:

@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from benchmarks.paper.data import test_trajectory
+from benchmarks.paper.experiment import Experiment, Row, stored_arrays
+from benchmarks.paper.figures import prediction_window_figure
+from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.metrics import interval_coverage, markdown_table, number
-from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.experiment import Experiment, Row, stored_arrays
-from forcegp.experiments.figures import prediction_window_figure
-from forcegp.experiments.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.jobs import Job, JobStore
 from forcegp.models import load_posterior
 
@@ -41,7 +41,7 @@ class Fig3(Experiment):
         for model in self.models:
             series = fit_series(model, data.name, self.seed, self.points, self.settings)
             spec = {"fit": series[-1].name, "data": data.name, "start": self.start, "seconds": self.seconds}
-            out += [*series, Job(self._name(model), "forcegp.experiments.fig3:predict", spec, (series[-1].name,), 3.0)]
+            out += [*series, Job(self._name(model), "benchmarks.paper.fig3:predict", spec, (series[-1].name,), 3.0)]
         return out
 
     def _name(self, model: str) -> str:

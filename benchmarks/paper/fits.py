@@ -10,9 +10,9 @@ from typing import Any
 
 from torch import Tensor
 
+from benchmarks.paper.data import scored_rows, training_rows
 from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
-from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import Job, JobStore
 from forcegp.mechanics import MechanicalSystem, ViscousJointFriction
@@ -94,7 +94,7 @@ def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings
         spec = {"model": model, "data": data, "points": count, "seed": seed, "start": before, **settings.of(count)}
         after = (data,) if before is None else (data, before)
         jobs.append(
-            Job(fit_name(model, count, seed), "forcegp.experiments.fits:fit", spec, after, fit_cost(model, count, spec))
+            Job(fit_name(model, count, seed), "benchmarks.paper.fits:fit", spec, after, fit_cost(model, count, spec))
         )
     return jobs
 
@@ -102,7 +102,7 @@ def fit_series(model: str, data: str, seed: int, points: Iterable[int], settings
 def fit_to_all(model: str, data: str, seed: int) -> Job:
     """An analytical model on all training rows of the data job."""
     spec = {"model": model, "data": data, "points": None, "seed": seed, "start": None}
-    return Job(all_name(model, seed), "forcegp.experiments.fits:fit", spec, (data,), 60.0)
+    return Job(all_name(model, seed), "benchmarks.paper.fits:fit", spec, (data,), 60.0)
 
 
 def fit_cost(model: str, points: int, settings: Mapping[str, Any]) -> float:

@@ -8,6 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from benchmarks.paper import published
+from benchmarks.paper.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS
+from benchmarks.paper.fig2c_jobs import MODELS as ESTIMATING_MODELS
+from benchmarks.paper.fits import MODELS
 from forcegp.evaluation.plots.style import (
     LARGE,
     QUANTILE,
@@ -20,10 +24,6 @@ from forcegp.evaluation.plots.style import (
     plain_ticks,
     quiet,
 )
-from forcegp.experiments import published
-from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS
-from forcegp.experiments.fig2c_jobs import MODELS as ESTIMATING_MODELS
-from forcegp.experiments.fits import MODELS
 
 COLORS = dict(zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET), strict=True))
 """One colour per model, the same in every figure."""

@@ -2,17 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from forcegp.evaluation.metrics import formatted, in_columns, medians
-from forcegp.evaluation.pages import rendered
-from forcegp.experiments import published
-from forcegp.experiments.experiment import Experiment, Row
-from forcegp.experiments.figures import learning_curves_figure
-from forcegp.experiments.fits import (
+from benchmarks.paper import published
+from benchmarks.paper.experiment import Experiment, Row, in_columns, medians
+from benchmarks.paper.figures import learning_curves_figure
+from benchmarks.paper.fits import (
     ANALYTICAL,
     GAUSSIAN_PROCESSES,
     MODELS,
@@ -22,6 +21,8 @@ from forcegp.experiments.fits import (
     fit_series,
     fit_to_all,
 )
+from forcegp.evaluation.metrics import formatted
+from forcegp.evaluation.pages import rendered
 from forcegp.jobs import Job, JobStore
 
 SCORES = {
@@ -121,7 +122,7 @@ class Fig2b(Experiment):
             for model, scores in summary["all_rows"]["models"].items()
         ]
         return rendered(
-            "experiments/fig2b.md.jinja",
+            Path(__file__).with_name("fig2b.md.jinja"),
             **summary,
             seeds=len(self.seeds),
             few_points=self.few_points,

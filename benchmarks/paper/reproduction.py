@@ -7,18 +7,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.paper.experiment import DataSettings, Experiment, Row
+from benchmarks.paper.fig2b import Fig2b
+from benchmarks.paper.fig2c import Fig2c
+from benchmarks.paper.fig3 import Fig3
+from benchmarks.paper.fig4 import Fig4
+from benchmarks.paper.fits import FitSettings
 from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
 from forcegp.evaluation.pages import alike
-from forcegp.experiments.experiment import DataSettings, Experiment, Row
-from forcegp.experiments.fig2b import Fig2b
-from forcegp.experiments.fig2c import Fig2c
-from forcegp.experiments.fig3 import Fig3
-from forcegp.experiments.fig4 import Fig4
-from forcegp.experiments.fits import FitSettings
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Backend
 

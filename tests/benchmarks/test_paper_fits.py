@@ -3,9 +3,9 @@
 import json
 
 import pytest
+from benchmarks.paper.fits import MODELS, FitSettings, fit_series, fitted
 
 from forcegp.data import farthest_rows
-from forcegp.experiments.fits import MODELS, FitSettings, fit_series, fitted
 
 SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, tolerance={"0": 1e-6, "400": 1e-5})
 

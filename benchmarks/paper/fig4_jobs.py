@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.paper.data import test_trajectory
+from benchmarks.paper.fits import MODEL
 from forcegp.data import Dataset
 from forcegp.data.motion_records import recorded_motions
-from forcegp.experiments.data import test_trajectory
-from forcegp.experiments.fits import MODEL
 from forcegp.integration import Feedback, SymplecticEuler, integrate
 from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte, MechanicalSystem

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.paper.data import scored_rows, training_rows
 from forcegp.data import Dataset
-from forcegp.experiments.data import scored_rows, training_rows
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.mechanics import MechanicalSystem

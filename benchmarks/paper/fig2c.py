@@ -2,20 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from benchmarks.paper.experiment import Experiment, Row
+from benchmarks.paper.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
+from benchmarks.paper.figures import estimation_figure
+from benchmarks.paper.fits import fit_cost
 from forcegp.evaluation.metrics import formatted, median_and_range, number
 from forcegp.evaluation.pages import rendered
-from forcegp.experiments.experiment import Experiment, Row
-from forcegp.experiments.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS, MODELS
-from forcegp.experiments.figures import estimation_figure
-from forcegp.experiments.fits import fit_cost
 from forcegp.jobs import Job, JobStore
 
-TASKS = "forcegp.experiments.fig2c_jobs"
+TASKS = "benchmarks.paper.fig2c_jobs"
 AXES = ("com.x", "com.y", "com.z")
 ERRORS = ("mass_error", "center_error", "mae")
 _trace_name = "fig2c/trace/{}/{}".format  # model, mean
@@ -104,7 +105,7 @@ class Fig2c(Experiment):
             for name, entry in summary["intervals"].items()
         ]
         return rendered(
-            "experiments/fig2c.md.jinja",
+            Path(__file__).with_name("fig2c.md.jinja"),
             **summary,
             points_interval=self.points_interval,
             start=summary["traces"]["s-gp"]["analytical"],

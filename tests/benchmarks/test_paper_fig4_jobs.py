@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.experiments.oracle import Tool
-from tests.experiments.stored_jobs import DATA
+from benchmarks.paper import fig4_jobs
+from benchmarks.paper.fig4_jobs import BAUMGARTE, FREQUENCY, OFFSET, PERTURBATIONS
+from tests.benchmarks.oracle import Tool
+from tests.benchmarks.stored_jobs import DATA
 
-from forcegp.experiments import fig4_jobs
-from forcegp.experiments.fig4_jobs import BAUMGARTE, FREQUENCY, OFFSET, PERTURBATIONS
 from forcegp.integration import SymplecticEuler, integrate
 
 SECONDS, STARTS = 0.2, 3
