@@ -331,8 +331,6 @@ def test_what_a_killed_process_left_is_deleted_but_not_what_a_living_one_writes(
             remove_leftovers(tmp_path) if how == "by remove_leftovers" else require_writable(tmp_path / name)
 
     make_folder(tmp_path / "model", one="old")
-    for name in (".note.txt.0123456789ab.tmp", "..note.txt.0123456789ab.tmp.ba9876543210.tmp"):
-        (tmp_path / name).write_text("left by a version before locks")
     command = [sys.executable, "-c", KILLED, tmp_path]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
         assert writer.stdout.readline()

@@ -140,7 +140,7 @@ def _beside(target: Path) -> Iterator[Path]:
     from filelock import FileLock, Timeout  # 40 ms that only writing costs
 
     name = target.name[:40]  # so that the longest names that file systems allow do not become too long
-    left = re.compile(rf"\.+{re.escape(name)}(\.[0-9a-f]{{12}}\{TEMPORARY})+")
+    left = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{12}}\{TEMPORARY}")
     with contextlib.suppress(OSError):  # a folder that may be written, but not listed
         for entry in list(target.parent.iterdir()):
             if left.fullmatch(entry.name):
@@ -166,19 +166,16 @@ def _beside(target: Path) -> Iterator[Path]:
 
 
 def _remove_if_left(entry: Path) -> None:
-    """Delete a hidden folder, or the hidden file of an earlier version, unless the process that made it lives."""
+    """Delete a hidden folder, unless the process that made it lives."""
     from filelock import FileLock, Timeout
 
-    lock = FileLock(entry / LOCK if entry.is_dir() else entry)
+    lock = FileLock(entry / LOCK)
     with contextlib.suppress(OSError, Timeout):  # being written, or not ours to delete
         lock.acquire(blocking=False)
         for old in (entry / OLD).glob("*"):  # killed between two renames
             if not (entry.parent / old.name).exists():
                 old.rename(entry.parent / old.name)
-        if entry.is_dir():
-            shutil.rmtree(entry, ignore_errors=True)
-        else:
-            entry.unlink(missing_ok=True)
+        shutil.rmtree(entry, ignore_errors=True)
     lock.release()
 
 
@@ -231,14 +228,14 @@ def write_digests(folder: Path) -> None:
     (folder / SUMS).write_bytes(_text(folder, (name for name in names if name != SUMS)).encode("utf-8"))
 
 
-def require_unchanged(folder: Path, remedy: str) -> bool:
-    """Whether the folder has digests; raises FileFormatError, which ends in the remedy, where a file is not as written.
+def require_unchanged(folder: Path, remedy: str) -> None:
+    """Raises FileFormatError, which ends in the remedy, where a file is not as written, or nothing says what was.
 
     Files that were added are no concern of this.
     """
     sums = folder / SUMS
     if not sums.exists():
-        return False
+        raise FileFormatError(f"{folder} is incomplete: it has no {SUMS}; {remedy}")
     if sums.is_fifo():  # to open it would wait for a writer for ever
         raise FileFormatError(f"{folder} is damaged: {SUMS} is not a regular file; {remedy}")
     try:
@@ -252,16 +249,13 @@ def require_unchanged(folder: Path, remedy: str) -> bool:
             raise FileFormatError(f"{folder} is damaged: {changed or SUMS} is not as it was written; {remedy}")
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{folder} is damaged: {SUMS} cannot be read ({error}); {remedy}") from None
-    return True
 
 
 def added_files(folder: Path, own: Iterable[str] = ()) -> list[str]:
-    """Files in the folder that nobody lists: neither its digests, nor `files` of its config.json, nor `own`."""
+    """Files in the folder that nobody lists: neither its digests nor `own`."""
     known = {SUMS, *own}
     with contextlib.suppress(OSError, ValueError):
         known |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
-    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):  # folders of before had no digests
-        known |= set(json.loads((folder / "config.json").read_text(encoding="utf-8")).get("files", ()))
     entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
     return sorted({entry.relative_to(folder).as_posix() for entry in entries} - known)
 

@@ -9,7 +9,7 @@ import pytest
 from forcegp.cli.command import FIELDS, NUMBERS, split_list
 from forcegp.cli.help_pages import command_page
 from forcegp.cli.learning_options import MODEL_PARTS, PARTS
-from forcegp.cli.main import COMMANDS, RENAMED, command_class, parse_arguments
+from forcegp.cli.main import ARGUMENTS, COMMANDS, command_class, parse_arguments
 from forcegp.errors import InvalidInput
 
 FIT = "fit x.h5 --out run"
@@ -124,12 +124,10 @@ def test_what_is_no_list_is_refused_with_the_list(words, message):
     assert "\n" not in refused(words)
 
 
-@pytest.mark.parametrize(("command", "old"), [(name, old) for name, names in RENAMED.items() for old in names])
-def test_former_names_are_refused_with_the_new_ones(command, old):
-    new = RENAMED[command][old]
-    assert refused(f"{command} --{old} 1") == f"--{old} of forcegp {command} is now --{new}."
-    assert new.replace("-", "_") in command_class(command).__dataclass_fields__
-    assert any(old in command_class(other).__dataclass_fields__ for other in COMMANDS), "no other command has the name"
+@pytest.mark.parametrize("command", ARGUMENTS)
+def test_what_arguments_are_called_as_options_are_options(command):
+    options = {option.replace("-", "_") for option in ARGUMENTS[command].values()}
+    assert options <= set(command_class(command).__dataclass_fields__)
 
 
 VALUES_OF_OTHER_KINDS = {"out": "a file or a folder, which the command names"}

@@ -39,7 +39,7 @@ class Writing:
             for job in out.glob("jobs/**/job.json"):
                 json.loads(job.read_text())
         else:
-            assert require_unchanged(out, "")
+            require_unchanged(out, "")
             for model in (file.parent for file in out.rglob("model.json")):
                 load_posterior(model)
 

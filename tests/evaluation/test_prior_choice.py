@@ -90,7 +90,7 @@ def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):
     assert f"over {k:.0f} rows" in note
     # nine rows that share their noise are one: the posterior of rows that are noisier by the root of k
     noisier = {**wide.parameters, ACCELERATION: wide.parameters[ACCELERATION] + 0.5 * np.log(k)}
-    expected = model.condition(wide.training, noisier, wide.result, {"widening": wide.widening, "beyond_visited": True})
+    expected = model.condition(wide.training, noisier, wide.result, {"widening": wide.widening})
     state = log.q[:5], log.v[:5], log.u[:5]
     np.testing.assert_allclose(wide.predict(*state).mean, expected.predict(*state).mean, rtol=1e-12)
     np.testing.assert_allclose(wide.predict(*state).covariance, expected.predict(*state).covariance, rtol=1e-12)

@@ -30,7 +30,7 @@ def start() -> tuple[Posterior, list]:
 def drift(posterior: Posterior) -> float:
     """The largest difference of a mean or covariance to conditioning on its rows at once, relative to the largest."""
     training = posterior.training
-    settings = {"widening": posterior.widening, "beyond_visited": True}
+    settings = {"widening": posterior.widening}
     fresh = posterior.model.condition(training, posterior.parameters, posterior.result, settings)
     states = tuple(torch.tensor(x) for x in _states())
     mine, theirs = posterior.predict(*states), fresh.predict(*states)

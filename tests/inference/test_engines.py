@@ -86,17 +86,7 @@ def test_settings_up_to_their_bounds(kind, fine, wrong):
         kind(**wrong)
 
 
-@pytest.mark.parametrize("stored", [["exact"], {"name": "gone"}, {"name": "exact", "points": 3}, {"points": 3}])
+@pytest.mark.parametrize("stored", [None, ["exact"], {"name": "gone"}, {"name": "exact", "points": 3}, {"points": 3}])
 def test_what_is_no_stored_engine_is_refused(stored):
     with pytest.raises(InvalidInput, match="exact, inducing"):
         engine_from_dict(stored)
-    assert engine_from_dict(None) == Exact()
-
-
-def test_conjugate_gradients_of_earlier_versions_had_the_exact_mean():
-    assert engine_from_dict({"name": "iterative", "points": 20, "tolerance": 1e-4}) == Exact()
-
-
-def test_an_engine_that_is_gone_loads_as_the_one_that_computed_its_posterior():
-    stored = {"name": "stochastic", "points": 60, "steps": 5, "batch": 10, "rate": 0.01, "seed": 0}
-    assert engine_from_dict(stored) == Inducing(points=60, tolerance=0.0)

@@ -107,8 +107,9 @@ def test_leftovers_of_killed_runs_go(results):
 
 def test_a_run_killed_before_its_description_does_not_block_the_folder(tmp_path):
     folder = tmp_path / "out"
-    folder.mkdir()
-    (folder / ".jobs.json.0123456789ab.tmp").write_text('{"kind"')
+    left = folder / ".jobs.json.0123456789ab.tmp"
+    left.mkdir(parents=True)
+    (left / "jobs.json").write_text('{"kind"')
     results = JobStore.open(folder, KIND, {"preset": "smoke"})
     with results.locked():
         remove_leftovers(results.folder)

@@ -34,7 +34,7 @@ def at_once(posterior, data):
     first = posterior.training
     whole = type(first).of(data, torch.device("cpu"))
     whole = dataclasses.replace(whole, reference=first)
-    settings = {"widening": posterior.widening, "beyond_visited": True}
+    settings = {"widening": posterior.widening}
     return posterior.model.condition(whole, posterior.parameters, posterior.result, settings)
 
 

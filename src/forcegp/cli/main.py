@@ -62,14 +62,11 @@ COMMANDS: Mapping[str, str] = {
 """A new command is an entry here, and a module of that name with a subclass of Command of that name."""
 MODULES = {"import": "import_log"}
 """Names that Python does not allow for a module."""
-RENAMED: Mapping[str, Mapping[str, str]] = {
-    "compare": {"prior": "priors"},
+ARGUMENTS: Mapping[str, Mapping[str, str]] = {
     "excite": {"start": "posture", "motions": "tries", "margin": "limit-share", "surface": "avoid"},
-    "reproduce": {"seeds": "seed-list"},
-    "rollout": {"start": "start-rows"},
     "simulate": {"contact": "contact-model", "episodes": "trajectories", "friction": "tool-friction"},
 }
-"""Former names of options, which mean something else in other commands, and are still those of arguments in Python."""
+"""Arguments in Python, whose messages begin with their name, and options that are called otherwise."""
 NOT_NUMBERS = {
     r"invalid literal for int\(\) with base 10": "a whole number",
     "could not convert string to float": "a number",
@@ -136,8 +133,6 @@ def _checked_options(name: str, kind: type[Command], words: Sequence[str]) -> di
         flag = flag.replace("_", "-")
         if not flag.startswith("--"):
             continue
-        if flag[2:] in RENAMED.get(name, {}):
-            raise InvalidInput(f"{flag} of forcegp {name} is now --{RENAMED[name][flag[2:]]}.")
         if flag not in flags:
             close = difflib.get_close_matches(flag, flags, n=1)
             hint = f" Did you mean {close[0]}?" if close else ""
@@ -234,7 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     except ForceGPError as error:
         message = with_option_names(str(error), command.options if command else ())
-        for argument, option in RENAMED.get(command.name if command else "", {}).items():
+        for argument, option in ARGUMENTS.get(command.name if command else "", {}).items():
             message = re.sub(rf"^{argument} is ", f"--{option} is ", message)
         return _fail(message, USER_ERROR, debug)
     except OSError as error:

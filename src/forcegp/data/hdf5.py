@@ -156,11 +156,10 @@ def _check_header(path: Path, file: h5py.File) -> None:
             f"{path} is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
         )
     version = file.attrs.get("format_version")
-    if not isinstance(version, int | np.integer) or version < 1:
-        raise FileFormatError(f"{path} has no valid 'format_version' ({version!r}); it is damaged.")
-    if version > VERSION:
+    if not isinstance(version, int | np.integer) or version != VERSION:
         raise FileFormatError(
-            f"{path} has format version {version}; this forcegp ({__version__}) reads up to {VERSION}. Upgrade forcegp."
+            f"{path} has format version {version!r}; this forcegp ({__version__}) reads {VERSION}. Use what wrote it "
+            f"({file.attrs.get('written_by')!r}), or convert the log again."
         )
 
 

@@ -207,15 +207,9 @@ def engine_of(given: Engine | str) -> Engine | None:
 
 
 def engine_from_dict(stored: object) -> Engine:
-    """The engine that `to_dict` stored; exact for None. Raises InvalidInput for anything else."""
-    if stored is None:
-        return Exact()
+    """The engine that `to_dict` stored. Raises InvalidInput for anything else."""
     if not isinstance(stored, Mapping):
         raise InvalidInput(f"stored engine {stored!r} is not a name with settings; there are {', '.join(ENGINES)}")
-    if stored.get("name") == "iterative":  # of version 0.2: the mean was the exact one
-        return Exact()
-    if stored.get("name") == "stochastic":  # of version 0.2: the posterior was that of its inducing points
-        stored = {"name": "inducing", "points": stored.get("points", 200), "tolerance": 0.0}
     kind = ENGINES.get(str(stored.get("name")))
     known = {field.name for field in fields(kind)} if kind is not None else set()  # type: ignore[arg-type]  # a dataclass
     settings = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items() if name != "name"}

@@ -21,7 +21,7 @@ from forcegp.jobs.job import Job, digests, machine
 from forcegp.parallel import Backend, Joblib
 from forcegp.parallel.backend import outcome_of
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 1
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
 RESULT_FILE = "job.json"
 

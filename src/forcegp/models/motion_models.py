@@ -64,7 +64,7 @@ class MotionIntervals:
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
         arrays = {name: np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors")}
-        return cls(**arrays, inputs=tuple(stored.get("inputs", ())))
+        return cls(**arrays, inputs=tuple(stored["inputs"]))
 
 
 AnyModel = TypeVar("AnyModel", bound="MotionModel")

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from forcegp import __version__
-from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_unchanged, write_digests
+from forcegp.atomic_files import added_files, atomic_folder, require_unchanged, write_digests
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.inference import OptimizationResult, engine_from_dict
@@ -59,9 +59,7 @@ KINDS = {
 
 RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
 """What is stored of a search."""
-FORMAT_VERSION = 7
-BEFORE_DIGESTS = 6
-"""The oldest format that is read, of version 0.2: its files have no digests."""
+FORMAT_VERSION = 1
 FEATURES = {
     "target": "it was carried to another system, for which it predicts",
     "reference": "its rows are standardised by others than those that it is conditioned on",
@@ -157,9 +155,7 @@ def load_posterior(path: str | Path) -> Posterior:
     path = Path(path)
     document = _document(path)
     declared = _declared(path / "model.json", document)
-    # whatever the version says: a flipped bit could make it one of those that had no digests
-    if not require_unchanged(path, "fit the model again") and document["format_version"] > BEFORE_DIGESTS:
-        raise FileFormatError(f"{path} is incomplete: it has no {SUMS}; fit the model again")
+    require_unchanged(path, "fit the model again")
     try:
         urdf = _robot(path, ROBOT, document.get("urdf_sha256"))
         moved_to = None
@@ -296,10 +292,10 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("kind") not in [*KINDS]:
         raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
     version = document.get("format_version")
-    if version not in (BEFORE_DIGESTS, FORMAT_VERSION):
+    if version != FORMAT_VERSION:
         raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {BEFORE_DIGESTS} and "
-            f"{FORMAT_VERSION}; use the version that wrote it ({document.get('forcegp_version')}) or fit again"
+            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}; use the "
+            f"version that wrote it ({document.get('forcegp_version')}) or fit again"
         )
     return document
 

@@ -259,9 +259,7 @@ class Robot(RobotStructure):
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
         """The robot that :meth:`to_stored` gave."""
-        given = {name: stored[name] for name in ("gravity", "armature", "locked")} | {
-            "base": stored.get("base", "fixed")
-        }
+        given = {name: stored[name] for name in ("gravity", "armature", "locked", "base")}
         return cls.from_urdf_text(stored["urdf"], source="stored URDF", strict=None, **given)
 
     def to_stored(self) -> dict[str, Any]:

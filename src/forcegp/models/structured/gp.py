@@ -213,8 +213,7 @@ class StructuredGP(StructuredModel):
     ) -> StructuredPosterior:
         """The posterior at given parameters, without optimisation; names as in `MarginalLikelihood`."""
         likelihood = self.likelihood(replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
-        # models that were stored before friction widened beyond visited velocities stay as they were
-        kernels = likelihood.kernels(beyond=bool(settings.get("beyond_visited")))
+        kernels = likelihood.kernels()
         engine = engine or Exact()
         # now: a failure belongs to the fit, not to the first prediction
         latent = likelihood.condition(kernels, parameters, engine, start=solution)
@@ -307,7 +306,6 @@ class StructuredGP(StructuredModel):
         check_prior(likelihood)
         require_memory_to_learn(likelihood)
         described = described_rows(rows, dataset) | {"mean": self.mean, "noise": noise.to_dict()}
-        described["beyond_visited"] = True
         described["prior"] = described_prior(self.prior)  # before the search: a prior of one's own may fail there
         learned_noise, fixed = fitted.split_noise
         if search.learn is None:

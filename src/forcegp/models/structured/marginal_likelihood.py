@@ -163,14 +163,14 @@ class MarginalLikelihood:
         features = Standardization.of(by, self.prior.scalings(self.system.robot))(given)
         return Terms(features, dynamics.H @ self.prior.mixing(dynamics), residual, noise)
 
-    def kernels(self, parameters: Mapping[str, Tensor] | None = None, beyond: bool = True) -> LatentKernels:
+    def kernels(self, parameters: Mapping[str, Tensor] | None = None) -> LatentKernels:
         """Kernels with moment-based start values, at the physical parameters among `parameters`.
 
         Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force
-        residual. With `beyond`, kernels that have the method `visit` take the range that the rows visit.
+        residual. Kernels that have the method `visit` take the range that the rows visit.
         """
         if self.training.reference is not None:  # on whose rows kernels were made
-            return replace(self, training=self.training.reference).kernels(parameters, beyond)
+            return replace(self, training=self.training.reference).kernels(parameters)
         any_noise = {ACCELERATION: torch.zeros_like(self.training.a[0])}
         with torch.no_grad():
             features, W, residual, _ = self.terms({**any_noise, **(parameters or {})})
@@ -193,7 +193,7 @@ class MarginalLikelihood:
         for kernel, z in zip(kernels, features, strict=True):
             for part in kernel.modules():
                 visit: Any = getattr(part, "visit", None)
-                if beyond and visit is not None:
+                if visit is not None:
                     visit(z)
         return LatentKernels(kernels).to(variances.device)
 
