@@ -15,7 +15,7 @@ import forcegp
 import forcegp.data
 import forcegp.evaluation
 import forcegp.models
-from forcegp.atomic_files import require_unchanged
+from forcegp.atomic_files import SUMS, require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
@@ -134,7 +134,7 @@ class RobotOptions(RobotFileOptions):
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
 
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
-        if path != self.identified:
+        if (self.identified / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
             require_unchanged(self.identified, "identify again")
         if path.is_fifo():  # to open it would wait for a writer for ever
             raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp identify` wrote.")
