@@ -3,24 +3,43 @@
 # the robot
 from .robots import Robot as Robot
 
-# what is known about it: contacts and forces
-from .mechanics import MechanicalSystem as MechanicalSystem
+# what is known about it, and what is not
+from .model import Model as Model
+from .noise import Noise as Noise
 from .mechanics import Contact as Contact
 from .mechanics import Plane as Plane
 from .mechanics import Sphere as Sphere
 from .mechanics import Cylinder as Cylinder
 from .mechanics import ImplicitSurface as ImplicitSurface
 from .mechanics import Baumgarte as Baumgarte
-from .mechanics import Actuation as Actuation
-from .mechanics import RigidBodyBias as RigidBodyBias
-from .mechanics import ViscousJointFriction as ViscousJointFriction
-from .mechanics import CoulombJointFriction as CoulombJointFriction
-from .mechanics import StribeckJointFriction as StribeckJointFriction
-from .mechanics import LoadJointFriction as LoadJointFriction
-from .mechanics import ConstantJointForce as ConstantJointForce
-from .mechanics import DirectionalJointFriction as DirectionalJointFriction
-from .mechanics import Armature as Armature
-from .mechanics import RotorInertia as RotorInertia
+
+# laws, and priors on their numbers
+from .forces import Actuation as Actuation
+from .forces import RigidBodies as RigidBodies
+from .forces import Payload as Payload
+from .forces import Viscous as Viscous
+from .forces import Coulomb as Coulomb
+from .forces import Stribeck as Stribeck
+from .forces import LoadFriction as LoadFriction
+from .forces import Offset as Offset
+from .forces import DirectionalFriction as DirectionalFriction
+from .forces import Spring as Spring
+from .forces import Rotor as Rotor
+from .forces import CoupledRotors as CoupledRotors
+from .forces import Normal as Normal
+from .forces import LogNormal as LogNormal
+from .forces import Body as Body
+
+# unknown forces
+from .forces import JointForces as JointForces
+from .forces import AerodynamicForce as AerodynamicForce
+from .forces import BaseWrench as BaseWrench
+from .forces import JointFriction as JointFriction
+from .forces import PeriodicJointForces as PeriodicJointForces
+from .forces import ToolForces as ToolForces
+from .forces import ContactFriction as ContactFriction
+from .forces import JointAccelerations as JointAccelerations
+from .forces import IndependentAccelerations as IndependentAccelerations
 
 # what was measured
 from .data import Dataset as Dataset
@@ -30,29 +49,22 @@ from .data import Preparation as Preparation
 from .recordings import import_recordings as import_recordings
 from .recordings import ColumnMapping as ColumnMapping
 from .recordings import ImportOptions as ImportOptions
-from .data import WeakForm as WeakForm
 from .simulation import KukaSurfaceConfig as KukaSurfaceConfig
 from .simulation import simulate_kuka_surface as simulate_kuka_surface
 
-# what is unknown, and the model that learns it
-from .priors import JointForces as JointForces
-from .priors import AerodynamicForce as AerodynamicForce
-from .priors import BaseWrench as BaseWrench
-from .priors import JointFriction as JointFriction
-from .priors import PeriodicJointForces as PeriodicJointForces
-from .priors import ToolForces as ToolForces
-from .priors import ContactFriction as ContactFriction
-from .priors import Payload as Payload
-from .priors import JointAccelerations as JointAccelerations
-from .priors import NoForces as NoForces
-from .models import Noise as Noise
-from .models import Coefficients as Coefficients
-from .models import StructuredGP as StructuredGP
-from .models import IndependentGP as IndependentGP
-from .models import save_posterior as save_posterior
-from .models import load_posterior as load_posterior
-from .models import casadi_function as casadi_function
-from .models import export_c as export_c
+# learning from it
+from .evidence import Accelerations as Accelerations
+from .evidence import Torques as Torques
+from .evidence import Windows as Windows
+from .evidence import Motions as Motions
+from .fit import fit as fit
+from .fit import calibrated as calibrated
+from .posterior import Posterior as Posterior
+from .posterior import Estimate as Estimate
+from .posterior import save_posterior as save_posterior
+from .posterior import load_posterior as load_posterior
+from .posterior import casadi_function as casadi_function
+from .posterior import export_c as export_c
 
 # what is done with it
 from .control import ComputedTorque as ComputedTorque
@@ -62,10 +74,6 @@ from .control import HybridForce as HybridForce
 from .control import MPPI as MPPI
 from .control import excitation as excitation
 from .control import Excitation as Excitation
-
-# the same without Gaussian processes
-from .analytical import identify_analytical as identify_analytical
-from .analytical import AnalyticalIdentification as AnalyticalIdentification
 
 # how and where it is computed
 from .inference import Exact as Exact

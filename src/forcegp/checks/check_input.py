@@ -23,7 +23,7 @@ from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.row_selection import consecutive, move_on
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 Severity = Literal["ok", "look", "wrong"]
@@ -125,11 +125,11 @@ class CheckInput:
     most_rows: int = MOST_ROWS
 
     @classmethod
-    def as_recorded(cls, dataset: Dataset, system: MechanicalSystem) -> "CheckInput":
+    def as_recorded(cls, dataset: Dataset, model: Model) -> "CheckInput":
         """A log of which nothing is filtered, compared or mended."""
         nowhere = np.zeros(dataset.v.shape, dtype=bool)
         return cls(
-            log=dataset, robot=system.robot, contacts=len(system.contacts), even=dataset, prepared=None, compared=None,
+            log=dataset, robot=model.robot, contacts=len(model.contacts), even=dataset, prepared=None, compared=None,
             automatic=False, wraps=nowhere, jumps=nowhere, dropped={}, mended=dataset, compared_noise=None,
         )  # fmt: skip
 
@@ -161,7 +161,7 @@ class CheckInput:
         return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
 
     @classmethod
-    def of(cls, dataset: Dataset, system: MechanicalSystem | None, preparation: Preparation) -> "CheckInput":
+    def of(cls, dataset: Dataset, model: Model | None, preparation: Preparation) -> "CheckInput":
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
@@ -186,10 +186,10 @@ class CheckInput:
             seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF
             noise = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
         results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
-        return cls(**_known(dataset, system), **found, **results, mended=mended, automatic=preparation.cutoff == "auto")
+        return cls(**_known(dataset, model), **found, **results, mended=mended, automatic=preparation.cutoff == "auto")
 
     @classmethod
-    def quick(cls, dataset: Dataset, system: MechanicalSystem | None) -> "CheckInput":
+    def quick(cls, dataset: Dataset, model: Model | None) -> "CheckInput":
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
         if dataset.time_ordered and not move_on(dataset):
             dataset = replace(dataset, time_ordered=False)
@@ -209,12 +209,12 @@ class CheckInput:
             noise = noise if seen is None else np.nan_to_num(seen)
         results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
         how = {"automatic": False, "most_rows": QUICK_ROWS}
-        return cls(**_known(dataset, system), **found, **results, **how, mended=mended)
+        return cls(**_known(dataset, model), **found, **results, **how, mended=mended)
 
 
-def _known(dataset: Dataset, system: MechanicalSystem | None) -> dict[str, Any]:
-    system = dataset.system if system is None else system
-    robot, contacts = (None, 0) if system is None else (system.robot, len(system.contacts))
+def _known(dataset: Dataset, model: Model | None) -> dict[str, Any]:
+    model = dataset.model if model is None else model
+    robot, contacts = (None, 0) if model is None else (model.robot, len(model.contacts))
     return {"log": dataset, "robot": robot, "contacts": contacts}
 
 

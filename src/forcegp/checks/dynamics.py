@@ -6,15 +6,19 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from forcegp.analytical import PayloadEstimate, identify_payload
 from forcegp.checks.check_input import CheckInput, Finding, look, ok
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import estimate_delay
 from forcegp.data.delay import shifted
 from forcegp.errors import DataWarning, ForceGPError
-from forcegp.mechanics import MechanicalSystem
+from forcegp.evidence import Torques
+from forcegp.fit import fit
+from forcegp.forces import Payload, Rotor
+from forcegp.forces.registry import force_name, usual_friction
+from forcegp.model import Model
+from forcegp.posterior import StructuredPosterior
 
-ROWS = 3_000
+ROWS = 1_000
 SURE = 4.0  # standard errors from zero
 LEAST_SHARE = 0.02  # of the mass of the last link and of the moving inertia: less is not worth a word
 
@@ -29,59 +33,65 @@ def dynamics_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
         rows = shifted(rows, np.full(rows.nv, late))
         with warnings.catch_warnings():  # of what hides a payload: the finding states what it rests on
             warnings.simplefilter("ignore", DataWarning)
-            found = identify_payload(rows, MechanicalSystem(log.robot), rows=ROWS)
+            found = fit(Model(log.robot).with_forces(usual_friction(), Rotor(), Payload()), rows, Torques(), rows=ROWS)
     except (ForceGPError, np.linalg.LinAlgError):
         return  # too short, or what moves shows too little: excitation is reported by itself
-    if not found.fit.settled:
+    if not found.parameters.settled:
         return
     yield from _payload(found)
     yield from _rotors(inputs, found)
-    yield _friction(inputs, found)
+    yield _friction(found)
 
 
-def _payload(found: PayloadEstimate) -> Iterator[Finding]:
-    error, link = found.standard_errors["mass"], found.system.robot.link(found.link)
-    if not found.mass > max(SURE * error, LEAST_SHARE * link.mass):
+def _payload(found: StructuredPosterior) -> Iterator[Finding]:
+    held = next(law for law in found.model.laws if isinstance(law, Payload))
+    assert held.link is not None, "it was found"
+    mass, link = found.parameters["payload.mass"], found.model.robot.link(held.link)
+    if not mass.value > max(SURE * mass.std, LEAST_SHARE * link.mass):
         return
-    center = ", ".join(f"{1e3 * x:.0f}" for x in found.center_of_mass)
+    place = [found.parameters[f"payload.center_of_mass.{x}"].value for x in "xyz"]
     yield look(
         subject="payload",
-        seen=f"the torques show {found.mass:.3g} kg ± {error:.1g} kg more at {found.link} than the URDF has, with its "
-        f"centre of mass at ({center}) mm, if the URDF is right about the other links.",
-        remedy=f"forcegp payload DATA --link {found.link}, with a --baseline without payload where the URDF is "
-        "uncertain; or forcegp identify.",
-        numbers={"mass": found.mass, "standard_error": error, "center_of_mass": found.center_of_mass.tolist()},
+        seen=f"the torques show {mass.value:.3g} kg ± {mass.std:.1g} kg more at {held.link} than in the URDF, with its "
+        f"centre of mass at ({', '.join(f'{1e3 * x:.0f}' for x in place)}) mm, if the URDF is right about the other "
+        "links.",
+        remedy=f"forcegp payload DATA --link {held.link}, with a --baseline without payload where the URDF is "
+        "uncertain; or forcegp fit --forces bodies.",
+        numbers={"mass": mass.value, "standard_error": mass.std, "center_of_mass": place},
     )
 
 
-def _rotors(inputs: CheckInput, found: PayloadEstimate) -> Iterator[Finding]:
-    values, errors = (np.array([found.joints[f"armature.{name}"][k] for name in inputs.names]) for k in (0, 1))
-    robot = found.system.robot
+def _rotors(inputs: CheckInput, found: StructuredPosterior) -> Iterator[Finding]:
+    rotors, robot = found.parameters.of("rotor"), found.model.robot
+    values, errors = (np.array([getattr(rotors[name], what) for name in inputs.names]) for what in ("value", "std"))
     q = torch.tensor(inputs.rows().q[::50], device=robot.device)
     moving = robot.mass_matrix(q).diagonal(dim1=-2, dim2=-1).mean(dim=0).cpu().numpy()
-    more = values - robot.armature.cpu().numpy() > np.maximum(SURE * errors, LEAST_SHARE * moving)
+    more = values > np.maximum(SURE * errors, LEAST_SHARE * moving)
     if not more.any():
         return
     joints = inputs.named(np.flatnonzero(more))
-    sizes = ", ".join(f"{name} {values[inputs.names.index(name)]:.3g}" for name in joints)
+    stated = dict(zip(inputs.names, (values + robot.armature.cpu().numpy()).tolist(), strict=True))
     yield look(
         subject="rotors",
-        seen=f"the torques show rotor inertias that the robot does not have: {sizes} (kg m², or kg).",
-        remedy="State them as `armature`, one for each joint; or forcegp identify --model consistent, which estimates "
-        "them with all else.",
+        seen="the torques show rotor inertias that the robot does not have: "
+        f"{', '.join(f'{name} {stated[name]:.3g}' for name in joints)} (kg m², or kg).",
+        remedy="State them as `armature`, one for each joint; or forcegp fit --forces rotor,bodies.",
         joints=joints,
-        numbers={"armature": dict(zip(inputs.names, values.tolist(), strict=True))},
+        numbers={"armature": stated},
     )
 
 
-def _friction(inputs: CheckInput, found: PayloadEstimate) -> Finding:
-    def each(field: str) -> str:
-        return ", ".join(f"{found.joints[f'{field}.{name}'][0]:.3g}" for name in inputs.names)
-
+def _friction(found: StructuredPosterior) -> Finding:
+    laws = [force_name(law) for law in usual_friction()]
+    parts = {name: each for name, each in found.parameters.items() if name.partition(".")[0] in laws}
+    joints = found.model.robot.joint_names
+    each: dict[str, list[str]] = {}
+    for name, estimate in parts.items():
+        label = next(name.removesuffix(f".{joint}") for joint in joints if name.endswith(f".{joint}"))
+        each.setdefault(label, []).append(f"{estimate.value:.3g}")
     return ok(
         subject="friction",
-        seen=f"of the joints: dry {each('coulomb')} Nm or N, more near rest by {each('breakaway')}; viscous "
-        f"{each('viscous')} per rad/s or m/s.",
-        remedy="forcegp identify --model consistent --friction viscous,stribeck; or let forcegp fit learn it.",
-        numbers={name: value for name, (value, _) in found.joints.items()},
+        seen=f"of the joints: {'; '.join(f'{label} ' + ', '.join(values) for label, values in each.items())}.",
+        remedy=f"forcegp fit --forces {','.join(laws)}; or gp:joint-friction, which needs no law.",
+        numbers={name: estimate.value for name, estimate in parts.items()},
     )

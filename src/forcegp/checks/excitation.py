@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from forcegp.analytical.identifiability import base_parameters, excitation
 from forcegp.checks.check_input import CheckInput, Finding, listed, look, numbers_of, ok
 from forcegp.checks.successive_rows import white_noise
 from forcegp.errors import InvalidInput
+from forcegp.evidence.identifiability import base_parameters, excitation
 from forcegp.summary import plain
 
 MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name

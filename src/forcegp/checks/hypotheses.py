@@ -20,7 +20,7 @@ from forcegp.checks.torques import (
     estimated_gravity,
     fit_torques,
     inverse_dynamics,
-    unexplained_share,
+    unexplained_shares,
     with_gravity,
 )
 from forcegp.data import Dataset
@@ -95,12 +95,12 @@ def _explains(now: Hypothesis, best: Hypothesis) -> bool:
 def _hypothesis(robot: Robot, correction: Correction, given: Dataset, **more: Any) -> Hypothesis:
     rows = correction.applied(given)
     tau = inverse_dynamics(robot, rows)
-    return Hypothesis(robot=robot, correction=correction, rows=rows, tau=tau, fit=fit_torques(tau, rows), **more)
+    return Hypothesis(robot=robot, correction=correction, rows=rows, tau=tau, fit=fit_torques(robot, tau, rows), **more)
 
 
 def _torque_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
     """All joints whose torque fits with the other sign, together."""
-    other = fit_torques(now.tau, now.rows, -now.rows.u)
+    other = fit_torques(now.robot, now.tau, now.rows, -now.rows.u)
     with np.errstate(invalid="ignore"):
         turned = (other.unexplained < 0.5 * now.fit.unexplained) & (other.unexplained < STILL_UNEXPLAINED)
         turned &= now.fit.unexplained > SMALLEST
@@ -125,12 +125,8 @@ def _torque_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Itera
     """Torques in the places of other joints: the assignment that leaves least unexplained."""
     names, nv = inputs.names, given.nv
 
-    def unexplained(joint: int, column: int) -> float:
-        rows = now.rows
-        left = unexplained_share(now.tau[:, joint], rows.v[:, joint], rows.a[:, joint], rows.u[:, column])
-        return float(np.log(np.clip(left, SMALLEST, 1.0))) if np.isfinite(left) else 0.0
-
-    table = np.array([[unexplained(joint, column) for column in range(nv)] for joint in range(nv)])
+    left = unexplained_shares(now.robot, now.tau, now.rows)
+    table = np.where(np.isfinite(left), np.log(np.clip(left, SMALLEST, 1.0)), 0.0)
     _, order = linear_sum_assignment(table)
     moved = order != np.arange(nv)
     if not moved.any():

@@ -19,7 +19,7 @@ from forcegp.checks.successive_rows import whole_windows
 from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
 from forcegp.data.row_selection import consecutive
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots.manifold import Group, difference, pose
 
 CLEARLY = 0.3
@@ -82,12 +82,12 @@ class _Windows:
         return torch.tensor(values[self.rows.ravel()])
 
 
-def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
+def base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     """What is seen of the bases of a log."""
     if not dataset.time_ordered or consecutive(dataset).sum() < 10:
         yield look(subject="base", seen="too few successive rows to compare positions and velocities of the base.")
         return
-    for group in system.robot.layout.groups:
+    for group in model.robot.layout.groups:
         own = np.arange(dataset.nv)[group.rows]
         windows = _Windows.of(dataset, own[[k for k, free in enumerate(group.motion.free) if free > 2]])
         q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
@@ -96,7 +96,7 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
         each = v.unflatten(0, windows.rows.shape)
         change = (each[:, -1] - each[:, 0]) / windows.step
         error, size = _rms(change - windows.mean(a)), _rms(change)
-        measured = in_base(group, at, a, ("imu", "body"), v, system.robot.gravity)
+        measured = in_base(group, at, a, ("imu", "body"), v, model.robot.gravity)
         specific = _rms(change - windows.mean(measured))
         if error > 2.0 * size and specific < CLEARLY * error:
             yield wrong(
@@ -118,40 +118,40 @@ def base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Findin
             )
 
 
-def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
-    """A base that no foot, wheel, thruster or known force of the system moves, although it does not fall or drives."""
-    robot, groups = system.robot, system.robot.layout.groups
+def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+    """A base that no foot, wheel, thruster or known force of the model moves, although it does not fall or drives."""
+    robot, groups = model.robot, model.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
     planar = bool(groups) and groups[0].kind == "planar"
     if not planar and (not groups or groups[0].kind != "floating" or not weight):
         return
-    complete, feet = dataset.u.shape[1] == len(system.inputs), {contact.switch for contact in system.touching}
+    complete, feet = dataset.u.shape[1] == len(model.inputs), {contact.switch for contact in model.touching}
     if None in feet or (feet and not complete):
         return
-    flags = dataset.u[:, [column for column, name in enumerate(system.inputs) if name in feet]] > 0.5
+    flags = dataset.u[:, [column for column, name in enumerate(model.inputs) if name in feet]] > 0.5
     if flags.any(1).mean() > 0.5:  # the median window shows less of flight
         return
     group = groups[0]
     linear = 2 if planar else 3
     windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][linear:], MOST_FORCES)
-    inputs = dataset.u if complete else np.zeros((len(dataset), len(system.inputs)))
+    inputs = dataset.u if complete else np.zeros((len(dataset), len(model.inputs)))
     q, v, u, a = (windows.of_signal(x).to(robot.device) for x in (dataset.q, dataset.v, inputs, dataset.a))
 
     def missing(inputs: Tensor) -> Tensor:
-        """The linear part of M a less what the system knows of, in the axes of the base, in N."""
-        dynamics = system.dynamics(q, v, inputs)
+        """The linear part of M a less what the model knows of, in the axes of the base, in N."""
+        dynamics = model.dynamics(q, v, inputs)
         return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :linear].cpu()
 
     def size(force: Tensor) -> float:
         return float(torch.linalg.vector_norm(windows.mean(force), dim=-1).median())
 
-    found, thrusters = size(missing(u)), sorted(thruster_columns(system)) if complete else []
+    found, thrusters = size(missing(u)), sorted(thruster_columns(model)) if complete else []
     if planar:
         needed = size(robot.mass * a[:, group.rows][:, :linear].cpu())
         if found > CARRIED * needed:
             yield look(
                 subject="base force",
-                seen=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the system explains "
+                seen=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
                 f"(its acceleration takes {needed:.3g} N); masses found from this log would be wrong.",
                 remedy="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
                 "For the arm alone, record it while the base stands, and leave out --base and the columns of the base.",
@@ -164,7 +164,7 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     if not thrusters and found > THOUSANDS * weight:
         yield wrong(
             subject="base force",
-            seen=f"{group.name!r} moves under {found:.3g} N that nothing in the system explains {weighs}.",
+            seen=f"{group.name!r} moves under {found:.3g} N that nothing in the model explains {weighs}.",
             remedy="Are positions of the base in mm? Then give their unit, as in forcegp import --unit q=mm,v=mm/s.",
             numbers=numbers,
         )
@@ -172,12 +172,12 @@ def carried_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Fin
     if not thrusters:
         yield wrong(
             subject="base force",
-            seen=f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the system explains, "
+            seen=f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, "
             f"no foot that stands and no thruster {weighs}.",
             remedy="Let forcegp import --feet name what stands, and compare "
             f"{', '.join(sorted(map(str, feet)))} with heights."
             if feet
-            else "Describe them in Python (docs/how-to/moving-bases.md), write system.to_json() into a file, and "
+            else "Describe them in Python (docs/how-to/moving-bases.md), write model.to_json() into a file, and "
             "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
             numbers=numbers,
         )

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import Finding, look
-from forcegp.checks.torques import inverse_dynamics, turning_speed, with_gravity
+from forcegp.checks.torques import SLOW, columns_of, inverse_dynamics, with_gravity
 from forcegp.data import Dataset
 from forcegp.robots import Robot
 
@@ -25,7 +25,7 @@ FEWEST_ROWS = 30
 STANDARD_GRAVITY = 9.81  # m/s^2
 NO_GRAVITY = 0.05
 FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))  # values that are tried for a factor
-REMEDY = "Correct the URDF, or the unit of the signal; or let forcegp identify estimate it from this log."
+REMEDY = "Correct the URDF, or the unit of the signal; or let forcegp fit --forces bodies estimate it from this log."
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,13 +53,11 @@ class Unexplained:
     `noise` (nv,) is that of tau [Nm or N], from the acceleration: a factor below 1 makes it smaller, which is no merit.
     """
 
-    def __init__(self, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> None:
+    def __init__(self, robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> None:
         self.u, self.bases, self.rotors = rows.u, [], []
+        _, *of_laws = columns_of(robot, rows, (SLOW, 5.0 * SLOW))
         for joint in range(rows.nv):
-            v = rows.v[:, joint]
-            slow = turning_speed(v)
-            columns = np.stack([np.ones_like(v), v, np.tanh(v / slow), np.tanh(v / (5.0 * slow))], axis=1)
-            basis = np.linalg.qr(columns)[0]
+            basis = np.linalg.qr(np.stack([each[:, joint] for each in of_laws], axis=1))[0]
             rotor = rows.a[:, joint] - basis @ (basis.T @ rows.a[:, joint])
             self.bases.append(basis)
             self.rotors.append(rotor / max(float(np.linalg.norm(rotor)), 1e-300))
@@ -91,7 +89,7 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
         return []
     with torch.no_grad():
         M = robot.mass_matrix(torch.tensor(rows.q, device=robot.device)).cpu().numpy()
-    left = Unexplained(rows, np.sqrt(np.square(M).mean(axis=0) @ np.square(noise)))
+    left = Unexplained(robot, rows, np.sqrt(np.square(M).mean(axis=0) @ np.square(noise)))
     tau = inverse_dynamics(robot, rows)
     now = left.logarithms(tau[None], np.ones((1, 1)))[0]
     if np.exp(now).max() < 100.0 * FLOOR:

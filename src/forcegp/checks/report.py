@@ -31,7 +31,7 @@ from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import InvalidInput, require_type
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
 from forcegp.summary import listed as shortened
@@ -58,7 +58,7 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
         yield look(
             subject="URDF",
             seen=f"all {len(heavy)} moving links have the same mass and inertia ({heavy[0].mass:g} kg): a placeholder.",
-            remedy="Use the manufacturer's URDF, or identify the inertias (forcegp identify).",
+            remedy="Use the manufacturer's URDF, or identify the inertias (forcegp fit --forces bodies).",
         )
     for link in heavy:
         gyration = float(np.sqrt(np.linalg.eigvalsh(np.array(link.inertia)).max() / link.mass))
@@ -73,7 +73,7 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
             )
 
 
-def contact_findings(inputs: CheckInput, system: MechanicalSystem | None) -> list[Finding]:
+def contact_findings(inputs: CheckInput, model: Model | None) -> list[Finding]:
     """Contacts beside which the motion runs, whose force acts elsewhere or not at all, or that are missing."""
     return [
         Finding(
@@ -83,7 +83,7 @@ def contact_findings(inputs: CheckInput, system: MechanicalSystem | None) -> lis
             remedy=doubt.remedy,
             numbers={"kind": doubt.kind, **doubt.numbers},
         )
-        for doubt in contact_doubts(inputs.mended, system)
+        for doubt in contact_doubts(inputs.mended, model)
     ]
 
 
@@ -155,12 +155,10 @@ class CheckReport(Summary):
         }
 
 
-def check(
-    dataset: Dataset, system: MechanicalSystem | None = None, *, preparation: Preparation | None = None
-) -> CheckReport:
+def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparation | None = None) -> CheckReport:
     """Look for what would spoil a model: wrong units, signs, joints, delays; dead channels; motion that shows nothing.
 
-    `system` is the robot that was recorded (default: that of the dataset); without one, torques are not compared.
+    `model` is the robot that was recorded (default: that of the dataset); without one, torques are not compared.
     `preparation` sets how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
     `trim` are not used. Nothing is changed.
 
@@ -169,15 +167,15 @@ def check(
     require_type("dataset", dataset, Dataset)
     preparation = Preparation(cutoff="auto") if preparation is None else preparation
     require_type("preparation", preparation, Preparation)
-    system = dataset.system if system is None else system
-    if system is not None:
-        robot = require_type("system", system, MechanicalSystem).robot
+    model = dataset.model if model is None else model
+    if model is not None:
+        robot = require_type("model", model, Model).robot
         require_rows("dataset", dataset, robot.joint_names, robot.name)
         if robot.layout.groups:  # torques and filters are not looked at
-            inputs = CheckInput.as_recorded(dataset, system)
-            return CheckReport(findings=_of_base(dataset, system, preparation), inputs=inputs, comparison=None)
-    inputs = CheckInput.of(dataset, system, preparation)
-    findings, comparison = _findings(inputs, system)
+            inputs = CheckInput.as_recorded(dataset, model)
+            return CheckReport(findings=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
+    inputs = CheckInput.of(dataset, model, preparation)
+    findings, comparison = _findings(inputs, model)
     if comparison is not None and "torque unit" not in {each.subject for each in findings if each.severity == "wrong"}:
         shown = list(dynamics_findings(inputs, comparison))
         if "payload" in {each.subject for each in shown}:  # which explains a heavy last link better than a factor
@@ -190,31 +188,31 @@ def check(
     return CheckReport(findings=_sorted(findings), inputs=inputs, comparison=comparison)
 
 
-def quick_check(dataset: Dataset, system: MechanicalSystem | None = None) -> tuple[Finding, ...]:
+def quick_check(dataset: Dataset, model: Model | None = None) -> tuple[Finding, ...]:
     """What of `check` is cheap enough before every fit, worst first: only what would make the fit wrong.
 
     From a few stretches of the log and without a filter, so that it takes a tenth of a second; rows out of order and
     short logs are taken, of which less can be checked. Raises InvalidInput for a robot with other joints.
     """
-    system = dataset.system if system is None else system
-    if system is not None:
-        require_rows("dataset", dataset, system.robot.joint_names, system.robot.name)
-        if system.robot.layout.groups:
-            return tuple(each for each in _of_base(dataset, system) if each.severity != "ok")
-    findings, _ = _findings(CheckInput.quick(dataset, system), system)
+    model = dataset.model if model is None else model
+    if model is not None:
+        require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
+        if model.robot.layout.groups:
+            return tuple(each for each in _of_base(dataset, model) if each.severity != "ok")
+    findings, _ = _findings(CheckInput.quick(dataset, model), model)
     said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
     if dataset.nv > 1:  # friction of one joint can look like a delay
         said = [each for each in said if each.subject != "delay" or len(each.joints) > 1]
     return _sorted([*said, *(each for each in findings if each.severity == "wrong")])
 
 
-def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list[Finding], Hypothesis | None]:
+def _findings(inputs: CheckInput, model: Model | None) -> tuple[list[Finding], Hypothesis | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
     findings = [*signal_findings(inputs), *stated_noise_findings(inputs)]
     if inputs.log.time_ordered:
         findings = [*sampling_findings(inputs), *findings, *motion_findings(inputs)]
-    contacts = contact_findings(inputs, system)
-    findings += [*contacts, *(stance_findings(inputs.log, system) if system is not None else ())]
+    contacts = contact_findings(inputs, model)
+    findings += [*contacts, *(stance_findings(inputs.log, model) if model is not None else ())]
     comparison = None
     if inputs.compared is None:
         return findings, None
@@ -231,15 +229,15 @@ def _findings(inputs: CheckInput, system: MechanicalSystem | None) -> tuple[list
     return findings, comparison
 
 
-def _of_base(dataset: Dataset, system: MechanicalSystem, preparation: Preparation | None = None) -> tuple[Finding, ...]:
+def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = None) -> tuple[Finding, ...]:
     """What is seen of a base that moves, of the joints and of what holds it; torques are not looked at."""
-    unmeasured = list(unmeasured_base_findings(dataset, system))
-    of_joints = list(_of_single_joints(dataset, system.robot, preparation))
-    of_base = unmeasured or list(base_findings(dataset, system))
+    unmeasured = list(unmeasured_base_findings(dataset, model))
+    of_joints = list(_of_single_joints(dataset, model.robot, preparation))
+    of_base = unmeasured or list(base_findings(dataset, model))
     if not unmeasured and worst(of_base) != "wrong":  # forces in wrong axes show nothing
-        of_base += carried_findings(dataset, system)
-    flags = stance_findings(dataset, system) if worst(of_joints) != "wrong" else ()  # wrong v contradict any flag
-    return _sorted([*of_base, *of_joints, *gravity_findings(dataset, system), *flags])
+        of_base += carried_findings(dataset, model)
+    flags = stance_findings(dataset, model) if worst(of_joints) != "wrong" else ()  # wrong v contradict any flag
+    return _sorted([*of_base, *of_joints, *gravity_findings(dataset, model), *flags])
 
 
 def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Finding]:

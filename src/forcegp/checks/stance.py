@@ -11,38 +11,38 @@ from forcegp.data import Dataset, estimate_stance
 from forcegp.data.gravity import missing_gravity
 from forcegp.data.stance import TILTS, tilting
 from forcegp.errors import ContactError
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 
 MOST_ROWS = 4000
 FEW, RARE, RESTING = 0.05, 0.002, 0.02
 """Shares of rows of stance that the motion contradicts and that are wrong, or worth a look; the same of swing."""
 
 
-def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
+def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     """Contacts that contradict each other; flags that are no flags, or that `estimate_stance` contradicts."""
-    if not system.contacts:
+    if not model.contacts:
         return
     every = -(-len(dataset) // MOST_ROWS)
     dataset = dataset.rows(slice(None, None, every))
     try:
-        system.check_states(*(torch.tensor(x, device=system.robot.device) for x in (dataset.q, dataset.v, dataset.u)))
+        model.check_states(*(torch.tensor(x, device=model.robot.device) for x in (dataset.q, dataset.v, dataset.u)))
     except ContactError as error:
         counted = f" (rows are counted in every {every}. one)" if every > 1 else ""
         yield wrong(subject="contacts", seen=f"{error}{counted}")
-    names = dict.fromkeys(contact.switch for contact in system.contacts if contact.switch is not None)
+    names = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
     if not names:
         return
-    if missing_gravity(dataset, system) is not None:  # another finding, without which forces show nothing
+    if missing_gravity(dataset, model) is not None:  # another finding, without which forces show nothing
         return
-    found = estimate_stance(dataset, system)
-    leans = tilting(dataset, system, found.names, dataset.u[:, [system.inputs.index(name) for name in found.names]])
-    shared = {name: finding for name in found.names for finding in _shared_flag(dataset, system, name, every)}
+    found = estimate_stance(dataset, model)
+    leans = tilting(dataset, model, found.names, dataset.u[:, [model.inputs.index(name) for name in found.names]])
+    shared = {name: finding for name in found.names for finding in _shared_flag(dataset, model, name, every)}
     yield from shared.values()
     for k, name in enumerate(found.names):
         if name in shared:
             continue
-        logged, shown, speed = dataset.u[:, system.inputs.index(name)], found.flags[:, k], found.speed[:, k]
-        frame = next(contact.frame for contact in system.contacts if contact.switch == name)
+        logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
+        frame = next(contact.frame for contact in model.contacts if contact.switch == name)
         stands = logged > 0.5
         leaning = float(leans[:, k].sum() / max(stands.sum(), 1))
         if leaning > FEW:
@@ -90,16 +90,16 @@ def stance_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Find
             yield ok(subject="contact flag", seen=f"{name!r} agrees with motion and forces.", numbers=numbers)
 
 
-def _shared_flag(dataset: Dataset, system: MechanicalSystem, name: str, every: int) -> Iterator[Finding]:
+def _shared_flag(dataset: Dataset, model: Model, name: str, every: int) -> Iterator[Finding]:
     """Feet of this flag of which only some stand, by flags of their own."""
-    frames = list(dict.fromkeys(contact.frame for contact in system.contacts if contact.switch == name))
+    frames = list(dict.fromkeys(contact.frame for contact in model.contacts if contact.switch == name))
     if len(frames) < 2:
         return
     own = {frame: f"{name} {frame}" for frame in frames}
-    contacts = [replace(each, switch=own[each.frame]) if each.switch == name else each for each in system.contacts]
-    apart = system.with_contacts(contacts)
-    places = [system.inputs.index(x if x in system.inputs else name) for x in apart.inputs]
-    found = estimate_stance(replace(dataset, system=apart, u=dataset.u[:, places], truth={}))
+    contacts = [replace(each, switch=own[each.frame]) if each.switch == name else each for each in model.contacts]
+    apart = model.with_contacts(contacts)
+    places = [model.inputs.index(x if x in model.inputs else name) for x in apart.inputs]
+    found = estimate_stance(replace(dataset, model=apart, u=dataset.u[:, places], truth={}))
     flags = found.flags[:, [found.names.index(switch) for switch in own.values()]]
     some = (flags == 1.0).any(axis=1) & (flags == 0.0).any(axis=1)
     if some.mean() > FEW:
@@ -115,16 +115,16 @@ def _shared_flag(dataset: Dataset, system: MechanicalSystem, name: str, every: i
         )
 
 
-def gravity_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
+def gravity_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     """A robot in a vertical plane that was read without gravity in it."""
-    found = missing_gravity(dataset, system)
+    found = missing_gravity(dataset, model)
     if found is not None:
         yield wrong(subject="gravity", seen=f"{found[0]}.", remedy=found[1])
 
 
-def unmeasured_base_findings(dataset: Dataset, system: MechanicalSystem) -> Iterator[Finding]:
+def unmeasured_base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     """A base whose columns hold one number while joints move: nobody measured it."""
-    for group in system.robot.layout.groups:
+    for group in model.robot.layout.groups:
         others = np.delete(np.arange(dataset.nv), np.arange(group.rows.start, group.rows.stop))
         still = not np.ptp(dataset.q[:, group.places], axis=0).any() and not dataset.v[:, group.rows].any()
         moves = not len(others) or np.ptp(dataset.v[:, others], axis=0).any()

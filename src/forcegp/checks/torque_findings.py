@@ -159,4 +159,4 @@ def not_compared(inputs: CheckInput) -> Finding:
             "known. Check a log of free motion, too.",
         )
     seen = "not compared with inverse dynamics: no robot was given."
-    return look(subject="torque", seen=seen, remedy="Give the robot: `system`.")
+    return look(subject="torque", seen=seen, remedy="Give the robot: `model`.")

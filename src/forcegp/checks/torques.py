@@ -1,10 +1,11 @@
 """Measured torques against inverse dynamics: how much of each the robot explains, and by what factor.
 
-For every joint, `u = s tau(q, v, a) + I a + d v + c tanh(v / w) + o` with tau the inverse dynamics of the URDF and
-s, I, d, c >= 0, by non-negative least squares (Lawson & Hanson 1974): friction always brakes, and a robot that needs a
-negative factor was logged with a wrong sign.
+For every joint, `u = s tau(q, v, a) + I a + d v + c tanh(v / w) + o` with tau the inverse dynamics of the URDF, the
+laws of a rotor, viscous and dry friction (`forcegp.forces.columns`), and s, I, d, c >= 0, by non-negative least squares
+(Lawson & Hanson 1974): friction always brakes, and a robot that needs a negative factor was logged with a wrong sign.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
 from forcegp.data import Dataset
+from forcegp.forces.columns import usual_columns
 from forcegp.robots import Robot
 
 CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding
@@ -48,7 +50,7 @@ class Correction:
         """The corrected log, without robot, truth and metadata, which belong to it as it was."""
         moved = {name: getattr(dataset, name)[:, self.motion_from] * self.motion_factor for name in ("q", "v", "a")}
         u = dataset.u[:, self.torque_from] * self.torque_factor
-        return replace(dataset, **moved, u=u, system=None, noise_std=None, truth={}, metadata={})
+        return replace(dataset, **moved, u=u, model=None, noise_std=None, truth={}, metadata={})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +58,7 @@ class TorqueFit:
     """What the robot explains of the torque of each joint.
 
     `unexplained` (nv,) is the share of the torque's variance that is left, NaN for a torque that never changes;
-    `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque, with w = `slow` (nv,).
+    `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque.
     `friction` (nv,) is the share that is left without inverse dynamics and armature, `plain` (nv,) that without
     armature, whose s is `factor` (nv,): where tau is nearly proportional to a, s and I cannot be separated.
     """
@@ -67,7 +69,6 @@ class TorqueFit:
     factor: Float[np.ndarray, " nv"]
     coefficients: Float[np.ndarray, "nv 5"]
     predicted: Float[np.ndarray, "rows nv"]
-    slow: Float[np.ndarray, " nv"]
 
     @property
     def rests_on_robot(self) -> Bool[np.ndarray, " nv"]:
@@ -78,15 +79,15 @@ class TorqueFit:
         with np.errstate(invalid="ignore"):
             return (self.friction - self.plain > RESTS_ON_ROBOT) & (self.plain < POOR) & (self.factor > 0.0)
 
-    def at(self, tau: Float[np.ndarray, "rows nv"], rows: Dataset) -> Float[np.ndarray, "rows nv"]:
+    def at(self, robot: Robot, tau: Float[np.ndarray, "rows nv"], rows: Dataset) -> Float[np.ndarray, "rows nv"]:
         """The fitted torque of other rows, whose inverse dynamics is `tau`."""
-        s, armature, viscous, dry, constant = self.coefficients.T
-        return s * tau + armature * rows.a + viscous * rows.v + dry * np.tanh(rows.v / self.slow) + constant
+        parts = np.stack([tau, *columns_of(robot, rows)[:-1]], axis=-1)
+        return (parts * self.coefficients[:, :4]).sum(-1) + self.coefficients[:, 4]
 
 
-def turning_speed(v: Float[np.ndarray, " rows"]) -> float:
-    """The velocity at which dry friction turns over."""
-    return SLOW * float(np.sqrt(np.square(v).mean())) + 1e-12
+def columns_of(robot: Robot, rows: Dataset, widths: Sequence[float] = (SLOW,)) -> list[np.ndarray]:
+    """Torques (rows, nv) of a rotor, viscous and dry friction, and an offset."""
+    return usual_columns(robot, rows.q, rows.v, rows.u, rows.a, widths)
 
 
 def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
@@ -97,11 +98,12 @@ def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"
 
 
 def fit_torques(
-    tau: Float[np.ndarray, "rows nv"], rows: Dataset, u: Float[np.ndarray, "rows nu"] | None = None
+    robot: Robot, tau: Float[np.ndarray, "rows nv"], rows: Dataset, u: Float[np.ndarray, "rows nu"] | None = None
 ) -> TorqueFit:
     """Fit the torques of these rows, or others, to inverse dynamics tau of their motion."""
     u = rows.u if u is None else u
-    fits = [_JointFit(tau[:, joint], rows.v[:, joint], rows.a[:, joint], u[:, joint]) for joint in range(rows.nv)]
+    parts = np.stack([tau, *columns_of(robot, rows)[:-1]], axis=-1)
+    fits = [_JointFit(parts[:, joint], u[:, joint]) for joint in range(rows.nv)]
     every, plain, friction = ([fit.solved(columns) for fit in fits] for columns in ((0, 1, 2, 3), (0, 2, 3), (2, 3)))
     return TorqueFit(
         unexplained=np.array([share for _, share in every]),
@@ -109,22 +111,21 @@ def fit_torques(
         plain=np.array([share for _, share in plain]),
         factor=np.array([solution[0] for solution, _ in plain]),
         coefficients=np.stack([solution for solution, _ in every]),
-        slow=np.array([fit.slow for fit in fits]),
         predicted=np.stack([fit.predicted(solution) for fit, (solution, _) in zip(fits, every, strict=True)], axis=1),
     )
 
 
-def unexplained_share(tau: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> float:
-    """Share of the variance of one torque (rows,) that one joint's tau, v and a leave; NaN if u is constant."""
-    return _JointFit(tau, v, a, u).solved((0, 1, 2, 3))[1]
+def unexplained_shares(robot: Robot, tau: np.ndarray, rows: Dataset) -> Float[np.ndarray, "nv nv"]:
+    """Share of the variance of each torque (column) that tau, v and a of each joint (row) leave; NaN if constant."""
+    parts, joints = np.stack([tau, *columns_of(robot, rows)[:-1]], axis=-1), range(rows.nv)
+    return np.array([[_JointFit(parts[:, j], rows.u[:, k]).solved((0, 1, 2, 3))[1] for k in joints] for j in joints])
 
 
 class _JointFit:
     """One joint's torque and what may explain it; a free constant takes the means out of both sides."""
 
-    def __init__(self, tau: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> None:
-        self.slow = turning_speed(v)
-        self.columns = np.stack([tau, a, v, np.tanh(v / self.slow)], axis=1)
+    def __init__(self, columns: Float[np.ndarray, "rows 4"], u: Float[np.ndarray, " rows"]) -> None:
+        self.columns = columns
         self.centered = self.columns - self.columns.mean(axis=0)
         self.size = np.linalg.norm(self.centered, axis=0)
         self.mean = float(u.mean())
@@ -170,10 +171,10 @@ def estimated_gravity(
     with torch.no_grad():
         axes = [with_gravity(robot, axis).gravity_forces(q).cpu().numpy() for axis in np.eye(3)]
     pulls = np.stack(axes, axis=-1)  # (rows, nv, 3): torque per m/s^2
-    matrices, targets = [], []
+    of_laws, matrices, targets = columns_of(robot, rows), [], []
     for joint in np.flatnonzero(np.isfinite(fit.unexplained)):
-        v, a, u, pull = rows.v[:, joint], rows.a[:, joint], rows.u[:, joint], pulls[:, joint]
-        free = np.stack([tau[:, joint] - pull @ nominal, a, v, np.tanh(v / turning_speed(v)), np.ones_like(v)], axis=1)
+        u, pull = rows.u[:, joint], pulls[:, joint]
+        free = np.stack([tau[:, joint] - pull @ nominal, *(each[:, joint] for each in of_laws)], axis=1)
         basis = np.linalg.qr(free)[0]
         factor = fit.factor[joint] if fit.factor[joint] > 0.0 else 1.0
         weight = 1.0 / max(float(np.std(u)), 1e-12)

@@ -14,19 +14,26 @@ from typing_extensions import override
 from tyro.conf import arg
 
 import forcegp
-import forcegp.analytical
 import forcegp.checks
 import forcegp.data
+import forcegp.evaluation
+import forcegp.evidence
 import forcegp.report
 import forcegp.validation
-from forcegp.atomic_files import atomic_file, atomic_folder, write_json, write_text
-from forcegp.cli.auto_answer import NAMES, answer_lines, best_sentence, default_models, identification, payload_text
-from forcegp.cli.command import CONFIG, URDF, Resuming, listed, unless_given
-from forcegp.cli.fit import calibrated_with_progress
-from forcegp.cli.identify import rounds_reported
+from forcegp.atomic_files import atomic_file, atomic_folder, write_json
+from forcegp.cli.auto_answer import (
+    answer_lines,
+    best_sentence,
+    default_models,
+    identification,
+    payload_text,
+    short_name,
+)
+from forcegp.cli.command import CONFIG, FIELDS, URDF, Resuming, listed, unless_given
+from forcegp.cli.fit import write_estimates
 from forcegp.cli.import_log import Import
-from forcegp.cli.input_options import SYSTEM_FILE
-from forcegp.cli.learning_options import MODEL_PARTS
+from forcegp.cli.input_options import forces_of
+from forcegp.cli.payload import payload_dict, with_payload
 from forcegp.cli.terminal import Terminal, facts, findings_table
 from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit, NumericalError
 
@@ -58,7 +65,7 @@ class Auto(Resuming, Import):
     """Correct mistakes in units, signs and the order of joints, and continue."""
     accept: bool = False
     """Continue although the log contains mistakes."""
-    models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=MODEL_PARTS)] = ()
+    models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=FIELDS)] = ()
     """What is compared, as for forcegp validate."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """Where a payload may be."""
@@ -84,12 +91,14 @@ class Auto(Resuming, Import):
             raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-        system, mapping = self._system(), self._mapping(terminal)
-        assert system is not None
+        model, mapping = self._model(), self._mapping(terminal)
+        assert model is not None
+        for note in forces_of(model):
+            terminal.note(note)
         path = self.out.parent / f".{self.out.name}.log.h5"
         with contextlib.ExitStack() as cleanup:
             cleanup.callback(path.unlink, missing_ok=True)  # where the log is refused
-            dataset, done, mapping, mistakes = self._imported(terminal, system, mapping, path)
+            dataset, done, mapping, mistakes = self._imported(terminal, model, mapping, path)
             corrected = self._command(mapping)
             if mistakes and not self.correct:
                 terminal.show(findings_table(mistakes, terminal.worded), "Run:")
@@ -110,22 +119,26 @@ class Auto(Resuming, Import):
             self.out.mkdir(parents=True, exist_ok=True)
             path.replace(self.out / "log.h5")
         with terminal.progress("preparing"):
-            if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.system):
+            if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
                 timed = self.with_delay_that_shows(terminal, preparation, dataset)
             else:
                 timed = replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
+        named = forcegp.evaluation.named_model
+        assert recording.model is not None, "it has one"
+        expression, _, evidence = identification(model).partition("@")
+        laws = forcegp.evaluation.summands(expression)
         with terminal.progress("identifying", may_end_early=True) as progress:
-            how: dict[str, Any] = {"friction": forcegp.analytical.LAWS, "progress": rounds_reported(progress)}
-            identified = forcegp.identify_analytical(recording, **how)
-        with terminal.progress("looking for a payload"):
+            how: dict[str, Any] = {"evidence": forcegp.evidence.parse_evidence(evidence), "report": progress}
+            identified: Any = forcegp.evaluation.learn(named(recording.model, laws), recording, **how)[0]
+        with terminal.progress("looking for a payload", may_end_early=True) as progress:
             try:
-                payload = forcegp.analytical.identify_payload(recording, link=self.link, identified=identified)
-                why_not = ""
+                payload = with_payload(named(recording.model, laws[1:]), recording, self.link, report=progress)
+                held = payload_text(payload)
             except DatasetError as error:
-                payload, why_not = None, f"not estimated: {error}"
-        document, posterior = self._validated(terminal, rows, recording, system)
+                payload, held = None, f"not estimated: {error}"
+        document, posterior = self._validated(terminal, rows, recording, model)
         content: dict[str, Any] = {
             "out": str(self.out),
             "seconds": sum(each["seconds"] for each in done["recordings"]),
@@ -133,27 +146,25 @@ class Auto(Resuming, Import):
             "mistakes": [finding.to_dict() for finding in mistakes],
             "check": report.to_dict(),
             "preparation": settings,
-            "payload": None if payload is None else payload.to_dict(),
-            "identified": identified.to_dict(),
-            "weak": list(identified.weak_directions),
+            "payload": None if payload is None else payload_dict(payload, False),
+            "identified": identified.estimates.to_dict(),
             **{name: document[name] for name in ("models", "joint_names", "units")},
             "recommended": forcegp.validation.recommended(document),
             "code": self._code(terminal, posterior),
         }
-        answer = answer_lines(content, dataset, identified, why_not if payload is None else payload_text(payload))
+        answer = answer_lines(content, dataset, identified, held)
         best = best_sentence(content, dataset)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer)
         content |= {"cpu_seconds": time.process_time() - begin}
-        write_json(self.out / "payload.json", {} if payload is None else payload.to_dict())
-        write_text(self.out / SYSTEM_FILE, identified.system.to_json() + "\n")
-        identified.system.to_urdf(self.out / "identified.urdf")
+        write_json(self.out / "payload.json", content["payload"] or {})
+        write_estimates(self.out, identified)
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
         terminal.show(facts("", dict(answer)), best)
         return content
 
     def _imported(
-        self, terminal: Terminal, system: forcegp.MechanicalSystem, mapping: forcegp.ColumnMapping, path: Path
+        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping, path: Path
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
         mistakes: list[forcegp.checks.Finding] = []
@@ -161,7 +172,7 @@ class Auto(Resuming, Import):
             try:
                 with terminal.progress("importing") as progress, atomic_file(path, overwrite=True) as temporary:
                     done = forcegp.import_recordings(
-                        self.logs, temporary, mapping, system=system, options=self._options(), report=progress
+                        self.logs, temporary, mapping, model=model, options=self._options(), report=progress
                     )
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
@@ -227,34 +238,33 @@ class Auto(Resuming, Import):
         return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
 
     def _validated(
-        self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, system: forcegp.MechanicalSystem
-    ) -> tuple[Mapping[str, Any], forcegp.models.Posterior]:
+        self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model
+    ) -> tuple[Mapping[str, Any], forcegp.posterior.Posterior]:
         """The comparison of the models, and the recommended one, learned from all rows and stored."""
-        laws = forcegp.analytical.LAWS
         comparison = forcegp.Comparison(
             rows,
             recording,
-            system,
+            model,
             forcegp.split_named(rows, "auto"),
             points=min(100, len(rows) // 4),
-            identification=identification(system),
+            identification=identification(model),
             restarts=1,
-            friction=laws,
         )
-        models = self.models or default_models(system)
+        models = self.models or default_models(model)
         with terminal.progress("validating") as report:
             found = forcegp.validate(
                 comparison, self.out / "validation", models=models, seeds=1, overwrite=self.overwrite, progress=report
             )
-        for name, model in found.document["models"].items():
-            for failure in model["failures"]:
+        for name, told in found.document["models"].items():
+            for failure in told["failures"]:
                 terminal.warn(f"{name} was not fitted: {failure['error']}")
         with terminal.progress("learning from all rows"):
             best = forcegp.validation.recommended(found.document)
             if best is None:
                 raise FitError(f"no model was fitted; {self.out / 'validation' / 'report.md'} has the reasons.")
             posterior = forcegp.validation.fitted_on_all_rows(comparison, best)
-        posterior, why_not = calibrated_with_progress(terminal, posterior, recording)
+        with terminal.progress("intervals of motions") as report:
+            posterior, why_not = forcegp.evaluation.with_intervals_of_motions(posterior, recording, report)
         if why_not is not None:
             terminal.note(why_not)
         forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
@@ -263,24 +273,25 @@ class Auto(Resuming, Import):
     def _write_report(
         self,
         terminal: Terminal,
-        posterior: forcegp.models.Posterior,
+        posterior: forcegp.posterior.Posterior,
         recording: forcegp.Dataset,
         content: Mapping[str, Any],
         answer: list[tuple[str, str]],
     ) -> None:
         """The page to send around."""
-        posterior, recording = forcegp.models.observing(posterior, recording)
+        posterior, recording = forcegp.posterior.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
+        names = {name: short_name(name) for name in content["models"]}
         following = [forcegp.report.Finding("Record the most informative motion:", command)]
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
                 posterior,
                 recording,
-                title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.system.robot.name}",
+                title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
                 findings=[forcegp.report.Finding(*line) for line in answer],
                 pictures=forcegp.report.validation_pictures(content),
-                tables=[forcegp.report.validation_table(content, NAMES)],
+                tables=[forcegp.report.validation_table(content, names)],
                 next_steps=following if command.startswith("forcegp") else [],
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
@@ -290,11 +301,11 @@ class Auto(Resuming, Import):
             )
             forcegp.report.write_page(self.out / "report.html", page)
 
-    def _code(self, terminal: Terminal, posterior: forcegp.models.Posterior) -> str | None:
+    def _code(self, terminal: Terminal, posterior: forcegp.posterior.Posterior) -> str | None:
         """The folder of the model's C program; None where there is no compiler, or none of this model."""
         try:
             with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
-                forcegp.export_c(cast(forcegp.models.StructuredPosterior, posterior), folder)
+                forcegp.export_c(cast(forcegp.posterior.StructuredPosterior, posterior), folder)
         except (CompilerError, InvalidInput, NumericalError) as error:
             terminal.note(f"no C program: {error}")
             return None

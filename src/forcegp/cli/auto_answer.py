@@ -7,7 +7,6 @@ from statistics import median
 from typing import Any
 
 import forcegp
-import forcegp.analytical
 import forcegp.checks
 import forcegp.data
 from forcegp.cli.import_log import stance_text
@@ -15,33 +14,36 @@ from forcegp.cli.terminal import number
 from forcegp.summary import listed
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
-FIXED, MOVING = "torque-all", "both-all"  # how the robot is identified
-NAMES = {"analytical": "the URDF"}
-NAMES |= {f"identified-{each}": "identified" for each in (FIXED, MOVING)}
-NAMES |= {f"joint-friction@{each}": "friction learned" for each in (FIXED, MOVING)}
-NAMES |= {"aerodynamic": "air forces learned", "joint-friction + aerodynamic": "friction and air forces learned"}
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+LAWS = "viscous+stribeck+offset+rotor"
 
 
-def identification(system: forcegp.MechanicalSystem) -> str:
-    """The method of `forcegp validate`."""
-    return FIXED if system.robot.space.is_vector_space else MOVING
+def short_name(name: str) -> str:
+    """What a model is called in the answer."""
+    laws, air = "gp:joint-friction" in name, "gp:aerodynamic" in name
+    learned = " and ".join(what for what, has in (("friction", laws), ("air forces", air)) if has)
+    return f"{learned} learned" if learned else {"given": "the URDF"}.get(name, name)
 
 
-def default_models(system: forcegp.MechanicalSystem) -> tuple[str, ...]:
+def identification(model: forcegp.Model) -> str:
+    """What is found of the robot by itself, as `forcegp validate --identification` takes it."""
+    laws = f"+{LAWS}" if model.robot.single_joint_names else ""
+    return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
+
+
+def default_models(model: forcegp.Model) -> tuple[str, ...]:
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given."""
-    method, friction = identification(system), bool(system.robot.single_joint_names)
-    identified = f"identified-{method}"
-    if forcegp.data.thruster_columns(system):
-        return "analytical", identified, "joint-friction + aerodynamic" if friction else "aerodynamic"
-    return "analytical", identified, *([f"joint-friction@{method}"] if friction else [])
+    friction = bool(model.robot.single_joint_names)
+    if forcegp.data.thruster_columns(model):
+        return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
+    return "given", "identified", *(["identified+gp:joint-friction"] if friction else [])
 
 
 def answer_lines(
-    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: forcegp.AnalyticalIdentification, held: str
+    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
-    names, values = dataset.joint_names, identified.values
+    names, values, robot = dataset.joint_names, identified.estimates, identified.model.robot
     import_, prepared = content["import"], content["preparation"]
     deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
@@ -59,29 +61,29 @@ def answer_lines(
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
 
     def each(field: str, pattern: str = "{:.3g}") -> str:
-        return ", ".join(pattern.format(values[f"{field}.{name}"]) for name in joints)
+        return ", ".join(pattern.format(values[f"{field}.{name}"].value) for name in joints)
 
-    joints, moving = identified.terms.joints, identified.given.robot.base != "fixed"
+    joints, moving = robot.single_joint_names, robot.base != "fixed"
     freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(names)} joints"
-    kinds = [identified.given.robot.joint(name).type == "prismatic" for name in joints]
+    kinds = [robot.joint(name).type == "prismatic" for name in joints]
     q, force = (" or ".join(dict.fromkeys(two[kind] for kind in kinds)) for two in (("rad", "m"), ("Nm", "N")))
     of_joints = [
-        ("dry friction", f"{each('coulomb')} {force}, near rest {each('breakaway')} more"),
+        ("dry friction", f"{each('stribeck.level')} {force}, near rest {each('stribeck.breakaway')} more"),
         ("viscous", f"{each('viscous')} {force} per {q}/s"),
-        ("rotors", f"{each('armature')} {INERTIA.get(q, 'kg m² or kg')}"),
+        ("rotors", f"{each('rotor')} {INERTIA.get(q, 'kg m² or kg')}"),
     ]
-    mass, error = identified.total_mass
-    by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.given) else ""
+    mass, error = values.total_mass
+    by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
     q = "rad or m" if moving else q
     models = content["models"]
     scores = "; ".join(
-        f"{NAMES.get(name, name)} {number(_motion(model))} / {number(_acceleration(model))}"
+        f"{short_name(name)} {number(_motion(model))} / {number(_acceleration(model))}"
         for name, model in models.items()
     )
     best = content["recommended"]
     covered = models[best]["coverage_95"]
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
-    weak = ", ".join(name for name, _ in content["weak"][:3])
+    weak = ", ".join(list(values.by_body or {})[:3])
     out = content["out"]
     command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
     command = "faster and larger motions, also of what hardly moved" if moving else command
@@ -94,7 +96,7 @@ def answer_lines(
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
         ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
-        ("trust", f"{NAMES.get(best, best)}{intervals}"),
+        ("trust", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]
@@ -110,17 +112,17 @@ def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
         f"positions {horizon} ahead are wrong by {{:.2g}} {unit}": _motion,
         "accelerations are wrong by {:.2g} of their standard deviation": _acceleration,
     }
-    name, error = NAMES.get(best, best), _acceleration(models[best])
+    name, error = short_name(best), _acceleration(models[best])
     if _motion(models[best]) is None and error is not None and error >= 1.0:  # no better than a = 0
         return (
             f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are wrong by "
             f"{error:.2g} of their standard deviation. Forces, flags of stance, units or the robot's file are wrong."
         )
     for pattern, score in scores.items():
-        own, urdf = score(models[best]), score(models.get("analytical"))
+        own, urdf = score(models[best]), score(models.get("given"))
         if own is not None:
-            against = "" if urdf is None or best == "analytical" else f", with the URDF alone by {urdf:.2g}"
-            if urdf is None and score is _motion and "analytical" in models:
+            against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
+            if urdf is None and score is _motion and "given" in models:
                 against = "; with the URDF alone they diverge"
             doubt = _no_better_than_rest(models[best], dataset) if error is not None and error >= 1.0 else ""
             return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}.{doubt}"
@@ -148,10 +150,13 @@ def _acceleration(model: Mapping[str, Any] | None) -> float | None:
     return None if error is None else error["median"]
 
 
-def payload_text(payload: forcegp.analytical.PayloadEstimate) -> str:
+def payload_text(found: Any) -> str:
     """Mass with its 95 % interval and place; or that there is none."""
-    mass, error = payload.mass, 1.96 * payload.standard_errors["mass"]
-    if mass < max(SURE / 1.96 * error, LEAST_PAYLOAD):
-        return f"none ({mass:.2g} ± {error:.1g} kg)"
-    center = ", ".join(f"{1e3 * x:.0f}" for x in payload.center_of_mass)
-    return f"{mass:.3g} ± {error:.1g} kg at ({center}) mm of {payload.link}, if the URDF's links are right"
+    parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
+    mass, *center = parts.values()
+    error = 0.5 * (mass.interval[1] - mass.interval[0])
+    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
+        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
+    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
+    [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, if the URDF's links are right"

@@ -44,9 +44,9 @@ class Check(CutoffOptions, RobotOptions, Overwriting):
 
         preparation = self._preparation()
         dataset = forcegp.Dataset.load(self.data)
-        system = self.system_if_any(dataset, self.data)
+        model = self.model_if_any(dataset, self.data)
         with terminal.progress("checking"):
-            report = forcegp.check(dataset, system, preparation=preparation)
+            report = forcegp.check(dataset, model, preparation=preparation)
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
             with self.folder(self.plots, {"data": str(self.data)}) as folder:

@@ -81,7 +81,7 @@ NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
 
 
 FIELDS = r"\w+ *=.*"
-"""What continues a prior: NAME:FIELD=VALUE,FIELD=VALUE."""
+"""What continues a force: NAME:FIELD=VALUE,FIELD=VALUE."""
 
 
 def numbers_of(text: str, complaint: str, *, one: bool = False) -> list[float]:
@@ -107,7 +107,7 @@ OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html", "rerun")
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
 URDF = InputPath(": no such file; give the path of a URDF file.", Path.exists)
-IDENTIFIED = InputPath(": no such file or folder; give a folder that `forcegp identify` wrote.", Path.exists)
+IDENTIFIED = InputPath(": no such file or folder; give a folder that `forcegp fit` wrote.", Path.exists)
 LOG = InputPath(" does not exist; give the path of a log.", Path.exists)
 MAPPING = InputPath(" is not a file; give --mapping a YAML file.")
 

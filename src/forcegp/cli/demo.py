@@ -6,20 +6,21 @@ import os
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
 import forcegp
-import forcegp.models
+import forcegp.evaluation
+import forcegp.posterior
 import forcegp.report
 import forcegp.simulation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import Command
 from forcegp.cli.evaluate import draw, evaluate_with_progress
-from forcegp.cli.fit import fit_summary, fit_with_progress
+from forcegp.cli.fit import fit_summary
 from forcegp.cli.simulate import simulate_with_progress
 from forcegp.cli.terminal import NONE, NORMAL_FORCES, Terminal, columns, multiplier_scores, nats, number, percent
 from forcegp.errors import InvalidInput
@@ -27,8 +28,8 @@ from forcegp.errors import InvalidInput
 NOISE = 0.1  # rad/s^2, as in the paper
 SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
 
-MODELS = {"S-GP": ("s-gp", "zero"), "S-GP + analytical mean": ("s-gp-analytical-mean", "analytical")}
-"""Name in the paper -> (folder, mean)."""
+MODELS = {"S-GP": ("s-gp", False), "S-GP + analytical mean": ("s-gp-analytical-mean", True)}
+"""Name in the paper -> (folder, whether known forces are the mean)."""
 
 PUBLISHED_MAE = {
     "S-GP": {100: 0.5856, 200: 0.2092, 400: 0.1193, 600: 0.1049, 800: 0.1006, 1000: 0.0977},
@@ -110,7 +111,7 @@ class Demo(Command):
         self,
         terminal: Terminal,
         folder: Path,
-        posterior: forcegp.models.StructuredPosterior,
+        posterior: forcegp.posterior.StructuredPosterior,
         test: forcegp.Dataset,
         evaluations: Mapping[str, forcegp.Evaluation],
         results: Mapping[str, Any],
@@ -146,22 +147,16 @@ class Demo(Command):
         return best
 
     def _fitted(
-        self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: Any
-    ) -> tuple[forcegp.models.StructuredPosterior, dict[str, Any]]:
+        self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: bool
+    ) -> tuple[forcegp.posterior.StructuredPosterior, dict[str, Any]]:
         """The fitted model, and what the fit came to."""
-        assert train.system is not None
+        assert train.model is not None
         start = time.monotonic()
-        posterior = fit_with_progress(
-            terminal,
-            forcegp.StructuredGP(train.system, mean=mean),
-            train,
-            name=f"fitting {name}",
-            points=min(self.points, len(train)),
-            restarts=None,
-            seed=0,
-            jobs=self.jobs,
-            options=replace(forcegp.models.default_options(self.points), iterations=self.iterations),
-        )
+        model = train.model.with_forces(forcegp.JointForces())
+        model = model if mean else model.without_mean()
+        how: dict[str, Any] = {"points": self.points, "iterations": self.iterations, "jobs": self.jobs}
+        with terminal.progress(f"fitting {name}", may_end_early=True) as report:
+            posterior: Any = forcegp.evaluation.learn(model, train, report=report, **how)[0]
         seconds = time.monotonic() - start
         forcegp.save_posterior(posterior, run)
         iterations = len(posterior.result.history) - 1

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-import forcegp.models
+import forcegp.posterior
 import forcegp.report
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, listed, unless_given
@@ -71,8 +71,8 @@ class Evaluate(Overwriting):
         posterior, dataset = model_and_data(terminal, self.run_folder, self.data, self.system)
         dataset = dataset.rows(slice(None, None, self.every))
         if self.contact:
-            posterior = posterior.with_system(
-                posterior.system.with_contacts([*parse_contacts(self.contact), *posterior.system.loops])
+            posterior = posterior.with_model(
+                posterior.model.with_contacts([*parse_contacts(self.contact), *posterior.model.loops])
             )
         evaluation = evaluate_with_progress(terminal, posterior, dataset)
         forces = forcegp.evaluation.force_scores(posterior, dataset)
@@ -101,7 +101,7 @@ class Evaluate(Overwriting):
             terminal.note(f"plots: {self.plots}")
         if self.report is not None:
             self._write_report(terminal, posterior, dataset, evaluation, scores)
-        known = isinstance(posterior, forcegp.models.StructuredPosterior) and not posterior.latent_names
+        known = isinstance(posterior, forcegp.posterior.StructuredPosterior) and not posterior.latent_names
         why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
         forces_table = force_facts(forces, why) | slip_facts(scores.get("slip", {}))
         terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
@@ -110,7 +110,7 @@ class Evaluate(Overwriting):
     def _write_report(
         self,
         terminal: Terminal,
-        posterior: forcegp.models.Posterior,
+        posterior: forcegp.posterior.Posterior,
         dataset: forcegp.Dataset,
         evaluation: forcegp.Evaluation,
         scores: Mapping[str, Any],
@@ -139,7 +139,7 @@ class Evaluate(Overwriting):
 
 
 def evaluate_with_progress(
-    terminal: Terminal, posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, name: str = "predicting"
+    terminal: Terminal, posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset, name: str = "predicting"
 ) -> forcegp.Evaluation:
     """`forcegp.evaluation.evaluate` with a progress bar; warnings go to stderr."""
     with terminal.progress(f"{name}: {len(dataset)} rows") as report:
@@ -152,13 +152,13 @@ def evaluate_with_progress(
 def draw(
     terminal: Terminal,
     folder: Path,
-    posterior: forcegp.models.Posterior,
+    posterior: forcegp.posterior.Posterior,
     dataset: forcegp.Dataset,
     mu: float | None = None,
 ) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
     figures = {"prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset)}
-    if posterior.system.contacts and posterior.predicts_forces:
+    if posterior.model.contacts and posterior.predicts_forces:
         figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
     if mu is not None:
         figures["friction_margins.png"] = lambda: forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)
@@ -178,7 +178,7 @@ def acceleration_unit(dataset: forcegp.Dataset) -> str:
 
 
 def _report(
-    posterior: forcegp.models.Posterior,
+    posterior: forcegp.posterior.Posterior,
     evaluation: forcegp.Evaluation,
     dataset: forcegp.Dataset,
     data: Path,
@@ -187,8 +187,8 @@ def _report(
     points = len(posterior.training)
     unit = acceleration_unit(dataset)
     # what an observer reports is neither robot nor contact
-    systems = [{**x.to_dict(), "known_forces": None} for x in (posterior.target, posterior.model.system) if x]
-    where = ", carried to another robot or contacts" if systems[0] != systems[-1] else ""
+    models = [{**x.to_dict(), "forces": None} for x in (posterior.trained, posterior.model)]
+    where = ", carried to another robot or contacts" if models[0] != models[-1] else ""
     title = (
         f"{points} training points, {posterior.description}{where}; {evaluation.rows} rows of {data}; errors in {unit}"
     )

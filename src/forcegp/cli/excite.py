@@ -59,8 +59,8 @@ class Excite(RobotOptions, Overwriting):
         picture = self.out.with_suffix(".png")
         for path, mark in ((self.out, b"t,q_"), (picture, b"\x89PNG")):
             self.require_free_file(path, begins(mark), "what forcegp writes there")
-        system, limits = self.chosen(), {}
-        if (system is None) == (self.run_folder is None):
+        model, limits = self.chosen(), {}
+        if (model is None) == (self.run_folder is None):
             raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
         for word in self.limits:
             name, _, values = word.partition("=")
@@ -69,7 +69,7 @@ class Excite(RobotOptions, Overwriting):
         given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
         with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
             chosen = forcegp.excitation(
-                system or forcegp.load_posterior(str(self.run_folder)),
+                model or forcegp.load_posterior(str(self.run_folder)),
                 **given,
                 margin=self.limit_share,
                 motions=self.tries,

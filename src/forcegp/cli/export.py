@@ -74,7 +74,7 @@ def _casadi(options: Export, terminal: Terminal, posterior: Any, folder: Path) -
         if getattr(options, name):
             raise InvalidInput(f"--{name} is for --to c; CasADi functions have all derivatives, and no covariance.")
     given = {"steps": options.steps, "integrator": options.integrator or "symplectic-euler"}
-    differences = forcegp.models.export_casadi(posterior, folder, **given)
+    differences = forcegp.posterior.export_casadi(posterior, folder, **given)
     rows = [[file, f"{apart:.1e}"] for file, apart in differences.items()]
     terminal.show(columns(str(options.out), ["file", "largest difference / largest value"], rows))
     return {"differences": differences}

@@ -1,179 +1,281 @@
-"""`forcegp fit`: learn the unknown forces from a dataset and write the model to a folder."""
+"""`forcegp fit`: find what a model leaves open, from a log, and write the model to a folder."""
 
 from __future__ import annotations
 
-import math
+import shlex
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.checks
+import forcegp.data
 import forcegp.evaluation
-import forcegp.inference
-import forcegp.models
-import forcegp.priors
+import forcegp.evidence
+import forcegp.posterior
 import forcegp.robots
-from forcegp.cli.model_choice import (
-    POINTS,
-    ModelOptions,
-    make_model,
-    resolved,
-    resolved_noise,
-    search_arguments,
-    window_observation,
-)
+from forcegp.atomic_files import file_digest, write_json, write_text
+from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, Overwriting, listed, numbers_of, unless_given
+from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
+from forcegp.cli.estimates import estimates_table, what_is_open
+from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
-from forcegp.errors import InvalidInput
+from forcegp.errors import ContactError, ContactWarning, InvalidInput
+
+NEARLY_ALL = 0.995
+"""Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
+HARDLY_ANY = 0.2
+"""Share below which something is wrong with the contact, rather than the tool in the air."""
+MOST = 3
+"""Findings whose text is shown; the others by their subject."""
+CHOSEN = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic, unless left-out rows prefer another"
+LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torques:both"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(ModelOptions):
-    """Learn the unknown forces from a dataset, and write the model to a folder.
+class Fit(BackendOptions, RobotOptions, Overwriting):
+    """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown forces.
 
-    The dataset carries its robot and contacts, so nothing else is needed; --robot, --contact and --known-force
-    override it.
+    The dataset carries its robot, contacts and forces; --robot, --contact and --forces replace or add to them. The
+    folder holds the model, its estimates, and of a model without gp: also identified.urdf.
 
     For example:
       forcegp fit train.h5 --points 100 --out run
-      forcegp fit train.h5 --prior tool-friction,joint-friction --points 100 --out run
-      forcegp fit train.h5 --model independent-gp --points 100 --out baseline
-      forcegp fit log.h5 --robot arm.urdf --contact tool@0,0,0.1:plane:0,0,1,0.055 --noise learned --out run
-      forcegp fit raw.h5 --learn-from weak-form --window 0.1 --points 100 --out run
-      forcegp fit log.h5 --identified identified --prior joint-friction --points 400 --motions 1 --out run
+      forcegp fit log.h5 --forces bodies,viscous,coulomb,offset,rotor --out identified
+      forcegp fit log.h5 --identified identified --forces gp:joint-friction --evidence accelerations,motions:1 --out run
+      forcegp fit log.h5 --forces viscous,gp:joint-friction --robot arm.urdf --noise learned --out run
+      forcegp fit train.h5 --forces gp:independent --points 100 --out baseline
+      forcegp fit raw.h5 --forces gp:joint --evidence windows:.1 --points 100 --out run
     """
 
+    data: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    """The dataset to learn from (HDF5)."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """The folder to write."""
+    forces: Annotated[tuple[str, ...], listed("FORCE,...", CHOSEN, goes_on=FIELDS)] = ()
+    """What is found, beside the forces that the model has. Laws: viscous, coulomb, stribeck, rotor, offset, spring,
+    payload:LINK, bodies; their numbers are estimated unless they are given, as in viscous:.1. Unknown forces: gp:joint,
+    gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
+    gp:independent is without physics, none the noise alone. See docs/how-to/forces.md."""
+    evidence: Annotated[tuple[str, ...], listed("EVIDENCE,...", LEARNED_FROM)] = ()
+    """What is learned from: accelerations, torques (torques:both where accelerations are noisy, too, torques:mean=.4
+    of means), or windows:S of raw positions, where nothing is differentiated. Beside it motions:S refines the
+    numbers on recorded positions, over windows of S seconds."""
+    baseline: Annotated[Path | None, DATASET, unless_given("LOG", "none", Path)] = None
+    """A second log, of the same robot without the payloads that are estimated."""
+    contact: Annotated[tuple[str, ...], listed(CONTACTS, "the dataset's", goes_on=NUMBERS)] = ()
+    """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME.
+    SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
+    none is no contact at all."""
+    noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
+    """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
+    where it does not)."""
+    force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
+    """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
+    measured_torque: bool = False
+    """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""
+    points: Annotated[int | None, unless_given("N", "200; all for functions of one or two inputs", int)] = None
+    """Learn unknown forces from N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube
+    of N as far as --engine is exact. Numbers of laws are found from all rows."""
+    engine: Literal["auto", "exact", "inducing"] = "auto"
+    """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points. auto: by
+    their number, the features and the free memory, with the reason. See docs/how-to/large-data.md."""
+    learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
+    """Find the hyper-parameters on N of the points; the posterior is that of all points."""
+    iterations: Annotated[int, arg(metavar="N")] = 200
+    """Most L-BFGS iterations of each start."""
+    restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
+    """Starts of the search; the best is kept."""
+    seed: Annotated[int, arg(metavar="K")] = 0
+    """Draws the starts of the search after the first."""
+    jobs: Annotated[int | None, unless_given("J", "1, or all that --backend has", int)] = None
+    """Restarts at once."""
+    hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
+    rows: Literal["auto", "in-contact", "all"] = "auto"
+    """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
+    every row. auto: in-contact where the tool leaves the surface at times, with a note."""
+    checks: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
+    device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
+    """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
+
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Fit and save."""
+        """Fit, save and show."""
         self.require_free(self.out)
-        if self.motions is not None and not 0.0 < self.motions < math.inf:
-            raise InvalidInput(f"--motions is {self.motions:g}; give the length of the windows in seconds, such as 1.")
-        command = resolved(self)
-        self._backend()  # refused now, not after the data are read
+        workers, noise = self._backend(), self._noise()  # refused now, not after the data are read
         forcegp.robots.usable_device(self.device)
-        start = time.monotonic()
+        evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
+        start, notes = time.monotonic(), []
         dataset = forcegp.Dataset.load(self.data)
-        system = self._system(dataset)
-        self._check(terminal, dataset, system, self.learn_from == "accelerations")
-        recording, rows_note = dataset, None
-        if self.rows != "auto" or self.learn_from == "accelerations":  # raw accelerations show no contact
-            dataset, rows_note = self._rows(dataset, system)
-        observe = window_observation(command.learn_from, command.window)
-        prior_note, correlation_note, intervals_note = None, None, None
-        if command.model == "structured" and not command.prior:
-            command, prior_note = self._with_prior(command, dataset, system)
-        model = make_model(command, system.to(self.device))
-        # of functions of few inputs, inducing points stand for any number of rows
-        few = isinstance(model, forcegp.StructuredGP) and forcegp.priors.has_few_inputs(model.prior, system.robot)
-        all_rows = few and observe is None and command.points is None and command.engine in ("auto", "inducing")
-        rows = len(dataset) if observe is None else observe.count(dataset)
-        points = rows if all_rows else min(POINTS if command.points is None else command.points, rows)
-        command = replace(command, points=points)
-        how = search_arguments(command, points)
-        if all_rows:
-            assert isinstance(model, forcegp.StructuredGP)
-            model = forcegp.evaluation.with_force_noise(model, dataset)
-            given = {} if command.learning_points is None else {"learning_points": command.learning_points}
-            how |= forcegp.evaluation.all_rows_at_once(points, system.robot.nv) | given
-        posterior = fit_with_progress(terminal, model, dataset, points=points, **how)
-        if all_rows:
-            found = forcegp.evaluation.allowing_for_correlation(posterior, dataset, command.hyperprior)
-            posterior, correlation_note = found
-        if self.motions is not None:
-            posterior = refined_with_progress(terminal, posterior, recording, self.motions)
-            posterior, intervals_note = calibrated_with_progress(terminal, posterior, recording)
-        summary = fit_summary(posterior, time.monotonic() - start) | {"payloads": payloads(posterior, dataset)}
-        command._write(posterior)
-        for note in (rows_note, prior_note, correlation_note, intervals_note):
-            if note is not None:
-                terminal.note(note)
+        given = self._known(dataset)
+        windows = any(isinstance(each, forcegp.evidence.Windows) for each in evidence)
+        self._check(terminal, dataset, given, not windows)
+        recording = dataset
+        if self.rows != "auto" or not windows:  # raw accelerations show no contact
+            dataset, note = self._rows(dataset, given)
+            notes += [] if note is None else [note]
+        words = self.forces
+        if not words:
+            words, note = self._chosen(dataset, replace(given, noise=noise), windows)
+            notes.append(note)
+        if windows and noise is None:  # no dataset states the noise of windows
+            noise = forcegp.Noise(None, learn=True)
+        model = forcegp.evaluation.named_model(given, words, noise).to(self.device)
+        with terminal.progress("fitting", may_end_early=True) as report:
+            posterior, found = forcegp.evaluation.learn(
+                model,
+                dataset,
+                evidence,
+                recording=recording,
+                baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
+                backend=workers,
+                report=report,
+                **{name: getattr(self, name) for name in SAME},
+            )
+        summary = fit_summary(posterior, time.monotonic() - start)
+        tables = fit_report(self.out, posterior, summary)
+        if not model.unknown_forces and model.is_open:
+            residuals = _residuals(given, posterior, recording)
+            tables.insert(1, residuals.pop("table"))
+            summary["residuals"] = residuals
+        self._write(posterior)
+        for note in [*forces_of(given), *notes, *found]:
+            terminal.note(note)
         for doubt in forcegp.evaluation.unfinished_search(posterior):
             terminal.warn(doubt)
-        terminal.show(*_report(self.out, summary), *motion_report(posterior))
+        terminal.show(*tables)
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 
-    def _with_prior(self, command: Fit, dataset: forcegp.Dataset, system: forcegp.MechanicalSystem) -> tuple[Fit, str]:
-        """The command with the prior that a look at some rows prefers, and the reason."""
-        if command.mean == "zero":
-            return replace(command, prior=("joint",)), "prior: joint, since the processes hold the known forces, too"
-        if command.learn_from != "accelerations":
-            name = forcegp.evaluation.usual_prior(system)
-            return replace(command, prior=(name,)), f"prior: {name}, the usual one; windows are not looked at"
-        noise = resolved_noise(command.noise, command.force_noise)
-        options = replace(forcegp.models.default_options(forcegp.evaluation.LOOK), iterations=command.iterations)
-        name, why = forcegp.evaluation.choose_prior(dataset, system, noise=noise, seed=command.seed, options=options)
-        return replace(command, prior=(name,)), f"prior: {why}"
+    def _noise(self) -> forcegp.Noise | None:
+        """The noise that the options ask for; None where the dataset states it. Raises InvalidInput."""
+        if self.measured_torque and self.force_noise is None:
+            raise InvalidInput("--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA.")
+        how = {"measured_torque": self.measured_torque}
+        if self.noise == "learned":
+            return forcegp.Noise(None, self.force_noise, learn=True, **how)
+        if self.noise == "dataset":
+            return None if self.force_noise is None else forcegp.Noise(None, self.force_noise, **how)
+        complaint = f"--noise is {self.noise!r}; give learned, dataset or a number such as 0.1."
+        return forcegp.Noise(numbers_of(self.noise, complaint, one=True)[0], self.force_noise, **how)
 
+    def _known(self, dataset: forcegp.Dataset) -> forcegp.Model:
+        """The dataset's own model, with the robot and contacts that the options give."""
+        contacts = parse_contacts(self.contact)
+        model = self.chosen_model(dataset, self.data)
+        return model.with_contacts((*contacts, *model.loops)) if self.contact else model
 
-def fit_with_progress(
-    terminal: Terminal, model: Any, dataset: forcegp.Dataset, *, name: str = "fitting", **how: Any
-) -> Any:
-    """`fit`, `fit_windows` or `identify` of a model, as `how` asks, with a bar of restart, iteration and objective."""
-    steps = how["options"].iterations
-    wanted = how.get("restarts", 1)
-    restarts = forcegp.models.default_restarts(how["points"]) if wanted is None else wanted
-    with terminal.progress(f"{name}: {how['points']} points", may_end_early=True) as report:
+    def _chosen(self, dataset: forcegp.Dataset, model: forcegp.Model, windows: bool) -> tuple[tuple[str, ...], str]:
+        """The unknown forces that a look at some rows prefers, and the reason."""
+        if windows:
+            name = forcegp.evaluation.usual_forces(model)
+            return forcegp.evaluation.summands(name), f"forces: {name}, the usual ones; windows are not looked at"
+        name, why = forcegp.evaluation.choose_forces(dataset, model, seed=self.seed, iterations=self.iterations)
+        return forcegp.evaluation.summands(name), f"learned: {why}"
 
-        def progress(restart: int, iteration: int, value: float) -> None:
-            if restart == forcegp.models.ALL_ROWS:
-                report(restarts * steps, restarts * steps, f"all {how['points']} points: {iteration}, {value:.3g}")
-                return
-            start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
-            note = f"{start}iteration {iteration}, objective {_short(value)}"
-            report(restart * steps + min(iteration, steps), restarts * steps, note)
+    def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model, accelerations: bool) -> None:
+        """One line on what would spoil the model; contacts are not warned of again by the fit.
 
-        learn = model.identify if "learn" in how else model.fit_windows if "observe" in how else model.fit
-        return learn(dataset, **how, progress=progress)
+        Without `accelerations` nobody has measured `a`: nothing is compared with it.
+        """
+        if self.checks:
+            # without a model it compares no torques; those of moving bases are never compared
+            without = not (accelerations or model.robot.layout.groups)
+            looked_at = (replace(dataset, model=None), None) if without else (dataset, model)
+            found = forcegp.checks.quick_check(*looked_at)
+            of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
+            used = [each for each in found if each.subject not in of_accelerations]
+            # check has no --contact: it would find nothing wrong with the contacts of the data
+            line = findings_in_one_line(used, self.data, self.words(*ROBOT_OPTIONS), advise=bool(self.contact))
+            if line is not None:
+                terminal.warn(line)
+        warnings.simplefilter("ignore", ContactWarning)
 
+    def _rows(self, dataset: forcegp.Dataset, model: forcegp.Model) -> tuple[forcegp.Dataset, str | None]:
+        """The rows in which all contacts act (`forcegp.data.rows_in_contact`), or all, as --rows asks.
 
-def refined_with_progress(
-    terminal: Terminal, posterior: Any, dataset: forcegp.Dataset, seconds: float, **how: Any
-) -> Any:
-    """`refined_on_motions`, with a bar of steps and the error of the motions."""
-    steps = 100
-    with terminal.progress(f"motions of {seconds:g} s", may_end_early=True) as report:
-        return posterior.refined_on_motions(
-            dataset,
-            seconds,
-            **how,
-            report=lambda step, rms: report(min(step, steps), steps, f"step {step}, rms of q {rms:.3g}"),
-        )
-
-
-def calibrated_with_progress(terminal: Terminal, posterior: Any, dataset: forcegp.Dataset) -> tuple[Any, str | None]:
-    """`calibrated_on_motions` with a bar; the posterior itself, and why, where the recording is too short for it."""
-    with terminal.progress("intervals of motions") as report:
+        And a note to print after the fit, so that an error before it stands alone. Raises ContactError with in-contact
+        if there are none.
+        """
+        if self.rows == "all" or not model.contacts:
+            return dataset, None
         try:
-            return posterior.calibrated_on_motions(dataset, report=report), None
-        except InvalidInput as error:
-            return posterior, f"intervals of motions are not calibrated: {error}"
+            touching = forcegp.data.rows_in_contact(replace(dataset, model=model))
+        except ContactError:
+            if self.rows == "in-contact":
+                raise
+            return dataset, None  # the fit raises a clearer error
+        share = len(touching) / len(dataset)
+        if self.rows == "auto" and share >= NEARLY_ALL:
+            return dataset, None
+        text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
+        if self.rows == "auto" and share < HARDLY_ANY:
+            return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
+        note = f"{text}; these alone were learned from (--rows all takes every row)"
+        return replace(touching, model=dataset.model), note
+
+    def _write(self, posterior: forcegp.posterior.Posterior) -> None:
+        """The model, how it was made and what was estimated; what is known also as a robot's file."""
+        options = {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+            if name not in ("json", "debug", "overwrite")
+        }
+        data = {"path": str(self.data), "sha256": file_digest(self.data)}
+        content = {"options": options, "data": data, "resolved": dict(posterior.settings)}
+        with self.folder(self.out, content) as folder:
+            forcegp.save_posterior(posterior, folder)
+            if posterior.estimates:
+                write_estimates(folder, posterior)
 
 
-def motion_report(posterior: Any) -> list[Any]:
-    """What motions refined, as a table and a sentence; nothing where they did not."""
-    found = posterior.settings.get("motions")
-    if found is None:
-        return []
-    errors = found["standard_errors"]
-    rows = [[name, f"{value:.4g}", f"{errors[name]:.2g}"] for name, value in found["parameters"].items()]
-    units = ["mm" if joint.type == "prismatic" else "mrad" for joint in posterior.system.robot.joints]
-    error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in zip(found["rms"], units, strict=True))
-    summary = (
-        f"{found['windows']} windows of {found['seconds']:g} s, whose initial states are estimated, too; rms of q by "
-        f"joint: {error}."
-    )
-    weak = f"Not identified by the motions: {', '.join(found['not_told'])}." if found["not_told"] else ""
-    table = columns("refined on motions", ["", "value", "std. error"], rows)
-    return [*([table] if rows else []), summary, *([weak] if weak else [])]
+SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed", "hyperprior")
+"""Options that `forcegp.evaluation.learn` takes by the same names."""
 
 
-def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dict[str, Any]:
+def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
+    """The numbers that were found, and robot and known forces with them: for --identified, and as a URDF."""
+    estimates, known = posterior.estimates, posterior.model.known
+    unloaded = tuple(law for law in known.laws if not isinstance(law, forcegp.Payload))
+    known = replace(known, robot=known.loaded_robot, forces=unloaded)
+    write_json(folder / "estimates.json", estimates.to_dict())
+    write_text(folder / SYSTEM_FILE, known.to_json() + "\n")
+    if estimates.by_body:  # a URDF has no place for intervals
+        held = "; ".join(f"{link}: {count}" for link, count in estimates.by_body.items())
+        note = f"of each body's ten inertial directions the log holds nothing of: {held}"
+        known = known.with_robot(known.robot.with_note(note))
+    known.to_urdf(folder / f"{name}.urdf")
+
+
+def findings_in_one_line(
+    findings: Sequence[forcegp.checks.Finding], data: Path, words: Sequence[str] = (), advise: bool = False
+) -> str | None:
+    """The worst findings, the subjects of the others, and where to read more; None if there are none.
+
+    `words` are the options of forcegp check that show the same findings; `advise` names what to do about the worst
+    finding instead, where no options do.
+    """
+    if not findings:
+        return None
+    shown = [f"{each.subject}: {each.seen.rstrip('.')}" for each in findings[:MOST]]
+    more = dict.fromkeys(each.subject for each in findings[MOST:])
+    others = [f"further {', '.join(more)}"] if more else []
+    see = f"See {shlex.join(['forcegp', 'check', str(data), *words])}"
+    following = findings[0].remedy.rstrip(".") if advise else see
+    return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
+
+
+def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
     result, settings = posterior.result, posterior.settings
-    force_noise, prior = posterior.parameters.get("noise.log_force"), getattr(posterior.model, "prior", None)
-    air = [x for x in prior.summands() if isinstance(x, forcegp.AerodynamicForce)] if prior else []
-    looked = not {"air", "observe"} & set(settings) and not posterior.system.held_inputs  # not for wind in windows
+    force_noise, unknown = posterior.hyperparameters.get("noise.log_force"), posterior.model.unknown_forces
+    air = [each for each in unknown if isinstance(each, forcegp.AerodynamicForce)]
+    looked = not {"air", "observe"} & set(settings) and not posterior.model.held_inputs  # not for wind in windows
     return {
         "model": posterior.description,
         "objective_is": posterior.objective,
@@ -184,68 +286,73 @@ def fit_summary(posterior: forcegp.models.Posterior, wall_seconds: float) -> dic
         "nll": posterior.negative_log_likelihood,
         **({"engine": settings["engine_reason"]} if "engine_reason" in settings else {}),
         **({"refined": settings["refined"]} if "refined" in settings else {}),
-        "restarts": posterior.settings.get("restarts", 1),
+        "restarts": settings.get("restarts", 1),
         "iterations": len(result.history) - 1,
         "evaluations": result.evaluations,
         "converged": result.converged,
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
-        "wind": posterior.settings.get("air", {}).get("wind"),
-        "wind_not_found": looked and any(x.observe != 0.0 for x in air),
-        "steady_forces": posterior.settings.get("steady_forces"),
+        "wind": settings.get("air", {}).get("wind"),
+        "wind_not_found": looked and any(each.observe != 0.0 for each in air),
+        "steady_forces": settings.get("steady_forces"),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
+        "estimates": posterior.estimates.to_dict()["parameters"],
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
     }
 
 
-def payloads(posterior: Any, dataset: forcegp.Dataset) -> dict[str, str]:
-    """Mass and centre of mass of every `payload` prior, with standard deviations, by the name of its term."""
-    if not isinstance(posterior, forcegp.models.StructuredPosterior) or "Payload" not in repr(posterior.model.prior):
-        return {}
-    found = {}
-    for name, part in posterior.components(dataset.q[:1], dataset.v[:1], dataset.u[:1]).items():
-        if "mass" not in part.latent_names:
-            continue
-        assert part.latents.covariance is not None
-        mean, covariance = part.latents.mean[0], part.latents.covariance[0]
-        found[name] = f"{mean[0]:.3g} ± {covariance[0, 0].sqrt():.2g} kg"
-        if len(mean) == 4:
-            center = mean[1:] / mean[0]
-            slopes = mean.new_zeros(3, 4)  # of the centre in mass and moments (delta method)
-            slopes[:, 0], slopes[:, 1:] = -center / mean[0], mean.new_ones(3).diag() / mean[0]
-            errors = (slopes @ covariance @ slopes.mT).diagonal().sqrt()
-            each = (f"{1e3 * x:.3g} ± {1e3 * error:.2g}" for x, error in zip(center, errors, strict=True))
-            found[name] += f" at ({', '.join(each)}) mm"
-    return found
-
-
-def _report(run: Path, summary: Mapping[str, Any]) -> list[Any]:
-    forces, air = summary.get("force_noise_std"), summary.get("wind")
-    still = "learned as still air" + (", with a force in each episode" if summary.get("steady_forces") else "")
+def fit_report(run: Path, posterior: Any, summary: Mapping[str, Any]) -> list[Any]:
+    """What was learned from what, and the numbers that were estimated."""
+    forces, air = summary["force_noise_std"], summary["wind"]
+    still = "learned as still air" + (", with a force in each episode" if summary["steady_forces"] else "")
     points, learning = summary["points"], summary["learning_points"]
     refined = " and refined on all" if "refined" in summary else ""
     fewer = f" (parameters: from {learning} of them{refined})" if learning != points else ""
     # the status counts failed evaluations, too, and the starts
     status = with_option_names(summary["status"], ("iterations",))
     unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
-    table = facts(
-        f"{run}: {summary['model']}, learned from {points} points{fewer}",
-        {
-            **summary.get("payloads", {}),
-            **({"engine": summary["engine"]} if "engine" in summary else {}),
-            "objective": f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}",
-            "negative log likelihood": f"{summary['nll']:.1f} nats",
-            "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
-            "search": status if summary["converged"] else f"not converged: {status}",
-            "noise std": _per_joint(summary["noise_std"]),
-            **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
-            **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
-            **({"wind of these rows": f"not found; {still}"} if summary.get("wind_not_found") else {}),
-            "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
-        },
-    )
-    return [table, f"Next: forcegp evaluate {run} TEST.h5"]
+    objective = f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}"
+    values = {
+        **({"engine": summary["engine"]} if "engine" in summary else {}),
+        **({"objective": objective} if posterior.model.unknown_forces else {}),
+        "negative log likelihood": f"{summary['nll']:.1f} nats",
+        "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
+        "search": status if summary["converged"] else f"not converged: {status}",
+        "noise std": _per_joint(summary["noise_std"]),
+        **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
+        **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
+        **({"wind of these rows": f"not found; {still}"} if summary["wind_not_found"] else {}),
+        "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
+    }
+    shown: list[Any] = [facts(f"{run}: {summary['model']}, learned from {points} points{fewer}", values)]
+    if posterior.estimates:
+        shown.append(estimates_table("estimates", posterior.estimates))
+        shown += what_is_open(posterior.estimates)
+    motions = posterior.settings.get("motions")
+    if motions is not None:
+        units = ["mm" if joint.type == "prismatic" else "mrad" for joint in posterior.model.robot.joints]
+        each = zip(motions["rms"], units, strict=False)
+        error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in each)
+        shown.append(
+            f"{motions['windows']} windows of {motions['seconds']:g} s, whose initial states are estimated, too; "
+            f"rms of q by joint: {error}."
+        )
+    return [*shown, f"Next: forcegp evaluate {run} TEST.h5"]
+
+
+def _residuals(given: forcegp.Model, posterior: Any, dataset: forcegp.Dataset) -> dict[str, Any]:
+    """How far the residuals of the data fell, as numbers and as a table."""
+    from forcegp.evidence import motion_residuals, residual_scores
+
+    models = {"before": given, "after": posterior.model}
+    found: dict[str, Any] = {
+        name: residual_scores(*motion_residuals(dataset, model), dataset) for name, model in models.items()
+    }
+    scores = [each[score] for score in ("force_rms", "acceleration_nrmse") for each in found.values()]
+    rows = [[joint, *(f"{each[k]:.4g}" for each in scores)] for k, joint in enumerate(dataset.joint_names)]
+    header = ["joint", "force rms\nbefore", "\nafter", "nRMSE of a\nbefore", "\nafter"]
+    return {**found, "table": columns(f"residuals of {len(dataset)} rows, in Nm or N", header, rows)}
 
 
 def _per_joint(values: list[float]) -> str:

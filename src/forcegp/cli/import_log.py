@@ -128,11 +128,9 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
         self.require_free_file(self.write_mapping, _is_mapping, "a mapping")
         mapping = self._mapping(terminal)
         options = self._options()
-        system, preparation = self._system(), self._preparation()
+        model, preparation = self._model(), self._preparation()
         with atomic_file(self.out, overwrite=self.overwrite) as temporary, terminal.progress("importing") as report:
-            done = forcegp.import_recordings(
-                self.logs, temporary, mapping, system=system, options=options, report=report
-            )
+            done = forcegp.import_recordings(self.logs, temporary, mapping, model=model, options=options, report=report)
             if done["open_switches"]:
                 preparation = replace(preparation, stance="auto")
             if not preparation.changes_nothing:
@@ -147,18 +145,18 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
         given = {name: getattr(self, name) for name in same}
         return forcegp.ImportOptions(most_rows=self.max_rows, stance="auto", **given)
 
-    def _system(self) -> forcegp.MechanicalSystem | None:
+    def _model(self) -> forcegp.Model | None:
         """The robot of the options, with the known forces and contacts of --identified, or with feet and wheels."""
         touching = [*parse_feet(self.feet), *parse_wheels(self.wheels)]
-        system = self.chosen()
+        model = self.chosen()
         if not touching:
-            return system
+            return model
         option = "--feet" if self.feet else "--wheels"
         if self.identified is not None:
             raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
-        if system is None:
+        if model is None:
             raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
-        return system.with_contacts((*touching, *system.loops))
+        return model.with_contacts((*touching, *model.loops))
 
     def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
         """That of the file, changed by the flags."""

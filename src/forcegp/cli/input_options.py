@@ -14,7 +14,7 @@ from tyro.conf import arg
 import forcegp
 import forcegp.data
 import forcegp.evaluation
-import forcegp.models
+import forcegp.posterior
 from forcegp.atomic_files import SUMS, require_unchanged
 from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
@@ -22,7 +22,7 @@ from forcegp.errors import FileFormatError, InvalidInput
 
 ROBOT_OPTIONS = ("robot", "inertias", "base", "root", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
-"""Where a folder that `forcegp identify` wrote holds robot and known forces."""
+"""Where a folder that `forcegp fit` wrote holds robot and known forces."""
 
 BASES = unless_given("fixed|floating|planar|spherical", "fixed; asked where a file looks otherwise")
 
@@ -68,9 +68,9 @@ class RobotOptions(RobotFileOptions):
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
     """Use this robot (URDF or MJCF) instead of the dataset's."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
-    """Begin with the robot and the known forces that `forcegp identify` found, instead of --robot and --known-force."""
+    """Begin with the robot and the known forces that `forcegp fit` estimated, instead of --robot."""
 
-    def chosen(self, recorded: forcegp.MechanicalSystem | None = None) -> forcegp.MechanicalSystem | None:
+    def chosen(self, recorded: forcegp.Model | None = None) -> forcegp.Model | None:
         """What the options ask for, else `recorded`, whose contacts and forces stay, and what no URDF holds.
 
         Closed loops of a file come along. None where there is neither. Raises InvalidInput for options that contradict
@@ -89,12 +89,12 @@ class RobotOptions(RobotFileOptions):
             before = recorded.robot
             changes = {"gravity": before.gravity.tolist(), "locked": before.locked, "base": before.base} | changes
         if self.robot is not None:
-            own = forcegp.MechanicalSystem.from_file(self.robot, inertias=self.inertias, **changes)
+            own = forcegp.Model.from_file(self.robot, inertias=self.inertias, **changes)
         else:
             assert recorded is not None, "there is one of both"
             text, source = recorded.robot.urdf_text, recorded.robot.source
             changed = forcegp.Robot.from_urdf_text(text, source=source, inertias=self.inertias, **changes)
-            own = forcegp.MechanicalSystem(changed)
+            own = forcegp.Model(changed)
         # robots with other joints are refused by their names: clearer than an armature of the wrong length
         if recorded is None or own.robot.joint_names != recorded.robot.joint_names:
             return own
@@ -102,30 +102,33 @@ class RobotOptions(RobotFileOptions):
         if self.robot is None or self.armature or not bool(robot.armature.any()):  # else those beside the file count
             rotors = dict(zip(robot.joint_names, recorded.robot.armature.tolist(), strict=True))
             robot = robot.with_armature(rotors | changes.get("armature", {}))
-        system = recorded.with_robot(robot)
-        return system.with_contacts((*system.touching, *own.loops)) if own.loops else system
+        model = recorded.with_robot(robot)
+        if self.robot is not None:  # its damping, dry friction and springs
+            kinds = {type(law) for law in model.laws}
+            model = model.with_forces(*(law for law in own.laws if type(law) not in kinds))
+        return model.with_contacts((*model.touching, *own.loops)) if own.loops else model
 
-    def chosen_system(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem:
+    def chosen_model(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model:
         """The dataset's own system, with what is replaced. Raises InvalidInput for none, and where joints differ."""
-        system = self.system_if_any(dataset, path)
-        if system is None:
+        model = self.model_if_any(dataset, path)
+        if model is None:
             raise InvalidInput(
                 f"{path} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
             )
-        return system
+        return model
 
-    def system_if_any(self, dataset: forcegp.Dataset, path: Path) -> forcegp.MechanicalSystem | None:
+    def model_if_any(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model | None:
         """The same, or None where there is no robot and no option asks for one."""
-        system = self.chosen(dataset.system)
-        if system is not None and system.robot.joint_names != tuple(dataset.joint_names):
+        model = self.chosen(dataset.model)
+        if model is not None and model.robot.joint_names != tuple(dataset.joint_names):
             raise InvalidInput(
-                f"{self.robot or self.identified or 'the robot'} has joints {', '.join(system.robot.joint_names)}; "
+                f"{self.robot or self.identified or 'the robot'} has joints {', '.join(model.robot.joint_names)}; "
                 f"{path} has {', '.join(dataset.joint_names)}. Give the robot that was recorded, or "
                 "--lock what was not."
             )
-        return system
+        return model
 
-    def _identified_system(self) -> forcegp.MechanicalSystem | None:
+    def _identified_system(self) -> forcegp.Model | None:
         if self.identified is None:
             return None
         given = ("robot", "base", "root", "lock", "armature", "gravity")
@@ -135,16 +138,22 @@ class RobotOptions(RobotFileOptions):
 
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
         if (self.identified / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
-            require_unchanged(self.identified, "identify again")
+            require_unchanged(self.identified, "fit again")
         if path.is_fifo():  # to open it would wait for a writer for ever
-            raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp identify` wrote.")
+            raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp fit` wrote.")
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise FileFormatError(
-                f"{path}: cannot be read ({error}); give a folder that `forcegp identify` wrote."
+                f"{path}: cannot be read ({error}); give a folder that `forcegp fit` wrote."
             ) from None
-        return forcegp.MechanicalSystem.from_json(text)
+        return forcegp.Model.from_json(text)
+
+
+def forces_of(model: forcegp.Model) -> list[str]:
+    """A line on the laws that a file brings beside the usual ones, if it does."""
+    titles = [law.title for law in model.laws]
+    return [] if set(titles) <= {"actuation", "rigid-bodies"} else [f"forces: {', '.join(titles)}"]
 
 
 def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
@@ -173,7 +182,7 @@ SystemChoice = Literal["model", "data"]
 
 def model_and_data(
     terminal: Terminal, run: Path, data: Path, choice: SystemChoice
-) -> tuple[forcegp.models.Posterior, forcegp.Dataset]:
+) -> tuple[forcegp.posterior.Posterior, forcegp.Dataset]:
     """A fitted model for the chosen system, and a recording of the same robot; what was changed is reported on stderr.
 
     A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data.
@@ -183,19 +192,19 @@ def model_and_data(
     posterior, dataset = forcegp.load_posterior(run), forcegp.Dataset.load(data)
     require_same_joints(posterior, dataset, data)
     if choice == "data":
-        if dataset.system is None:
+        if dataset.model is None:
             raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-        system = forcegp.evaluation.moved_system(posterior, dataset.system)
-        if system is not dataset.system:
+        model = forcegp.evaluation.moved_model(posterior, dataset.model)
+        if model is not dataset.model:
             terminal.note("--system data: contacts of the data; the robot stays the identified one")
-        posterior = posterior.with_system(system)
-    observed, seen = forcegp.models.observing(posterior, dataset)
+        posterior = posterior.with_model(model)
+    observed, seen = forcegp.posterior.observing(posterior, dataset)
     if observed is not posterior:
         terminal.note("wind: observed from earlier rows of each episode (aerodynamic:observe=0 leaves it unknown)")
     return observed, seen
 
 
-def require_same_joints(posterior: forcegp.models.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
+def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
     """Refuse a recording of another robot: InvalidInput."""
     if tuple(posterior.joint_names) != dataset.joint_names:
         raise InvalidInput(
@@ -254,7 +263,7 @@ class PreparationOptions(CutoffOptions):
         self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
     ) -> forcegp.Preparation:
         """The same with a delay of 0 instead of "auto" where a log shows none, which is reported on stderr."""
-        contacts = dataset.system is not None and dataset.system.contacts
+        contacts = dataset.model is not None and dataset.model.contacts
         if preparation.delay != "auto" or (forcegp.data.torques_of_joints(dataset) and not contacts):
             return preparation
         terminal.note(

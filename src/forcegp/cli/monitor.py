@@ -117,7 +117,7 @@ class Monitor(Overwriting):
             with tempfile.TemporaryDirectory() as folder, terminal.progress(f"reading {path}") as report:
                 out = Path(folder) / "log.h5"
                 try:
-                    forcegp.import_recordings([path], out, mapping, system=posterior.system, report=report)
+                    forcegp.import_recordings([path], out, mapping, model=posterior.model, report=report)
                 except InvalidInput as error:
                     raise InvalidInput(f"{error} Or write a dataset of {path} by `forcegp import`.") from None
                 dataset = forcegp.Dataset.load(out)

@@ -10,40 +10,41 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.analytical
-from forcegp.atomic_files import write_json, write_text
-from forcegp.cli.command import DATASET, Overwriting, listed, unless_given
-from forcegp.cli.identify import rounds_reported
-from forcegp.cli.input_options import SYSTEM_FILE, PreparationOptions, RobotOptions
-from forcegp.cli.learning_options import friction_laws
-from forcegp.cli.terminal import Terminal, columns
+import forcegp.evaluation
+import forcegp.posterior
+from forcegp.atomic_files import write_json
+from forcegp.cli.command import DATASET, FIELDS, Overwriting, listed, unless_given
+from forcegp.cli.estimates import estimates_table
+from forcegp.cli.fit import write_estimates
+from forcegp.cli.input_options import PreparationOptions, RobotOptions, forces_of
+from forcegp.cli.terminal import Terminal
 
-LABELS = {"mass": ("mass", "kg", 1.0)}
-LABELS |= {f"center_of_mass.{x}": (f"centre of mass {x}", "mm", 1e3) for x in "xyz"}
-LABELS |= {f"inertia.{x}": (f"inertia {x}", "kg m²", 1.0) for x in ("xx", "yy", "zz")}
+WINDOW = 0.4
+"""Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
+LAWS = "viscous", "stribeck", "offset", "rotor"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Payload(PreparationOptions, RobotOptions, Overwriting):
     """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
 
-    The log is a motion of 20 s or more that turns every joint in both directions, without contact but for feet that
-    stand. Without --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both
-    logs.
+    It is `forcegp fit --forces payload:LINK,... --evidence torques:mean=.4` on a log that is filtered first: a motion
+    of 20 s or more that turns every joint in both directions, without contact but for feet that stand. Without
+    --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both logs.
 
     For example:
       forcegp payload loaded.h5 --robot arm.urdf
       forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
     """
 
-    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
+    data: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The log with the payload (a dataset, raw or prepared)."""
-    baseline: Annotated[Path | None, DATASET, unless_given("DATA", "the URDF", Path)] = None
+    baseline: Annotated[Path | None, DATASET, unless_given("LOG", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """The link that carries the payload; results are in its frame."""
-    friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "stribeck", "offset")
-    """Friction laws to estimate, as for forcegp identify."""
+    forces: Annotated[tuple[str, ...], listed("FORCE,...", goes_on=FIELDS)] = LAWS
+    """What is estimated beside it, as for forcegp fit."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter of a raw log. auto: the one that predicts held-out torques best."""
     delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
@@ -54,59 +55,64 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, estimate, write and show."""
         self.require_free(self.out)
-        laws = friction_laws(self.friction)
         notes: list[str] = []
-        system, rows = self._rows(terminal, self.data, notes)
+        model, rows = self._rows(terminal, self.data, notes)
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
+        notes += forces_of(model)
+        words = [word for word in self.forces if word != "none"]
+        model = forcegp.evaluation.named_model(model, words)
         with terminal.progress("identifying", may_end_early=True) as report:
-            how: dict[str, Any] = {"link": self.link, "friction": laws, "progress": rounds_reported(report)}
-            found = forcegp.analytical.identify_payload(rows, system, baseline=baseline, **how)
-        content = {"data": str(self.data), **found.to_dict()}
+            found = with_payload(model, rows, self.link, baseline, report)
+        content = {"data": str(self.data), **payload_dict(found, baseline is not None)}
         if self.out is not None:
-            given = {"command": self.words("baseline", "link", "friction", "cutoff", "delay")}
+            given = {"command": self.words("baseline", "link", "forces", "cutoff", "delay")}
             with self.folder(self.out, {"data": str(self.data), **given}) as folder:
                 write_json(folder / "payload.json", content)
-                found.system.to_urdf(folder / "loaded.urdf")
-                write_text(folder / SYSTEM_FILE, found.system.to_json() + "\n")
+                write_estimates(folder, found, "loaded")
         for note in notes:
             terminal.note(note)
-        if not found.fit.settled:
+        if not found.estimates.settled:
             terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
-        if found.intervals["mass"][0] <= 0.0:
+        if found.estimates["payload.mass"].interval[0] <= 0.0:
             terminal.warn("the payload may weigh nothing by this log: centre of mass and inertia mean nothing then.")
-        terminal.show(*_tables(found))
+        beside = "the URDF" if baseline is None else "the baseline"
+        title = f"payload in the frame of {content['link']}, beside {beside}; {found.estimates.rows} rows"
+        own = {name: each for name, each in found.estimates.items() if name.startswith("payload.")}
+        others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
+        tables = [estimates_table("joints", others)] if others else []
+        terminal.show(estimates_table(title, own), *tables)
         return content
 
-    def _rows(
-        self, terminal: Terminal, path: Path, notes: list[str]
-    ) -> tuple[forcegp.MechanicalSystem, forcegp.Dataset]:
+    def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
         """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
         dataset = forcegp.Dataset.load(path)
-        system = self.chosen_system(dataset, path)
+        model = self.chosen_model(dataset, path)
         if forcegp.data.preparation_report(dataset.metadata):
-            return system, dataset
+            return model, dataset
         with terminal.progress(f"preparing {path}"):
-            raw = replace(dataset, system=system)
+            raw = replace(dataset, model=model)
             prepared = self.with_delay_that_shows(terminal, self._preparation(), raw).apply(raw)
         why = prepared.report["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
-        return system, prepared.dataset
+        return model, prepared.dataset
 
 
-def _tables(found: forcegp.analytical.PayloadEstimate) -> list[Any]:
-    rows = []
-    for name, (label, unit, factor) in LABELS.items():
-        low, high = (factor * end for end in found.intervals[name])
-        error = factor * found.standard_errors[name]
-        rows.append([label, f"{factor * found.values[name]:.4g}", f"{error:.2g}", f"{low:.4g} … {high:.4g}", unit])
-    title = f"payload in the frame of {found.link}, beside {'the baseline' if found.baseline else 'the URDF'}"
-    tables: list[Any] = [columns(title, ["", "", "std. error", "95 % interval", ""], rows)]
-    joints = list(dict.fromkeys(name.partition(".")[2] for name in found.joints))
-    fields = list(dict.fromkeys(name.partition(".")[0] for name in found.joints))
-    each = [[found.joints[f"{field}.{joint}"] for field in fields] for joint in joints]
-    rows = [[joint, *(f"{x:.3g} ± {e:.2g}" for x, e in row)] for joint, row in zip(joints, each, strict=True)]
-    header = ["joint", *(field.replace("_", "\n") for field in fields)]
-    slides = any(found.system.robot.joint(joint).type == "prismatic" for joint in joints)
-    units = "Nm or N, rad/s or m/s and kg m² or kg" if slides else "Nm, rad/s and kg m²"
-    tables += [columns(f"joints, in {units}", header, rows)] if rows else []
-    return [*tables, f"{found.rows} rows."]
+def with_payload(
+    model: forcegp.Model,
+    rows: forcegp.Dataset,
+    link: str | None,
+    baseline: forcegp.Dataset | None = None,
+    report: Any = None,
+) -> Any:
+    """The posterior of a model that carries something; with a baseline the links are estimated, too."""
+    bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
+    noisy = "u" if model.robot.space.is_vector_space else "both"
+    evidence = (forcegp.Torques(noisy, mean=WINDOW),)
+    loaded = model.with_forces(*bodies, forcegp.Payload(link))
+    return forcegp.evaluation.learn(loaded, rows, evidence, baseline=baseline, report=report)[0]
+
+
+def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
+    """Payload and other numbers as plain JSON values, with the link that carries it."""
+    [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    return {"link": payload.link, "baseline": baseline, **found.estimates.to_dict()}

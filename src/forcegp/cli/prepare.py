@@ -50,7 +50,7 @@ class Prepare(PreparationOptions, RobotOptions, Overwriting):
 
         preparation = replace(self._preparation(), stance=self.stance)
         dataset = forcegp.Dataset.load(self.data)
-        dataset = replace(dataset, system=self.system_if_any(dataset, self.data))
+        dataset = replace(dataset, model=self.model_if_any(dataset, self.data))
         with terminal.progress("preparing"):
             prepared = preparation.apply(dataset)
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:
@@ -90,7 +90,7 @@ def _report(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared
 
     noise, removed = report["acceleration_noise"], report["power_removed"]
     own = dataset.joint_names
-    inputs = own if dataset.system is None else dataset.system.actuators
+    inputs = own if dataset.model is None else dataset.model.actuators
     forces = dict(zip(inputs, removed["u"], strict=False))
     header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
     rows = [

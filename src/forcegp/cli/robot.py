@@ -60,22 +60,22 @@ class Robot(RobotFileOptions, Overwriting):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
             options = {"inertias": self.inertias, "strict": self.strict, **self._changes()}
-            system = forcegp.MechanicalSystem.from_file(self.file, **options)
-            robot = system.robot
+            model = forcegp.Model.from_file(self.file, **options)
+            robot = model.robot
         repaired = [str(warning.message) for warning in caught]
         for text in repaired:
             terminal.warn(text)
         content = _content(robot) | {"file": str(self.file), "repaired": repaired}
-        content["inputs"] = list(system.inputs)
-        content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in system.loops))
+        content["inputs"] = list(model.inputs)
+        content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in model.loops))
         terminal.show(*_shown(robot, content))
         drawn = self.out
-        writers = {".xml": system.to_mjcf, ".mjcf": system.to_mjcf, ".urdf": robot.to_urdf}
+        writers = {".xml": model.to_mjcf, ".mjcf": model.to_mjcf, ".urdf": robot.to_urdf}
         if self.out is not None and self.out.suffix in writers:
             writers[self.out.suffix](self.out)
             content["written"], drawn = str(self.out), None
             terminal.note(f"wrote {self.out}")
-            if system.loops and self.out.suffix == ".urdf":
+            if model.loops and self.out.suffix == ".urdf":
                 terminal.warn("URDF has no closed loops: the file holds the open chain.")
         if drawn is not None or self.browser:
             scene = forcegp.report.still_scene(robot, self.file)

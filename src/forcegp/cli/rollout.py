@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.evaluation
-import forcegp.models
+import forcegp.posterior
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.input_options import SystemChoice, model_and_data
@@ -78,7 +78,7 @@ class Rollout(Overwriting):
             begin = recorded.q[:, 0], recorded.v[:, 0]
             rollout = posterior.rollout(*begin, recorded.u, recorded.dt, **how, baumgarte=baumgarte, progress=report)
         cpu_seconds = time.process_time() - begun
-        errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.system)
+        errors = forcegp.evaluation.rollout_errors(rollout, recorded, posterior.model)
         summary = self._summary(rollout, recorded, errors, dataset, cpu_seconds)
         options = ("run", "data", "rows", "seconds", "system", "integrator", "baumgarte", "samples", "seed")
         content = {"options": {name: summary[name] for name in options}}
@@ -101,7 +101,7 @@ class Rollout(Overwriting):
 
     def _summary(
         self,
-        rollout: forcegp.models.Rollout,
+        rollout: forcegp.posterior.Rollout,
         recorded: forcegp.data.RecordedMotions,
         errors: forcegp.evaluation.RolloutErrors,
         dataset: forcegp.Dataset,

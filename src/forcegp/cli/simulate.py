@@ -20,10 +20,8 @@ from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
 Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped", "quadrotor"]
-ToolFriction = Literal["viscous", "coulomb", "stribeck"]
-JointFriction = Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"]
-TOOL_FRICTION = arg(help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
-JOINT_FRICTION = arg(help_behavior_hint="(default: none; stribeck for free arms)")
+TOOL_FRICTION = arg(metavar="LAW", help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
+JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; dry with more near rest for free arms)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,14 +29,14 @@ class Simulate(Overwriting):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
-    Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with Stribeck
+    Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with dry
     friction in every joint, without PyBullet. quadruped: a robot on a floating base that shifts its weight and lifts
     its feet, with an unknown load of 2 kg. quadrotor: a drone on a path in wind, with late rotors.
     Equal seeds give equal motions; train and test need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
-      forcegp simulate kuka-surface --tool-friction stribeck --patch 4 --joint-friction stribeck --out rough.h5
+      forcegp simulate kuka-surface --tool-friction coulomb --patch 4 --joint-friction coulomb --out rough.h5
       forcegp simulate ur5-free --seconds 60 --seed 1 --out arm.h5
       forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
       forcegp simulate quadruped --seconds 30 --seed 1 --out quadruped.h5
@@ -57,14 +55,14 @@ class Simulate(Overwriting):
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
     trajectories: Annotated[int, arg(metavar="N")] = 1
     """Number of independent trajectories, each from the start posture."""
-    tool_friction: Annotated[ToolFriction | None, TOOL_FRICTION] = None
-    """Unmodelled friction of the tool: viscous, or in proportion to the normal force
-    coulomb or stribeck. PyBullet's contact has no other than coulomb."""
+    tool_friction: Annotated[str | None, TOOL_FRICTION] = None
+    """Unmodelled friction of the tool: viscous, or a law of dry friction by name, in
+    proportion to the normal force. PyBullet's contact has no other than coulomb."""
     friction_coefficient: Annotated[float | None, unless_given("F", "1 if viscous, else 0.3", float)] = None
-    """viscous: in N/(m/s). coulomb, stribeck: friction per normal force while sliding."""
-    joint_friction: Annotated[JointFriction | None, JOINT_FRICTION] = None
-    """Unmodelled friction of the joints: dry and viscous, with stribeck and exponential more near rest.
-    asymmetric, load, lugre and drift have no kernel of their own."""
+    """viscous: in N/(m/s). others: friction per normal force while sliding."""
+    joint_friction: Annotated[str | None, JOINT_FRICTION] = None
+    """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces; of kuka-surface also
+    exponential, asymmetric, load, lugre and drift, which no model has."""
     patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """Multiplies friction on the strip 0 < x < 0.25 m of the surface; 1 for none."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
@@ -116,7 +114,7 @@ class Simulate(Overwriting):
         fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}
         fields["patch_factor"] = self.patch
         if self.friction_coefficient is not None:
-            dry = self.tool_friction in ("coulomb", "stribeck") or self.contact_model == "bullet"
+            dry = self.tool_friction not in (None, "viscous") or self.contact_model == "bullet"
             fields["coulomb_coefficient" if dry else "viscous_coefficient"] = self.friction_coefficient
         return fields
 

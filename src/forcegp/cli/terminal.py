@@ -28,13 +28,12 @@ OTHERWISE = {
     "folder": "out",
     "locked": "lock",
     "most_rows": "max_rows",
-    "observe": "learn_from",
-    "system": "robot",
+    "model": "robot",
 }
 """Options whose argument has another name in Python."""
 
 ELSEWHERE = {
-    "`posterior.with_system(dataset.system)`": "--system data (of forcegp evaluate and rollout)",
+    "`posterior.with_model(dataset.model)`": "--system data (of forcegp evaluate and rollout)",
     "forcegp.data.rows_in_contact": "--rows in-contact",
 }
 """Calls of Python that an option stands for."""

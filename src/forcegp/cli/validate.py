@@ -14,13 +14,13 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.validation
 from forcegp.atomic_files import file_digest
-from forcegp.cli.command import DATASET, BackendOptions, Resuming, listed, unless_given
-from forcegp.cli.input_options import PreparationOptions, RobotOptions
-from forcegp.cli.learning_options import MODEL_PARTS, friction_laws
+from forcegp.cli.command import DATASET, FIELDS, BackendOptions, Resuming, listed, unless_given
+from forcegp.cli.input_options import PreparationOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import NONE, Terminal, columns, number, percent
 
-SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations", "force_noise", "measured_torque")
+SAME = ("points", "starts", "integrator", "identification", "restarts", "iterations")
 """Options that have the names of fields of `forcegp.Comparison`."""
+IDENTIFICATION = "bodies+viscous+coulomb+rotor@accelerations, @torques:both where the base moves"
 BRIEF = ("models", "winners", "verdicts", "against_baseline", "splits", "preparation", "mass_matrix", "seeds", "points")
 """What --json prints of the document."""
 
@@ -36,7 +36,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
 
     For example:
       forcegp validate log.h5 --robot arm.urdf --split episodes:3,7 --cutoff 20 --trim 0.1 --every 5 --out results
-      forcegp validate log.h5 --split blocks:5:3,5 --guard 0.25 --models analytical,joint-friction@identified --out few
+      forcegp validate log.h5 --split blocks:5:3,5 --guard 0.25 --models given,identified+gp:joint --out few
     """
 
     data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
@@ -49,17 +49,13 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     auto: a quarter of the episodes, or with one episode blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
     """Seconds of training rows left out beside held-out blocks."""
-    models: Annotated[tuple[str, ...], listed("NAME,...", "some of every kind", goes_on=MODEL_PARTS)] = ()
-    """analytical: the robot as given. identified-METHOD. independent-gp: without physics.
-    PRIOR or PRIOR@identified: Gaussian processes on forces as in forcegp fit --prior, on the robot as given or as
-    identified. NAME/motions: refined on the motions of the training rows."""
-    identification: Annotated[str, arg(metavar="METHOD")] = "auto"
-    """What @identified takes, and whose mass matrix turns errors of accelerations into forces: from all training rows
-    acceleration-all, torque-all or both-all, from --points acceleration, torque, both or least-squares. auto:
-    acceleration-all, or both-all where the base moves."""
-    friction: Annotated[tuple[str, ...], listed("LAW,...")] = ("viscous", "coulomb")
-    """What identifications estimate of friction: out of viscous, coulomb or stribeck or load, offset and direction; or
-    none."""
+    models: Annotated[tuple[str, ...], listed("NAME,...", "some of every kind", goes_on=FIELDS)] = ()
+    """FORCES[@EVIDENCE], as for forcegp fit but joined by "+". given: the robot as given. identified: as
+    --identification finds it. gp:independent: without physics. gp:joint-friction: unknown forces on the robot as given;
+    identified+gp:joint-friction: on it as identified. viscous+coulomb@torques: laws alone, from all rows.
+    identified@motions:1: refined on the motions of the training rows."""
+    identification: Annotated[str | None, unless_given("FORCES@EVIDENCE", IDENTIFICATION, str)] = None
+    """What `identified` is, whose mass matrix turns errors of accelerations into forces."""
     every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
     points: Annotated[int, arg(metavar="N")] = 100
@@ -79,11 +75,6 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     """Starts of every search for hyper-parameters; the best is kept."""
     iterations: Annotated[int | None, unless_given("N", "200", int)] = None
     """Most iterations of each start."""
-    force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
-    """Models with physics learn a noise of the joint forces as well, beginning at this standard deviation in Nm."""
-    measured_torque: bool = False
-    """u comes from noisy sensors; predictions account for this noise. It applies to models with physics and a force
-    noise."""
     overwrite: bool = False
     """Compute everything anew where the folder holds results."""
 
@@ -94,6 +85,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
 
         comparison, digest = self._comparison(terminal), file_digest(self.data)
         text, robot = f"{self.data} (SHA-256 {digest[:16]}…)", [f"robot from {self.robot}"] * (self.robot is not None)
+        for note in forces_of(comparison.model):
+            terminal.note(note)
         with terminal.progress(f"validating: {len(comparison.splits)} split(s), {self.seeds} seed(s)") as report:
             validation = forcegp.validate(
                 comparison,
@@ -118,8 +111,8 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
 
     def _comparison(self, terminal: Terminal) -> forcegp.Comparison:
         raw = forcegp.Dataset.load(self.data)
-        system = self.chosen_system(raw, self.data)
-        raw = replace(raw, system=system)
+        model = self.chosen_model(raw, self.data)
+        raw = replace(raw, model=model)
         preparation = self._preparation()
         if preparation.changes_nothing:
             rows = recording = raw
@@ -133,10 +126,9 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
         return forcegp.Comparison(
             rows,
             recording,
-            system,
+            model,
             forcegp.split_named(rows, self.split, self.guard),
             horizons=self.horizon,
-            friction=friction_laws(self.friction),
             **{name: getattr(self, name) for name in SAME},
         )
 

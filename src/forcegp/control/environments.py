@@ -14,9 +14,9 @@ from typing_extensions import override
 from forcegp.control.controller import per_joint
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration.integrators import check_time_step
-from forcegp.models import load_posterior
-from forcegp.models.predictor import Predictor
-from forcegp.models.protocol import Posterior
+from forcegp.posterior import load_posterior
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
 
 
@@ -64,7 +64,7 @@ class RobotVectorEnv(VectorEnv):
         check_time_step(dt)
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
         self._how = {"integrator": integrator, "seed": function_seed, "threads": threads}
-        robot = self.predictor.posterior.system.robot
+        robot = self.predictor.posterior.model.robot
         robot.require_vectors("environments")
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
         self._limits = limits = per_joint("torque_limits", limits, robot.nv).numpy()

@@ -20,22 +20,23 @@ from jaxtyping import Float
 from scipy.interpolate import BSpline
 from typing_extensions import override
 
-from forcegp.analytical.identifiability import base_parameters, torque_regressor
 from forcegp.atomic_files import atomic_file
 from forcegp.control.controller import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
+from forcegp.evidence.identifiability import base_parameters, torque_regressor
 from forcegp.inference.cholesky_update import rows_to_keep, with_only
 from forcegp.inference.posterior import exact
+from forcegp.inference.threads import blas_threads
 from forcegp.integration.integrators import check_time_step
-from forcegp.mechanics import Contact, MechanicalSystem
-from forcegp.models import StructuredPosterior
-from forcegp.models.protocol import Posterior
-from forcegp.models.search import blas_threads
-from forcegp.models.structured.components import inverse_dynamics
-from forcegp.models.structured.update import learn_more_rows
+from forcegp.mechanics import Contact
+from forcegp.model import Model
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.components import inverse_dynamics
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.update import learn_more_rows
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number
 from forcegp.summary import Summary, rounded
@@ -66,8 +67,8 @@ class LearnedForces:
     judged_at: tuple[Values, Values, Values]
 
     def __init__(self, posterior: StructuredPosterior, rows: int) -> None:
-        self.rows, free, own = rows, posterior.system.with_contacts(()), posterior.likelihood
-        own = replace(own, system=free, fixed_standardization=own.standardization)
+        self.rows, free, own = rows, posterior.model.with_contacts(()), posterior.likelihood
+        own = replace(own, model=free, fixed_standardization=own.standardization)
         self.posterior = replace(posterior, likelihood=own, target=free)
         latent, given = exact(posterior.latent, "choosing a motion"), posterior.training
         kept = far_apart(given.q, given.v, given.u, MOST_ROWS)
@@ -82,8 +83,8 @@ class LearnedForces:
         some = far_apart(motion.q, motion.v, motion.u, self.rows)
         q, v, _, u = (x[some] for x in motion[1:])
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
-        noise, system = posterior.noise_std.numpy(), posterior.system
-        rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, system=system)
+        noise, model = posterior.noise_std.numpy(), posterior.model
+        rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model)
         return learn_more_rows(posterior, rows, None, rows_to_keep)
 
     def spread(self, posterior: StructuredPosterior) -> np.ndarray:
@@ -98,20 +99,20 @@ class LearnedForces:
 class BaseParameters:
     """What shows of base parameters, viscous and dry friction; torques count over their limits (nv,)."""
 
-    def __init__(self, system: MechanicalSystem, limits: np.ndarray) -> None:
-        self.system, self.scale = replace(system, contacts=()), np.where(np.isinf(limits), 1.0, limits)
-        self.columns = list(base_parameters(system.robot).independent)
+    def __init__(self, model: Model, limits: np.ndarray) -> None:
+        self.model, self.scale = replace(model, contacts=()), np.where(np.isinf(limits), 1.0, limits)
+        self.columns = list(base_parameters(model.robot).independent)
 
     def torques(self, *states: Values) -> Values:
         """u (n, nv) in Nm or N of q, v and a, against known forces as they are without u."""
         q, v, a = map(torch.as_tensor, states)
-        at = self.system.dynamics(q, v, 0.0 * a)
+        at = self.model.dynamics(q, v, 0.0 * a)
         return ((at.M @ a[..., None])[..., 0] - at.Q_K).numpy()
 
     def regressor(self, motion: Motion) -> np.ndarray:
         """Of all samples, (rows, k)."""
         q, v, a = map(torch.as_tensor, motion[1:4])
-        Y = torque_regressor(self.system.robot, q, v, a)[..., self.columns]
+        Y = torque_regressor(self.model.robot, q, v, a)[..., self.columns]
         Y = torch.cat([Y, torch.diag_embed(v), torch.diag_embed((v / DRY).tanh())], dim=-1)
         return (Y.numpy() / self.scale[:, None]).reshape(-1, Y.shape[-1])
 
@@ -267,7 +268,7 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], mar
 
 @usable_arguments("excitation")
 def excitation(
-    model: Robot | MechanicalSystem | Posterior,
+    model: Robot | Model | Posterior,
     *,
     seconds: float = 10.0,
     limits: Mapping[str, Any] | None = None,
@@ -283,8 +284,8 @@ def excitation(
 ) -> Excitation:
     """The motion from rest at `start` and back after which learned forces are surest.
 
-    * model: a fitted `StructuredGP`, whose accelerations at the states of `task` (None: any within the limits) are to
-      be sure once it has learned from `rows` rows of the motion; or a robot, a system or another model, for the
+    * model: a `StructuredPosterior`, whose accelerations at the states of `task` (None: any within the limits) are to
+      be sure once it has learned from `rows` rows of the motion; or a robot or another model, for the
       identification of base parameters and friction.
     * limits: of "position" (from the start), "velocity", "acceleration" and "torque", numbers or one per joint, in rad,
       s and Nm (m, N); those of the URDF count, too, `margin` times.
@@ -294,12 +295,11 @@ def excitation(
 
     Raises InvalidInput for arguments that do not fit and, naming the joint, for limits that cannot be kept.
     """
-    if not isinstance(model, Robot | MechanicalSystem | Posterior):
-        raise InvalidInput(f"model is a {type(model).__name__}; give a Robot, a MechanicalSystem or a fitted model.")
-    system = MechanicalSystem(model) if isinstance(model, Robot) else model
-    system = system.system if isinstance(system, Posterior) else system
-    system.robot.require_vectors("planned motions")
-    robot, rng = system.robot, np.random.default_rng(whole_number("seed", seed, 0))
+    if not isinstance(model, Robot | Model | Posterior):
+        raise InvalidInput(f"model is a {type(model).__name__}; give a Robot, a Model or a fitted model.")
+    known = Model(model) if isinstance(model, Robot) else model.model if isinstance(model, Posterior) else model
+    known.robot.require_vectors("planned motions")
+    robot, rng = known.robot, np.random.default_rng(whole_number("seed", seed, 0))
     for name, value, most in (("seconds", seconds, LONGEST), ("margin", margin, 1.0), ("clearance", clearance, 1e9)):
         if not isinstance(value, int | float) or not 0.0 < value <= most:
             raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
@@ -313,10 +313,10 @@ def excitation(
     bounds = motion_limits(robot, start, require_type("limits", {} if limits is None else limits, Mapping), margin)
     rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
     learned = model if isinstance(model, StructuredPosterior) and model.latent_names else None
-    teaches = BaseParameters(system, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
-    if system.loops:
+    teaches = BaseParameters(known, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
+    if known.loops:
         raise InvalidInput("motions are planned joint by joint, which would break the closed loops of this robot.")
-    surfaces = (system if surfaces is None else system.with_contacts(surfaces)).contacts
+    surfaces = (known if surfaces is None else known.with_contacts(surfaces)).contacts
     draft = Excitation(robot, start, bounds, seconds, teaches.torques, surfaces, clearance, Motion(*[start] * 5))
     best, least, size = draft.kept(0.0 * draft.random(rng)), np.inf, 0.3  # refuses the start
     if isinstance(teaches, LearnedForces) and task is not None:

@@ -13,11 +13,11 @@ from scipy.stats import chi2, gumbel_r
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.analytical.least_squares import NoiseLevels
-from forcegp.control.tracking import Model, joint_forces, system_of
+from forcegp.control.tracking import Moving, joint_forces, model_of
 from forcegp.errors import DatasetError, InvalidInput, require_known
+from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.integration.integrators import check_time_step
-from forcegp.models.predictor import Predictor
+from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_array
 from forcegp.summary import Summary
@@ -69,7 +69,7 @@ class ContactMonitor(Summary):
     accelerations and of the forces as in free motion (`calibrate`), and an alarm is raised where tau^T S^-1 tau exceeds
     a threshold that free motion reaches as often as stated.
 
-    * model: `posterior.predictor()`, or a `MechanicalSystem` without anything learned.
+    * model: `posterior.predictor()`, or a `Model` without anything learned.
     * covariance: "noise" is S; "noise and posterior" adds the spread of the learned forces there, which
       spares false alarms where the model has not been. None is the latter where the model has a covariance.
 
@@ -79,15 +79,15 @@ class ContactMonitor(Summary):
 
     def __init__(
         self,
-        model: Model,
+        model: Moving,
         *,
         dt: float,
         bandwidth: float = 5.0,
         covariance: Literal["noise", "noise and posterior"] | None = None,
     ) -> None:
-        self.model, system = model, system_of(model)
-        system.robot.require_vectors("monitors of contacts")
-        if system.contacts:
+        self.model, plain = model, model_of(model)
+        plain.robot.require_vectors("monitors of contacts")
+        if plain.contacts:
             raise InvalidInput(
                 "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
                 "motion, or give posterior.with_contacts([])."
@@ -101,7 +101,7 @@ class ContactMonitor(Summary):
         check_time_step(dt)
         if not (isinstance(bandwidth, int | float) and 0.0 < bandwidth < 0.5 / dt):
             raise InvalidInput(f"bandwidth is {bandwidth!r}; give Hz above 0 and below {0.5 / dt:g}, half the rate.")
-        self.robot: Robot = system.robot
+        self.robot: Robot = plain.robot
         self.dt, self.bandwidth = float(dt), float(bandwidth)
         self._keep = math.exp(-2.0 * math.pi * bandwidth * dt)
         self.noise: NoiseLevels | None = None

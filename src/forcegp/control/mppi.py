@@ -13,7 +13,7 @@ from typing_extensions import override
 from forcegp.control.controller import Controller, OnFailure, per_joint
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.integration.integrators import check_time_step
-from forcegp.models.predictor import Predictor
+from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
 
 Cost = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -75,7 +75,7 @@ class MPPI(Controller):
         self.dt, self.steps = float(dt), whole_number("steps", steps, 1)
         self.samples, self.functions = whole_number("samples", samples, 2), whole_number("functions", functions, 0)
         self._seed = whole_number("seed", seed, 0)
-        super().__init__(predictor.posterior.system.robot, torque_limits, on_failure)
+        super().__init__(predictor.posterior.model.robot, torque_limits, on_failure)
         self.noise = per_joint("noise", 0.5 * self.torque_limits if noise is None else noise, nv)
         if not bool(self.noise.isfinite().all()):
             raise InvalidInput("noise is infinite where torque_limits are; give noise in Nm or N, or finite limits.")

@@ -15,8 +15,8 @@ from typing_extensions import override
 from forcegp.codegen.c_text import c_text, filled
 from forcegp.codegen.library import Purpose, aligned, default_folder, load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
-from forcegp.models.predictor import Predictor
-from forcegp.models.structured.components import require_actuated
+from forcegp.posterior.components import require_actuated
+from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import Summary
 
@@ -45,17 +45,17 @@ class MujocoForces(Summary):
     def __init__(self, predictor: Predictor, model: Any, *, draw: int = 0, seed: int = 0) -> None:
         require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         require_type("model", model, mujoco.MjModel)
-        predictor.posterior.system.robot.require_vectors("forces in MuJoCo")
+        predictor.posterior.model.robot.require_vectors("forces in MuJoCo")
         require_actuated(predictor.posterior)
         self.predictor, self.draw = predictor, whole_number("draw", draw, 0)
-        system = predictor.posterior.system
-        if system.contacts:
+        own = predictor.posterior.model
+        if own.contacts:
             raise InvalidInput("MuJoCo has contacts of its own, and this model has one; posterior.with_contacts([]).")
         if draw and not len(predictor.latent.features):
             raise InvalidInput(f"draw={draw} functions are asked for, and this model has none; give draw=0.")
         if predictor.code is None:
             raise InvalidInput("the predictor was made with compile=False; MuJoCo needs the C program.")
-        places = _joints(model, system.robot.joint_names)
+        places = _joints(model, own.robot.joint_names)
         _require_alike(predictor, model, places)
         code, nv = predictor.code.traced, predictor.nv
         program = code.program("passive")
@@ -79,7 +79,7 @@ class MujocoForces(Summary):
     @override
     def facts(self) -> Mapping[str, object]:
         """The robot, and how many functions there are."""
-        return {"robot": self.predictor.posterior.system.robot.name, "functions": self.draw or "the mean"}
+        return {"robot": self.predictor.posterior.model.robot.name, "functions": self.draw or "the mean"}
 
     def use(self, number: int) -> None:
         """Take this of the drawn functions from now on; call it between two steps."""
@@ -131,7 +131,7 @@ def _joints(model: Any, names: tuple[str, ...]) -> list[tuple[int, int]]:
 
 def _require_alike(predictor: Predictor, model: Any, places: list[tuple[int, int]]) -> None:
     """Raise InvalidInput where masses, inertias or gravity are not those of the robot."""
-    data, system, generator = mujoco.MjData(model), predictor.posterior.system, np.random.default_rng(0)
+    data, known, generator = mujoco.MjData(model), predictor.posterior.model, np.random.default_rng(0)
     at_q, at_v = (list(each) for each in zip(*places, strict=True))
     for _ in range(STATES):
         data.qpos[at_q], data.qvel[at_v] = generator.uniform(-1.0, 1.0, (2, len(places)))
@@ -139,13 +139,13 @@ def _require_alike(predictor: Predictor, model: Any, places: list[tuple[int, int
         whole = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, whole)
         q, v = (torch.from_numpy(np.array(x)) for x in (data.qpos[at_q], data.qvel[at_v]))
-        kinematics = system.robot.kinematics(q, v)
-        M, h = system.mass_matrix(kinematics).numpy(), kinematics.bias_forces().numpy()
+        kinematics = known.robot.kinematics(q, v)
+        M, h = known.mass_matrix_at(kinematics).numpy(), kinematics.bias_forces().numpy()
         pairs = ("mass matrix", M, whole[np.ix_(at_v, at_v)]), ("gravity or bias force", h, data.qfrc_bias[at_v])
         for what, own, other in pairs:
             apart = float(np.abs(own - other).max() / np.abs(own).max())
             if not apart <= ALIKE:
                 raise InvalidInput(
                     f"the {what} of the MjModel differs by {apart:.2g} (relative) from that of "
-                    f"{system.robot.name}; load the same URDF, with the same gravity and armature (dof_armature)."
+                    f"{known.robot.name}; load the same URDF, with the same gravity and armature (dof_armature)."
                 )

@@ -12,15 +12,15 @@ from typing_extensions import override
 from forcegp.control.controller import Controller, OnFailure, per_joint
 from forcegp.errors import InvalidInput, NumericalError, require_known, require_type
 from forcegp.integration.integrators import check_time_step
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models.prediction import JointForces
-from forcegp.models.predictor import Predictor
-from forcegp.models.structured.components import require_actuated
+from forcegp.model import Model
+from forcegp.posterior.components import require_actuated
+from forcegp.posterior.prediction import JointForces
+from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import real_tensor
 from forcegp.robots.compiled import CompiledRobot
 
-Model = MechanicalSystem | Predictor
+Moving = Model | Predictor
 ROUNDS = 20  # of Newton's method; one where no force depends on u
 CLOSE = 1e-9  # relative to the forces
 NO_TORQUES = (
@@ -118,7 +118,7 @@ class PDGravity(TrackingController):
 class ComputedTorque(TrackingController):
     """u = M (a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum) + h - Q_U: all forces compensated, also those learned.
 
-    * model: `posterior.predictor()`, or a `MechanicalSystem` without anything learned, which takes longer. Gains as
+    * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
     * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
       velocity dry friction follows the noise of v and every overshoot, one sample late (docs/how-to/control.md).
@@ -129,14 +129,14 @@ class ComputedTorque(TrackingController):
 
     def __init__(
         self,
-        model: Model,
+        model: Moving,
         *,
         forces_at: Literal["desired", "measured"] = "desired",
         gain_factor: Callable[[Tensor], Tensor] | None = None,
         **settings: Any,
     ) -> None:
-        system = system_of(model)
-        if system.contacts:
+        known = model_of(model)
+        if known.contacts:
             raise InvalidInput(
                 "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
                 "posterior.with_contacts([])."
@@ -145,7 +145,7 @@ class ComputedTorque(TrackingController):
         if gain_factor is not None and not (isinstance(model, Predictor) and model.kind != "none"):
             raise InvalidInput("gain_factor needs standard deviations: give posterior.predictor() with a covariance.")
         self.model, self.forces_at, self.gain_factor = model, forces_at, gain_factor
-        super().__init__(system.robot, **settings)
+        super().__init__(known.robot, **settings)
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
@@ -159,16 +159,16 @@ class ComputedTorque(TrackingController):
         return u
 
 
-def system_of(model: Model) -> MechanicalSystem:
+def model_of(model: Moving) -> Model:
     """The robot and known forces of a model. Raises InvalidInput for what is none."""
-    if isinstance(model, MechanicalSystem):
+    if isinstance(model, Model):
         return model
     if isinstance(model, Predictor):
-        return model.posterior.system
-    raise InvalidInput(f"model is a {type(model).__name__}; give posterior.predictor() or a MechanicalSystem.")
+        return model.posterior.model
+    raise InvalidInput(f"model is a {type(model).__name__}; give posterior.predictor() or a Model.")
 
 
-def joint_forces(model: Model, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
+def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
     """Known and learned forces at a state (nv,) or states (n, nv) and what they act on."""
     if isinstance(model, Predictor):
         return model.joint_forces(q, v, u)
@@ -177,7 +177,7 @@ def joint_forces(model: Model, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
 
 
 def torques_for(
-    model: Model, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
+    model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
 ) -> Float[Tensor, " nv"] | None:
     """The u (nv,) under which known and learned forces at q, v are those `needed`, by Newton's method; None if none is.
 
@@ -211,14 +211,14 @@ class HybridForce(TrackingController):
 
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
-        self.system = predictor.posterior.system
-        if not self.system.touching or self.system.loops:
+        self.model = predictor.posterior.model
+        if not self.model.touching or self.model.loops:
             raise InvalidInput(
                 "HybridForce wants a force against a contact, and this model has none, or a closed loop; name it in "
                 "posterior.with_contacts([...]), or use ComputedTorque."
             )
         require_actuated(predictor.posterior)
-        super().__init__(self.system.robot, **settings)
+        super().__init__(self.model.robot, **settings)
 
     @override
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
@@ -226,7 +226,7 @@ class HybridForce(TrackingController):
 
         A normal force is positive where the surface pushes the robot off; a surface only pushes.
         """
-        count = len(self.system.contacts)
+        count = len(self.model.contacts)
         wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
         if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):
             raise InvalidInput(

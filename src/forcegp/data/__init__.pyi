@@ -7,6 +7,7 @@ from .contact_evidence import (
     contact_doubts as contact_doubts,
 )
 from .dataset import Dataset as Dataset
+from .memory import with_memory as with_memory
 from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints
 from .filtering import (
     differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass
@@ -19,9 +20,6 @@ from .motion_records import RecordedMotions as RecordedMotions, recorded_motions
 from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
 from .spectrum import (
     MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,
-)
-from .windows import (
-    WeakForm as WeakForm, Windows as Windows,
 )
 from .stance import Stance as Stance, estimate_stance as estimate_stance
 from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag, thruster_columns as thruster_columns

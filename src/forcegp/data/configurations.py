@@ -27,7 +27,7 @@ Positions = Float[np.ndarray, "rows nq"]
 
 def space_of(dataset: Dataset) -> ConfigurationSpace:
     """What positions the recorded robot can have; without a robot, vectors."""
-    return ConfigurationSpace(dataset.nv) if dataset.system is None else dataset.system.robot.space
+    return ConfigurationSpace(dataset.nv) if dataset.model is None else dataset.model.robot.space
 
 
 def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
@@ -157,10 +157,10 @@ def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
 
 def actuators(dataset: Dataset) -> int:
     """How many columns of u are forces. Those of observers and switches follow, which no filter may touch."""
-    return dataset.u.shape[1] if dataset.system is None else len(dataset.system.actuators)
+    return dataset.u.shape[1] if dataset.model is None else len(dataset.model.actuators)
 
 
 def switches(dataset: Dataset) -> list[int]:
     """Which columns of u are switches of contacts."""
-    own = [] if dataset.system is None else [contact.switch for contact in dataset.system.contacts]
-    return [] if dataset.system is None else [k for k, name in enumerate(dataset.system.inputs) if name in own]
+    own = [] if dataset.model is None else [contact.switch for contact in dataset.model.contacts]
+    return [] if dataset.model is None else [k for k, name in enumerate(dataset.model.inputs) if name in own]

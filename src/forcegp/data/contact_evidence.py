@@ -31,7 +31,7 @@ DISTANCE_DEVIATIONS = 20.0
 
 
 def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
-    """Whether each contact of `dataset.system` acts in each row, from q, v and a alone; `truth` is not looked at.
+    """Whether each contact of `dataset.model` acts in each row, from q, v and a alone; `truth` is not looked at.
 
     A row counts if its point
 
@@ -47,17 +47,17 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
 
     Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
-    system = dataset.system
-    if system is None or not system.contacts:
+    model = dataset.model
+    if model is None or not model.contacts:
         raise ContactError(
-            f"the dataset has {'no system' if system is None else 'a system without contacts'}; rows in contact can "
-            "only be found for a system that lists its contacts: dataclasses.replace(dataset, system=...)."
+            f"the dataset has {'no model' if model is None else 'a model without contacts'}; rows in contact can "
+            "only be found for a model that lists its contacts: dataclasses.replace(dataset, model=...)."
         )
-    recovery = _recovery(system)
+    recovery = _recovery(model)
     with torch.no_grad():
-        motions = _point_motions(dataset, system)
+        motions = _point_motions(dataset, model)
     columns = []
-    for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
+    for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
         if isinstance(contact, forcegp.mechanics.LoopClosure) or contact.switch is not None:
             columns.append(np.ones(len(dataset), dtype=bool))
             continue
@@ -72,7 +72,7 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
 
 
 def rows_in_contact(dataset: Dataset) -> Dataset:
-    """The rows in which every contact of `dataset.system` acts, as `contact_rows` finds them.
+    """The rows in which every contact of `dataset.model` acts, as `contact_rows` finds them.
 
     Raises ContactError as `contact_rows` does, and if the contacts never act together.
     """
@@ -82,7 +82,7 @@ def rows_in_contact(dataset: Dataset) -> Dataset:
         counts = ", ".join(f"{count}" for count in acts.sum(axis=0))
         raise ContactError(
             f"the {acts.shape[1]} contacts act in {counts} of {len(dataset)} rows, but never all in one. Learn from "
-            "the rows of fewer contacts: MechanicalSystem.with_contacts."
+            "the rows of fewer contacts: Model.with_contacts."
         )
     return dataset.rows(together)
 
@@ -106,18 +106,18 @@ class _PointMotion(NamedTuple):
 
 def _point_motions(
     dataset: Dataset,
-    system: forcegp.mechanics.MechanicalSystem,
+    model: forcegp.Model,
     noise_seen: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[_PointMotion]:
     """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
     q, v, u, a = tensors(dataset)
-    state = system.state(q, v, u)
+    state = model.state(q, v, u)
     wander, sigma = map(torch.tensor, noise_seen or (np.zeros(dataset.nv), np.zeros(dataset.nv)))
     if dataset.noise_std is not None:
         sigma = torch.tensor(dataset.noise_std)
     motions = []
-    for contact in system.contacts:
-        A, b, gradient = contact.constraint(state, system.baumgarte)
+    for contact in model.contacts:
+        A, b, gradient = contact.constraint(state, model.baumgarte)
         size = torch.linalg.vector_norm(gradient, dim=-1)
         J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
         speed, acceleration = (torch.linalg.vector_norm((J @ x[..., None])[..., 0], dim=-1) for x in (v, a))
@@ -128,9 +128,9 @@ def _point_motions(
     return motions
 
 
-def _recovery(system: forcegp.mechanics.MechanicalSystem) -> float:
+def _recovery(model: forcegp.Model) -> float:
     """Baumgarte's omega [1/s]."""
-    return 0.0 if system.baumgarte is None else system.baumgarte.omega
+    return 0.0 if model.baumgarte is None else model.baumgarte.omega
 
 
 def _acting(motion: _PointMotion, recovery: float) -> Bool[np.ndarray, " rows"]:
@@ -183,20 +183,20 @@ class ContactDoubt:
         return f"{self.seen} {self.remedy}"
 
 
-def contact_doubts(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem | None = None) -> list[ContactDoubt]:
-    """What the rows of `dataset` contradict about the contacts of `system` (default: its own); empty where nothing.
+def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list[ContactDoubt]:
+    """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
     say nothing. Not for contacts that hold several points of one body, nor for robots with closed loops.
     """
-    system = dataset.system if system is None else system
-    if system is None or system.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
+    model = dataset.model if model is None else model
+    if model is None or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
         return []
     noise = _white_noise(dataset.v, dataset), _white_noise(dataset.a, dataset)
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
     with torch.no_grad():
         try:
-            return _stated(rows, system.to("cpu"), noise) if system.contacts else _missing(rows, system.to("cpu"))
+            return _stated(rows, model.to("cpu"), noise) if model.contacts else _missing(rows, model.to("cpu"))
         except (ForceGPError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
             return []  # states that no contact bears: who computes with them raises what is wrong
 
@@ -212,14 +212,12 @@ def _white_noise(values: Float[np.ndarray, "rows nv"], dataset: Dataset) -> Floa
     return 1.4826 * np.median(np.abs(thirds), axis=0) / 20.0**0.5 if len(thirds) else np.zeros(dataset.nv)
 
 
-def _stated(
-    rows: Dataset, system: forcegp.mechanics.MechanicalSystem, noise_seen: tuple[np.ndarray, np.ndarray]
-) -> list[ContactDoubt]:
+def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, np.ndarray]) -> list[ContactDoubt]:
     touching = np.ones(len(rows), dtype=bool)
-    motions = _point_motions(rows, system, noise_seen)
-    for index, (contact, motion) in enumerate(zip(system.contacts, motions, strict=True)):
+    motions = _point_motions(rows, model, noise_seen)
+    for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
         acts = (
-            np.ones(len(rows), bool) if contact.switch is None else rows.u[:, system.inputs.index(contact.switch)] > 0.5
+            np.ones(len(rows), bool) if contact.switch is None else rows.u[:, model.inputs.index(contact.switch)] > 0.5
         )
         if not acts.any():
             continue
@@ -229,7 +227,7 @@ def _stated(
             float(np.median(np.abs(values))) for values in (motion.residual, motion.acceleration, motion.noise)
         )
         broken = residual > max(BROKEN * acceleration, NOISE * noise)
-        recovered = _recovery(system) * np.minimum(np.abs(distance), FARTHEST)
+        recovered = _recovery(model) * np.minimum(np.abs(distance), FARTHEST)
         slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered + 2.0 * motion.rate_noise
         moves = motion.speed > 2.0 * (CREEP + motion.speed_noise)
         along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= FARTHEST)
@@ -254,25 +252,25 @@ def _stated(
         return [ContactDoubt(kind="off", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]
     if touching.sum() < FEWEST_ROWS:
         return []
-    return _forces(rows.rows(touching), system)
+    return _forces(rows.rows(touching), model)
 
 
-def _forces(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[ContactDoubt]:
+def _forces(rows: Dataset, model: forcegp.Model) -> list[ContactDoubt]:
     """Whether forces act at the points that the contacts state, and whether there are any."""
-    if len(rows) * (rows.nv - len(system.contacts)) < 2 * (3 * rows.nv + 5 * len(system.contacts)):
+    if len(rows) * (rows.nv - len(model.contacts)) < 2 * (3 * rows.nv + 5 * len(model.contacts)):
         return []
-    others, tangents = moved_points(rows, system)
-    given = Residual(rows, system, more=others)
+    others, tangents = moved_points(rows, model)
+    given = Residual(rows, model, more=others)
     solution, left, weights = given.fitted(extra=True)
     stated = given.fitted(weights=weights)[1]
-    free = Residual(rows, system.with_contacts(()), friction=given.friction).fitted(weights=weights)[1]
+    free = Residual(rows, model.with_contacts(()), friction=given.friction).fitted(weights=weights)[1]
     necessary = float(np.log(free / stated).sum())
     improved = float(np.log(stated / left).sum())
     grams = given.grams()
     each = np.stack([given.solved(grams.sum(axis=0) - gram, weights, True)[0] for gram in grams])
     deviations = np.std(each, axis=0) * np.sqrt(BLOCKS - 1.0)
     doubts = []
-    for index, contact in enumerate(system.contacts):
+    for index, contact in enumerate(model.contacts):
         places = slice(len(solution) - len(others) + 2 * index, len(solution) - len(others) + 2 * index + 2)
         shift, std = solution[places], deviations[places]
         size, uncertain = float(np.linalg.norm(shift)), float(np.linalg.norm(std))
@@ -300,9 +298,9 @@ def _forces(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[C
     return doubts
 
 
-def _missing(rows: Dataset, system: forcegp.mechanics.MechanicalSystem) -> list[ContactDoubt]:
+def _missing(rows: Dataset, model: forcegp.Model) -> list[ContactDoubt]:
     """A point of a last link that stays on a plane or sphere, with a force that accelerations need."""
-    found = missing_contact(rows, system)
+    found = missing_contact(rows, model)
     if found is None:
         return []
     gain, contact = found

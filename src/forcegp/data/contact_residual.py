@@ -33,23 +33,23 @@ def tensors(rows: Dataset) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 class Residual:
-    """Accelerations that friction and some more columns leave of `a` under a system's contacts, joint by joint.
+    """Accelerations that friction and some more columns leave of `a` under a model's contacts, joint by joint.
 
     `friction` (rows, nv, k) are joint forces of the friction that may be there (default: of joints and contacts),
-    `more` the same system with something moved by STEP, whose effect is one more column each.
+    `more` the same model with something moved by STEP, whose effect is one more column each.
     """
 
     def __init__(
         self,
         rows: Dataset,
-        system: forcegp.mechanics.MechanicalSystem,
+        model: forcegp.Model,
         friction: Float[Tensor, "rows nv k"] | None = None,
-        more: Sequence[forcegp.mechanics.MechanicalSystem] = (),
+        more: Sequence[forcegp.Model] = (),
     ) -> None:
         q, v, u, a = tensors(rows)
-        dynamics = system.dynamics(q, v, u)
+        dynamics = model.dynamics(q, v, u)
         given = dynamics.acceleration_map().offset
-        self.friction = _friction(rows, system, dynamics) if friction is None else friction
+        self.friction = _friction(rows, model, dynamics) if friction is None else friction
         moved = [(other.dynamics(q, v, u).acceleration_map().offset - given) / STEP for other in more]
         columns = torch.cat([dynamics.H @ self.friction, *(each[..., None] for each in moved)], dim=-1)
         self.extra = len(moved)
@@ -91,7 +91,7 @@ class Residual:
 
 
 def _friction(
-    rows: Dataset, system: forcegp.mechanics.MechanicalSystem, dynamics: forcegp.mechanics.ConstrainedDynamics
+    rows: Dataset, model: forcegp.Model, dynamics: forcegp.mechanics.ConstrainedDynamics
 ) -> Float[Tensor, "rows nv k"]:
     """Joint forces of viscous and dry friction and constants in every joint, and of friction at every contact."""
     state, v = dynamics.state, dynamics.state.v
@@ -103,7 +103,7 @@ def _friction(
     ]
     multipliers = dynamics.multiplier_map().offset.abs()
     many = len(v) >= MANY_ROWS
-    for index, contact in enumerate(system.contacts):
+    for index, contact in enumerate(model.contacts):
         J, turning = state.kinematics.frame_jacobian(contact.frame, contact.point).split(3, dim=1)
         velocity = (J @ v[..., None])[..., 0]
         speed = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
@@ -116,21 +116,19 @@ def _friction(
     return torch.cat(forces, dim=-1)
 
 
-def moved_points(
-    rows: Dataset, system: forcegp.mechanics.MechanicalSystem
-) -> tuple[list[forcegp.mechanics.MechanicalSystem], list[np.ndarray]]:
-    """The system with each contact point moved along the surface, in both directions of the link's frame."""
-    kinematics = system.robot.kinematics(torch.tensor(rows.q))
+def moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Model], list[np.ndarray]]:
+    """The model with each contact point moved along the surface, in both directions of the link's frame."""
+    kinematics = model.robot.kinematics(torch.tensor(rows.q))
     others, tangents = [], []
-    for index, contact in enumerate(system.contacts):
+    for index, contact in enumerate(model.contacts):
         normal = contact.surface.gradient(contact.position(kinematics))
         local = (kinematics.frame_pose(contact.frame)[:, :3, :3].mT @ normal[..., None])[..., 0].numpy()
         across = np.linalg.eigh(local.T @ local)[1][:, :2].T  # the directions that are least along the normal
         for direction in across:
             point = tuple(np.asarray(contact.point) + STEP * direction)
-            contacts = list(system.contacts)
+            contacts = list(model.contacts)
             contacts[index] = replace(contact, point=point)
-            others.append(system.with_contacts(contacts))
+            others.append(model.with_contacts(contacts))
         tangents.append(across)
     return others, tangents
 
@@ -146,27 +144,25 @@ ARM = 0.3
 """Size in m of a link: of several points that stay on a surface, one not farther from its frame than that is likely."""
 
 
-def missing_contact(
-    rows: Dataset, system: forcegp.mechanics.MechanicalSystem
-) -> tuple[float, forcegp.mechanics.Contact] | None:
+def missing_contact(rows: Dataset, model: forcegp.Model) -> tuple[float, forcegp.mechanics.Contact] | None:
     """A point of a last link that stays on a plane or sphere, with a force along the normal that accelerations need.
 
     And the logarithm of what remains of the accelerations without it over what remains with it, over all joints.
     """
     if len(rows) < FEWEST_ROWS or rows.nv < 2:
         return None
-    robot = system.robot
+    robot = model.robot
     parents = set(robot.layout.parents)
     best: tuple[float, forcegp.mechanics.Contact] | None = None
     for body, joint in enumerate(robot.layout.bodies):
         if body in parents:
             continue
         for contact in _surfaces(rows, robot, joint.child):
-            others, _ = moved_points(rows, system.with_contacts([contact]))
-            with_it = Residual(rows, system.with_contacts([contact]), more=others)
+            others, _ = moved_points(rows, model.with_contacts([contact]))
+            with_it = Residual(rows, model.with_contacts([contact]), more=others)
             _, left, weights = with_it.fitted(extra=True)  # the motion may show the surface, and not the point
-            free = Residual(rows, system, friction=with_it.friction).fitted(weights=weights)[1]
-            own = Residual(rows, system, friction=with_it.friction).fitted()[1]
+            free = Residual(rows, model, friction=with_it.friction).fitted(weights=weights)[1]
+            own = Residual(rows, model, friction=with_it.friction).fitted()[1]
             gain = float(np.log(np.minimum(free, own) / left).sum())
             if gain > NEEDED and (best is None or gain > best[0]):
                 best = gain, contact

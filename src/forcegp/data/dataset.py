@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from typing_extensions import override
 
-import forcegp.mechanics
+import forcegp.model
 from forcegp.data.dataset_fields import (
     FrozenDict,
     arrays_of,
@@ -44,14 +44,14 @@ class Dataset(Summary):
     Fields
     ------
     q, v, u: (rows, nv) positions, velocities and actuator forces [units]. Where the base moves, q has the columns
-        `system.robot.position_names`, and u the columns `system.inputs`.
+        `model.robot.position_names`, and u the columns `model.inputs`.
     a: (rows, nv) measured acceleration, with its noise.
     time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
-    joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `system.robot`.
+    joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `model.robot`.
     units: mapping of "q", "v", "u", "a", "time" to SI units; one text, or one per joint where joints differ. By default
-        those that the joint types of `system.robot` ask for. Without a system both must be given.
+        those that the joint types of `model.robot` ask for. Without a model both must be given.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
-    system: the robot and what it touches, or None.
+    model: the robot and what it touches, or None.
     noise_std: standard deviation of the noise on `a`, if known: (nv,), or (rows, nv) where it differs between rows.
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
@@ -70,7 +70,7 @@ class Dataset(Summary):
     joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
     units: Mapping[str, Any] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
-    system: forcegp.mechanics.MechanicalSystem | None = None
+    model: forcegp.model.Model | None = None
     noise_std: Float[np.ndarray, " nv"] | Float[np.ndarray, "rows nv"] | None = None
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -83,32 +83,32 @@ class Dataset(Summary):
 
         for name in ("joint_names", "units"):
             if getattr(self, name) is None:
-                if self.system is None:
-                    raise DatasetError(f"{name} are missing; give them, or a system whose robot has them.")
-                robot = self.system.robot
+                if self.model is None:
+                    raise DatasetError(f"{name} are missing; give them, or a model whose robot has them.")
+                robot = self.model.robot
                 put(name, robot.joint_names if name == "joint_names" else units_for(robot))
-        names = _joint_names(self.joint_names, self.system)
+        names = _joint_names(self.joint_names, self.model)
         put("joint_names", names)
         positions, actuators = self._columns_of("q"), self._columns_of("u")
         put("q", finite_columns("q", self.q, positions))
         rows = len(self.q)
         for name, columns in (("v", names), ("u", actuators), ("a", names)):
             put(name, finite_columns(name, getattr(self, name), columns, rows))
-        if self.system is not None and positions != names:
+        if self.model is not None and positions != names:
             try:
-                self.system.robot.space.check(torch.tensor(self.q))
+                self.model.robot.space.check(torch.tensor(self.q))
             except InvalidInput as error:  # a quaternion of another length than 1
                 raise DatasetError(str(error)) from None
         put("time", finite_columns("time", self.time, None, rows))
         put("episode", integer_column("episode", np.zeros(rows, int) if self.episode is None else self.episode, rows))
         put("units", validated_units(self.units, names))
-        if self.system is not None and self.units != units_for(self.system.robot):
+        if self.model is not None and self.units != units_for(self.model.robot):
             raise DatasetError(
-                f"units are {self.units}; the joint types of {self.system.robot.name!r} ask for "
-                f"{units_for(self.system.robot)}."
+                f"units are {self.units}; the joint types of {self.model.robot.name!r} ask for "
+                f"{units_for(self.model.robot)}."
             )
         put("noise_std", _noise_std(self.noise_std, names, rows))
-        put("truth", _truth(self.truth, names, rows, self.system))
+        put("truth", _truth(self.truth, names, rows, self.model))
         put("metadata", frozen_json(self.metadata))
         put("time_ordered", bool(self.time_ordered))
         _check_time(self.time, self.episode, self.time_ordered)
@@ -119,7 +119,7 @@ class Dataset(Summary):
     @override
     def facts(self) -> dict[str, object]:
         """Rows, joints, episodes, robot, and what else is known."""
-        robot = f"{self.system.robot.name!r}, {len(self.system.contacts)} contacts" if self.system else "none"
+        robot = f"{self.model.robot.name!r}, {len(self.model.contacts)} contacts" if self.model else "none"
         facts: dict[str, object] = {"rows": len(self), "joints": listed(self.joint_names, most=7)}
         facts |= {"episodes": listed(self.episodes), "robot": robot}
         noise = self.noise_level
@@ -154,14 +154,14 @@ class Dataset(Summary):
         )
 
     @staticmethod
-    def from_pandas(frame: Any, system: forcegp.mechanics.MechanicalSystem | None = None, **more: Any) -> Dataset:
+    def from_pandas(frame: Any, model: forcegp.model.Model | None = None, **more: Any) -> Dataset:
         """The Dataset of a frame with the columns of `to_pandas`, of which time, q, v, u and a must be there.
 
         `more` are other fields, for example `units` and `noise_std`. Raises DatasetError for columns that are missing
         or not valid, MissingExtra without pandas.
         """
-        own = {} if system is None else {"q": system.robot.position_names, "u": system.inputs}
-        given: dict[str, Any] = {**arrays_of(frame, own), "system": system, **more}
+        own = {} if model is None else {"q": model.robot.position_names, "u": model.inputs}
+        given: dict[str, Any] = {**arrays_of(frame, own), "model": model, **more}
         return Dataset(**given)
 
     def _columns(self) -> dict[str, np.ndarray]:
@@ -180,9 +180,9 @@ class Dataset(Summary):
 
     def _columns_of(self, name: str) -> tuple[str, ...]:
         """Names of the columns of an array; q and u can have their own where the base moves."""
-        if self.system is not None and name == "q":
-            return self.system.robot.position_names
-        return self.system.inputs if self.system is not None and name == "u" else self.joint_names
+        if self.model is not None and name == "q":
+            return self.model.robot.position_names
+        return self.model.inputs if self.model is not None and name == "u" else self.joint_names
 
     @property
     def episodes(self) -> tuple[int, ...]:
@@ -253,7 +253,7 @@ class Dataset(Summary):
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
-def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSystem | None) -> tuple[str, ...]:
+def _joint_names(given: Sequence[str], model: forcegp.model.Model | None) -> tuple[str, ...]:
     if isinstance(given, str) or not all(isinstance(name, str) and name for name in given):
         raise DatasetError(f"joint_names must be a sequence of non-empty texts; given: {given!r}.")
     names = tuple(given)
@@ -262,9 +262,9 @@ def _joint_names(given: Sequence[str], system: forcegp.mechanics.MechanicalSyste
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise DatasetError(f"joint_names repeats {repeated}; every column needs its own name.")
-    if system is not None and names != tuple(system.robot.joint_names):
+    if model is not None and names != tuple(model.robot.joint_names):
         raise DatasetError(
-            f"joint_names are {list(names)}, but {system.robot.name!r} has {list(system.robot.joint_names)}. "
+            f"joint_names are {list(names)}, but {model.robot.name!r} has {list(model.robot.joint_names)}. "
             "Give the columns in the robot's order, with its names."
         )
     return names
@@ -291,7 +291,7 @@ def _truth(
     given: Mapping[str, object],
     joint_names: tuple[str, ...],
     rows: int,
-    system: forcegp.mechanics.MechanicalSystem | None,
+    model: forcegp.model.Model | None,
 ) -> FrozenDict:
     def known(name: str) -> bool:  # or `Q_U.tool`, `force.tool-friction`, with a name that a file can carry
         ends = (name[len(kind) :] for kind in TRUTH_KINDS if name.startswith(kind))
@@ -306,9 +306,9 @@ def _truth(
         what = f"truth[{name!r}]"
         if name in ("lambda", "in_contact"):
             values = finite_columns(what, given[name], (), rows)
-            if system is not None and values.shape[1] != len(system.contacts):
+            if model is not None and values.shape[1] != len(model.contacts):
                 raise DatasetError(
-                    f"{what} has {values.shape[1]} columns; the system has {len(system.contacts)} contacts."
+                    f"{what} has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
                 )
         elif name.startswith("force."):
             values = finite_columns(what, given[name], ("x", "y", "z"), rows)

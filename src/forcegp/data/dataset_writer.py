@@ -38,7 +38,7 @@ class DatasetWriter:
     """A context that writes what `Dataset.load` reads: rows by `append`, episode after episode, then `finish`.
 
     The file appears under its name when `finish` was called and the context ends without error. `joint_names` and
-    `units` are those of a Dataset; with a `system`, its robot's.
+    `units` are those of a Dataset; with a `model`, its robot's.
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class DatasetWriter:
         *,
         joint_names: Sequence[str],
         units: Mapping[str, Any],
-        system: forcegp.mechanics.MechanicalSystem | None,
+        model: forcegp.Model | None,
     ) -> None:
         self.path = Path(path)
         self.joint_names = tuple(joint_names)
         self.units = validated_units(units, self.joint_names)
-        self.system = system
+        self.model = model
         names: dict[str, tuple[str, ...]] = dict.fromkeys(TABLES, self.joint_names)
-        if system is not None:
-            names |= {"q": system.robot.position_names, "u": system.inputs}
+        if model is not None:
+            names |= {"q": model.robot.position_names, "u": model.inputs}
         self.columns = names
         self.rows = 0
         self._last: tuple[int, float] | None = None
@@ -132,7 +132,7 @@ class DatasetWriter:
         for name in TABLES:
             if not self.columns[name]:
                 self._file.create_dataset(name, data=np.zeros((self.rows, 0)))
-        fields = {"time_ordered": True, "units": self.units, "joint_names": self.joint_names, "system": self.system}
+        fields = {"time_ordered": True, "units": self.units, "joint_names": self.joint_names, "model": self.model}
         describe(fields | {"metadata": frozen_json(metadata)}, self._file)
         self._finished = True
 

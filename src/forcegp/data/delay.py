@@ -31,7 +31,7 @@ SIGNIFICANT = 3.0
 """Standard deviations by which a delay must differ from zero to be used."""
 
 FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0
-"""Of smooth signs of the velocity, relative to its root mean square: together nearly any friction curve."""
+"""Of dry friction, relative to the root mean square velocity."""
 
 ROWS_PER_PARAMETER = 3
 
@@ -113,9 +113,10 @@ def estimate_delay(
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to `largest` [s] to either side, u is fitted by least squares to what rigid bodies with friction
-    in the joints need: the torque regressor of `robot` (default: that of `dataset.system`), acceleration and velocity
+    in the joints need: the torque regressor of `robot` (default: that of `dataset.model`), acceleration and velocity
     of the joint, smooth signs of the velocity of several widths, and a constant. So the delay rests neither on the
-    robot's parameters nor on a law of friction: with one smooth sign, Stribeck friction looked 20 ms late. The best
+    robot's parameters nor on one law of friction: with one smooth sign, friction that falls with velocity looked 20 ms
+    late. The laws of the dataset's model have columns, too. The best
     shift has the least sum of squares, by a parabola through the three smallest: among shifts up to 50 ms and, where it
     lies at their end, up to `largest`, for each joint and for all together. Its standard deviation comes from leaving
     out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and the bootstrap for general
@@ -261,8 +262,10 @@ class _Shifts:
 
 
 def torque_columns(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
-    """What the torque of each joint may be made of, except for its parameters."""
+    """What the torque of each joint may be made of, except for its parameters; with the laws of the dataset's model."""
     import torch  # half a second, which only delays should cost
+
+    from forcegp.forces.columns import law_columns, usual_columns
 
     q, v, a = (torch.tensor(getattr(dataset, name), device=robot.device) for name in ("q", "v", "a"))
     with torch.no_grad():
@@ -272,10 +275,10 @@ def torque_columns(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.nd
             gravity, bias = robot.gravity_forces(q), robot.bias_forces(q, v)
             parts = (robot.inverse_dynamics(q, v, a) - bias, bias - gravity, gravity)
             torque = torch.stack(parts, dim=-1)
-    speed = np.square(dataset.v).mean(axis=0) ** 0.5 + TINY
-    dry = [np.tanh(dataset.v / (width * speed)) for width in FRICTION_WIDTHS]
-    own = np.stack([dataset.a, dataset.v, *dry, np.ones_like(dataset.v)], axis=-1)
-    return np.concatenate([torque.cpu().numpy(), own], axis=-1).transpose(1, 0, 2)
+    rows = dataset.q, dataset.v, dataset.u, dataset.a
+    laws = () if dataset.model is None or dataset.model.robot is not robot else dataset.model.laws
+    own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(laws, robot, *rows)]
+    return np.concatenate([torque.cpu().numpy(), np.stack(own, axis=-1)], axis=-1).transpose(1, 0, 2)
 
 
 def _orthonormal(features: Float[np.ndarray, "rows columns"]) -> np.ndarray:
@@ -304,20 +307,20 @@ def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shi
 
 
 def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robots.Robot:
-    system = dataset.system
-    if robot is None and system is None:
+    model = dataset.model
+    if robot is None and model is None:
         raise InvalidInput(
             "a delay is found by comparing torques with inverse dynamics, which needs the robot: give its URDF, or the "
             "delay in s."
         )
-    if system is not None and system.contacts:
+    if model is not None and model.contacts:
         raise InvalidInput(
             "the forces of contacts are not known, so a delay cannot be found in this log. Give the delay in s, or use "
             "a log without contact."
         )
     if robot is None:
-        assert system is not None
-        robot = system.robot
+        assert model is not None
+        robot = model.robot
     require_rows("dataset", dataset, robot.joint_names, robot.name)
     if not torques_of_joints(dataset):
         raise InvalidInput(
@@ -329,5 +332,5 @@ def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robo
 
 def torques_of_joints(dataset: Dataset) -> bool:
     """Whether u has one torque per degree of freedom."""
-    system = dataset.system
-    return system is None or (system.actuators == system.robot.joint_names and system.actuation.matrix is None)
+    model = dataset.model
+    return model is None or (model.actuators == model.robot.joint_names and model.actuation.matrix is None)

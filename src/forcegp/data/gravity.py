@@ -12,9 +12,9 @@ ALONG = 0.05
 """Of a unit vector: parts below this are none."""
 
 
-def missing_gravity(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem) -> tuple[str, str] | None:
+def missing_gravity(dataset: Dataset, model: forcegp.Model) -> tuple[str, str] | None:
     """What shows that a robot in a plane falls in it although its gravity has no part there, and the remedy."""
-    robot = system.robot
+    robot = model.robot
     if robot.base != "planar" or robot.gravity[:2].any():
         return None
     q, v, a = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.a))

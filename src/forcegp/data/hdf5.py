@@ -145,8 +145,8 @@ def describe(fields: Mapping[str, Any], file: h5py.File) -> None:
         file[name].attrs.create("units", unit, dtype=_TEXT)
     file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
     file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
-    if fields["system"] is not None:
-        file.create_dataset("system", data=fields["system"].to_json(), dtype=_TEXT)
+    if fields["model"] is not None:
+        file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
 
 
 def _check_header(path: Path, file: h5py.File) -> None:
@@ -178,7 +178,7 @@ def _read(path: Path, file: h5py.File) -> dict[str, Any]:
     values["noise_std"] = _array(path, file, "noise_std") if "noise_std" in file else None
     values["truth"] = {name: _array(path, file, f"truth/{name}") for name in _truth_names(path, file)}
     values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
-    values["system"] = _system(path, _text(path, file, "system")) if "system" in file else None
+    values["model"] = _model(path, _text(path, file, "model")) if "model" in file else None
     return values
 
 
@@ -234,8 +234,8 @@ def _units(path: Path, file: h5py.File, name: str) -> str | tuple[str, ...]:
     return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))
 
 
-def _system(path: Path, text: str) -> Any:
+def _model(path: Path, text: str) -> Any:
     try:
-        return forcegp.mechanics.MechanicalSystem.from_json(text)
+        return forcegp.Model.from_json(text)
     except ForceGPError as error:
         raise FileFormatError(f"{path}: its robot or contacts cannot be used: {error}") from error

@@ -175,10 +175,10 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         each, decisive = spectrum.cutoff, _decisive(spectrum.cutoff, dataset)
         cutoff = float(f"{np.nanmax(decisive):.3g}") if np.isfinite(decisive).any() else None
         reasons["cutoff"] = _why(cutoff, decisive, spectrum, dataset)
-        system = dataset.system
-        if cutoff is not None and system is not None and not system.contacts and torques_of_joints(dataset):
+        model = dataset.model
+        if cutoff is not None and model is not None and not model.contacts and torques_of_joints(dataset):
             with contextlib.suppress(DatasetError):  # too short, or sampled too slowly: the spectrum has to do
-                best, tried = held_out_cutoff(dataset, system.robot, cutoff, given.differentiate, given.order)
+                best, tried = held_out_cutoff(dataset, model.robot, cutoff, given.differentiate, given.order)
                 shares = ", ".join(f"{100.0 * share:.2g} % at {frequency:g} Hz" for frequency, share in tried.items())
                 reasons["cutoff"] += f"; of held-out torques stay unexplained {shares}"
                 cutoff = best
@@ -188,9 +188,9 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         how = getattr(given, name)
         if how not in AUTOMATIC:
             continue
-        if name == "lag" and how == "auto" and thruster_columns(dataset.system):
+        if name == "lag" and how == "auto" and thruster_columns(dataset.model):
             seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
-            pushing = thruster_columns(dataset.system)  # joints beside them do not follow so
+            pushing = thruster_columns(dataset.model)  # joints beside them do not follow so
             each = tuple(seconds * (column in pushing) for column in range(actuators(dataset)))
             chosen = replace(chosen, lag=seconds if all(each) else each)
             reasons[name] = f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
@@ -209,7 +209,7 @@ BEYOND_BASE = 8.0
 
 def _decisive(each: Float[np.ndarray, " nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
     """The cut-offs that count: of a robot whose base stands on contacts none far beyond those of the base."""
-    for group in dataset.system.robot.layout.groups[:1] if dataset.system and dataset.system.touching else ():
+    for group in dataset.model.robot.layout.groups[:1] if dataset.model and dataset.model.touching else ():
         if np.isfinite(each[group.rows]).any():
             return np.minimum(each, BEYOND_BASE * np.nanmax(each[group.rows]))
     return each

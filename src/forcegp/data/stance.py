@@ -102,7 +102,7 @@ class Stance:
         )
 
 
-def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem | None = None) -> Stance:
+def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Stance:
     """Flags of all contacts with a switch from q, v, u and a; those that u holds are not looked at.
 
     1. What clearly moves is free if it does not bear.
@@ -120,18 +120,18 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     40 %. Raises ContactError without contacts that have a switch, DatasetError for a robot in a plane
     that falls and has no gravity there.
     """
-    system = dataset.system if system is None else system
-    names = () if system is None else tuple(dict.fromkeys(each.switch for each in system.contacts if each.switch))
-    if system is None or not names:
+    model = dataset.model if model is None else model
+    names = () if model is None else tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))
+    if model is None or not names:
         raise ContactError(
-            "no contact of the system has a switch, so there is no stance to find; give one, for example "
+            "no contact of the model has a switch, so there is no stance to find; give one, for example "
             "fixed_point('foot', switch='foot_stands')."
         )
-    if (fall := missing_gravity(dataset, system)) is not None:
+    if (fall := missing_gravity(dataset, model)) is not None:
         raise DatasetError(f"{fall[0]}, so forces show no stance: {fall[1]}")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
-    motion, asked = _motion_and_force(dataset, system, names)
+    motion, asked = _motion_and_force(dataset, model, names)
     speed, force = (np.empty((len(dataset), len(names))) for _ in range(2))
     noise = np.empty(len(names))
     widths = [_width(dataset.time[rows]) for rows in episodes]
@@ -151,32 +151,32 @@ def estimate_stance(dataset: Dataset, system: forcegp.mechanics.MechanicalSystem
     for rows in episodes:
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
-    robot, whole, weight = system.robot, np.sum(asked, axis=0), 0.0
+    robot, whole, weight = model.robot, np.sum(asked, axis=0), 0.0
     gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
-    if gravity is not None and all(contact.switch for contact in system.contacts):  # which alone hold the robot up
+    if gravity is not None and all(contact.switch for contact in model.contacts):  # which alone hold the robot up
         weight = float(gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
         falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
         stands = (flags[rows] == 1.0).any(axis=1)
         flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
-    flags[tilting(dataset, system, names, flags)] = np.nan
+    flags[tilting(dataset, model, names, flags)] = np.nan
     return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
 
 
 def _motion_and_force(
-    dataset: Dataset, system: forcegp.mechanics.MechanicalSystem, names: tuple[str, ...]
+    dataset: Dataset, model: forcegp.Model, names: tuple[str, ...]
 ) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]]]:
     """A v of the contacts of every switch, and the force that the rows ask of them."""
-    of = [[k for k, contact in enumerate(system.contacts) if contact.switch == name] for name in names]
-    places = [system.inputs.index(name) for name in names]
+    of = [[k for k, contact in enumerate(model.contacts) if contact.switch == name] for name in names]
+    places = [model.inputs.index(name) for name in names]
     motion: list[list[np.ndarray]] = [[] for _ in names]
     asked: list[list[np.ndarray]] = [[] for _ in names]
     for first in range(0, len(dataset), CHUNK):
-        q, v, u, a = (x.to(system.robot.device) for x in tensors(dataset.rows(slice(first, first + CHUNK))))
+        q, v, u, a = (x.to(model.robot.device) for x in tensors(dataset.rows(slice(first, first + CHUNK))))
         u[:, places] = 1.0
         with torch.no_grad():
-            found = system.dynamics(q, v, u)
+            found = model.dynamics(q, v, u)
             white = found.inverse_lower @ (found.M @ a[..., None] - found.Q_K[..., None])
             forces = found.normals * (found.pseudo_inverse.mT @ white)
             rates = (found.A @ v[..., None])[..., 0]
@@ -187,16 +187,16 @@ def _motion_and_force(
 
 
 def tilting(
-    dataset: Dataset, system: forcegp.mechanics.MechanicalSystem, names: tuple[str, ...], flags: np.ndarray
+    dataset: Dataset, model: forcegp.Model, names: tuple[str, ...], flags: np.ndarray
 ) -> Bool[np.ndarray, "rows switches"]:
     """Where feet that are held flat lean, as a heel that turns, although these flags (rows, switches) are 1."""
-    found, g = np.zeros(flags.shape, bool), system.robot.gravity
-    held = {(c.frame, c.switch): {x.point for x in system.contacts if x.frame == c.frame} for c in system.contacts}
+    found, g = np.zeros(flags.shape, bool), model.robot.gravity
+    held = {(c.frame, c.switch): {x.point for x in model.contacts if x.frame == c.frame} for c in model.contacts}
     for (frame, switch), points in held.items():
         if switch is None or len(points) < 3 or not g.any():
             continue
         k = names.index(switch)
-        pose = system.robot.kinematics(torch.tensor(dataset.q, device=g.device)).frame_pose(frame)
+        pose = model.robot.kinematics(torch.tensor(dataset.q, device=g.device)).frame_pose(frame)
         # turns about gravity may be drift of an estimator
         down = (pose[..., :3, :3].mT @ (g / g.norm())).cpu().numpy()
         order = np.lexsort((dataset.time, dataset.episode))

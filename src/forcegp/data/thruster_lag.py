@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import jackknife, lagged, least_squares, lowest
@@ -34,10 +35,10 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     without `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag
     below .3 s.
     """
-    found = thruster_columns(dataset.system)
-    if dataset.system is None or not found:
-        raise InvalidInput("this lag is that of thrusters: give a system with Thrusters and base='floating'.")
-    columns, powers, group = list(found), np.array(list(found.values())), dataset.system.robot.layout.groups[0]
+    found = thruster_columns(dataset.model)
+    if dataset.model is None or not found:
+        raise InvalidInput("this lag is that of thrusters: give a model with Thrusters and base='floating'.")
+    columns, powers, group = list(found), np.array(list(found.values())), dataset.model.robot.layout.groups[0]
     episodes = [part for _, part, _ in episodes_in_order(dataset) if part.time[-1] - part.time[0] > 2.0 * SETTLED]
     if sum(map(len, episodes)) < 1000:
         raise DatasetError(
@@ -63,16 +64,16 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     return float(lags[0]), float(np.hypot(jackknife(lags[None, 1:])[0], half))
 
 
-def thruster_columns(system: forcegp.mechanics.MechanicalSystem | None) -> dict[int, int]:
+def thruster_columns(model: forcegp.Model | None) -> dict[int, int]:
     """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
-    groups = () if system is None else system.robot.layout.groups
-    if system is None or not groups or groups[0].kind != "floating":
+    groups = () if model is None else model.robot.layout.groups
+    if model is None or not groups or groups[0].kind != "floating":
         return {}
-    matrix = system.actuation.matrix
+    matrix = model.actuation.matrix
     pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))
-    kind = forcegp.mechanics.Thrusters
-    thrusters = [force for force in system.known_forces if isinstance(force, kind)]
-    named = {system.inputs.index(name): force.power for force in thrusters for name in force.names}
+    kind = forcegp.forces.Thrusters
+    thrusters = [force for force in model.forces if isinstance(force, kind)]
+    named = {model.inputs.index(name): force.power for force in thrusters for name in force.names}
     return {**{int(column): 1 for column in pushes}, **named}
 
 
@@ -92,8 +93,8 @@ def _causes(
 
 def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:
     """Forces (rows, 6) that accelerate the base, and for each of the first three k columns of bodies beside it."""
-    assert part.system is not None
-    robot, found = part.system.robot, []
+    assert part.model is not None
+    robot, found = part.model.robot, []
     for start in range(0, len(part), BLOCK):
         q, v, a = (torch.tensor(x[start : start + BLOCK], device=robot.device) for x in (part.q, part.v, part.a))
         with torch.no_grad():

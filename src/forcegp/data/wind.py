@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.data.filtering import episodes_in_order, sums_before
@@ -134,19 +135,19 @@ def steady_forces(dataset: Dataset) -> Float[np.ndarray, "rows 3"] | None:
 
 
 def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
-    """The recording with an `ObservedWind` in its system, whose columns of u hold the wind [m/s, world]."""
-    assert dataset.system is not None, "wind was found in a recording with a system"
-    forces = (*dataset.system.known_forces, forcegp.mechanics.ObservedWind())
-    system = replace(dataset.system, known_forces=forces)
-    first = system.inputs.index(forcegp.mechanics.ObservedWind.names[0])
+    """The recording with an `ObservedWind` in its model, whose columns of u hold the wind [m/s, world]."""
+    assert dataset.model is not None, "wind was found in a recording with a model"
+    forces = (*dataset.model.forces, forcegp.forces.ObservedWind())
+    model = replace(dataset.model, forces=forces)
+    first = model.inputs.index(forcegp.forces.ObservedWind.names[0])
     u = np.insert(dataset.u, [first] * 3, wind, axis=1)
-    return replace(dataset, u=u, system=system)
+    return replace(dataset, u=u, model=model)
 
 
 def _flies(dataset: Dataset) -> bool:
-    if dataset.system is None or dataset.system.contacts:
+    if dataset.model is None or dataset.model.contacts:
         return False
-    groups = dataset.system.robot.layout.groups
+    groups = dataset.model.robot.layout.groups
     return bool(groups) and groups[0].kind == "floating"
 
 
@@ -162,8 +163,8 @@ class _Forces:
 
     @classmethod
     def of(cls, dataset: Dataset) -> _Forces:
-        assert dataset.system is not None, "forces need a system"
-        robot = dataset.system.robot
+        assert dataset.model is not None, "forces need a model"
+        robot = dataset.model.robot
         group, parts = robot.layout.groups[0], []
         for start in range(0, len(dataset), BLOCK):
             block = slice(start, start + BLOCK)
@@ -171,7 +172,7 @@ class _Forces:
                 torch.tensor(x[block], device=robot.device) for x in (dataset.q, dataset.v, dataset.u, dataset.a)
             )
             with torch.no_grad():
-                dynamics = dataset.system.dynamics(q, v, u)
+                dynamics = dataset.model.dynamics(q, v, u)
                 Q_U = (dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K
                 parts.append((Q_U[:, group.rows], dynamics.state.delivered[:, group.rows]))
         wrench, delivered = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models import StructuredPosterior
-from forcegp.models.protocol import Posterior
+from forcegp.model import Model
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.posterior import Posterior
 from forcegp.summary import listed
 
 WORSE = 1.01
@@ -137,13 +137,14 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
     curves that each have an input of their own, and constants (a payload), are no such processes: one state does not
     separate them, but all together do.
     """
-    if not isinstance(posterior, StructuredPosterior) or not posterior.model.system.contacts:
+    if not isinstance(posterior, StructuredPosterior) or not posterior.trained.contacts:
         return False
     training = posterior.training
     q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
     with torch.no_grad():
-        dynamics = posterior.model.system.dynamics(q, v, u)
-        B, features = posterior.model.prior.mixing(dynamics), posterior.model.prior.features(dynamics)
+        dynamics = posterior.trained.dynamics(q, v, u)
+        forces = posterior.trained.unknown
+        B, features = forces.direction(dynamics), forces.features(dynamics)
         pressing = dynamics.multiplier_map().matrix @ B
         return any(_presses_unseen((dynamics.H @ B)[..., which], pressing[..., which]) for which in _groups(features))
 
@@ -207,12 +208,12 @@ def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
 
 def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy."""
-    own, model = dataset.system, posterior.system
+    own, model = dataset.model, posterior.model
     if own is None:
         return
     contacts = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
     # inertias that were identified are meant to differ from those that the data came with
-    robots = "learned" not in posterior.settings and not own.robot.tree.equals(model.robot.tree)
+    robots = not posterior.parameters and not own.robot.tree.equals(model.robot.tree)
     if not contacts and not robots:
         return
     what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
@@ -223,7 +224,7 @@ def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
         yield f"the {what} of the model {are} not {those} of the data{measured}{tried}"
 
 
-def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> str:
+def _tried(posterior: Posterior, dataset: Dataset, model: Model) -> str:
     """What carrying the model over to the system of the data would do to its error, on some of these rows.
 
     A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
@@ -235,7 +236,7 @@ def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            moved = posterior.with_system(moved_system(posterior, system))
+            moved = posterior.with_model(moved_model(posterior, model))
             with torch.no_grad():
                 means = [model.predict(rows.q, rows.v, rows.u, covariance=False).mean for model in (posterior, moved)]
     except ForceGPError:
@@ -244,16 +245,16 @@ def _tried(posterior: Posterior, dataset: Dataset, system: MechanicalSystem) -> 
     if there < WORTH_MOVING * here:
         return (
             f"; carried over to them, the error of its mean is {there:.3g} instead of {here:.3g} on "
-            f"{len(rows)} of these rows: `posterior.with_system(dataset.system)`"
+            f"{len(rows)} of these rows: `posterior.with_model(dataset.model)`"
         )
     return f"{KEPT}, for carried over to them its error would be {there:.3g} instead of {here:.3g}"
 
 
-def moved_system(posterior: Posterior, system: MechanicalSystem) -> MechanicalSystem:
+def moved_model(posterior: Posterior, model: Model) -> Model:
     """The system of other data, with the robot and known forces of a model that has identified them."""
-    if "learned" not in posterior.settings:
-        return system
-    return replace(posterior.system, contacts=system.contacts, baumgarte=system.baumgarte)
+    if not posterior.parameters:
+        return model
+    return replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
 
 
 def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from forcegp.errors import require_type
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts, overlap_warnings
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows, stated_noise_level
-from forcegp.models.protocol import Posterior
+from forcegp.posterior.posterior import Posterior
 from forcegp.summary import Summary, listed
 
 Numbers = tuple[float, ...]
@@ -153,7 +153,7 @@ def evaluate(
         warnings=(
             *overlap_warnings(posterior, dataset),
             *_noise_warnings(posterior, dataset),
-            *(str(doubt) for doubt in contact_doubts(dataset, posterior.system)),
+            *(str(doubt) for doubt in contact_doubts(dataset, posterior.model)),
             *doubts(posterior, dataset, scores),
         ),
         **scores,

@@ -17,10 +17,10 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Numbers
 from forcegp.evaluation.predicted_rows import in_blocks
-from forcegp.models import StructuredPosterior
-from forcegp.models.prediction import Gaussian
-from forcegp.models.protocol import Posterior
-from forcegp.models.structured.components import Curve, term_slices
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.components import Curve
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import Gaussian
 
 ROUNDING = 1e-9
 """Relative to the size of the truth: widths and distances below it are none."""
@@ -120,7 +120,7 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
     """
     require_rows("dataset", dataset, posterior.joint_names, "the model")
     comparable = isinstance(posterior, StructuredPosterior) and not posterior.carries_known_forces
-    terms = term_slices(posterior.model.prior, posterior.system.robot) if comparable else ()
+    terms = posterior.trained.unknown.named(posterior.model.robot) if comparable else ()
     named = true_names([name for name, *_ in terms], dataset)
     if not named and "lambda" not in dataset.truth:
         return ForceScores(len(dataset))

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.evaluation.metrics import negative_log_density
-from forcegp.models.prediction import Prediction
-from forcegp.models.protocol import Posterior
-from forcegp.models.search import blas_threads
+from forcegp.inference.threads import blas_threads
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import Prediction
 
 ROWS_PER_BLOCK = 1024
 Block = TypeVar("Block")
@@ -85,21 +85,21 @@ def in_blocks(
 
 
 def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> PredictedRows:
-    device = posterior.system.robot.device
+    device = posterior.model.robot.device
     q, v, u = (torch.tensor(values[block], device=device) for values in (dataset.q, dataset.v, dataset.u))
     prediction = posterior.predict(q, v, u)
     dynamics = posterior.dynamics(q, v, u)
-    own = dynamics if dataset.system is None else dataset.system.to(device).dynamics(q, v, u)
+    own = dynamics if dataset.model is None else dataset.model.to(device).dynamics(q, v, u)
     covariance, force, multiplier = prediction.covariance, prediction.unknown_force, prediction.multiplier
     assert covariance is not None, "predict computes the covariance unless asked not to"
     covariance = _array(covariance)
     measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
     alone = u.clone()
-    alone[:, list(posterior.system.held_inputs)] = 0.0  # what an observer reports is no part of the known physics
-    by_itself = posterior.dynamics(q, v, alone) if posterior.system.held_inputs else dynamics
-    known = _array(by_itself.acceleration_map(known=True).offset)
-    carried = dynamics.Q_K if posterior.carries_known_forces else torch.zeros_like(dynamics.Q_K)
+    alone[:, list(posterior.model.held_inputs)] = 0.0  # what an observer reports is no part of the known physics
+    by_itself = posterior.dynamics(q, v, alone) if posterior.model.held_inputs else dynamics
+    known = _array(by_itself.acceleration_map().offset)
+    carried = own.Q_K if posterior.carries_known_forces else torch.zeros_like(own.Q_K)
     return PredictedRows(
         mean=mean,
         variance=_array(prediction.variance),

@@ -1,51 +1,42 @@
-"""Which prior on the unknown forces do the data support? Candidates fitted to the same rows, and rows left out.
+"""Which unknown force do the data support? Candidates fitted to the same rows, and stretches of time left out.
 
-The score is the log predictive density of stretches of time that are left out, in closed form (`posterior.leave_out`),
-not the marginal likelihood: candidates differ in the number of parameters by a factor of thirty, and their searches end
-at optima of different quality; the left-out density charges both where it hurts.
+The score is the log predictive density of stretches that are left out, in closed form (`posterior.leave_out`), not the
+marginal likelihood: candidates differ in the number of parameters by a factor of thirty, and their searches end at
+optima of different quality; the left-out density charges both where it hurts.
 Differences between two candidates are paired, stretch by stretch: with the difference D_b of block b, its rows n_b and
 d = sum D_b / sum n_b per row, the standard error of d over B blocks is
 
     sqrt(B / (B - 1) sum_b (D_b - n_b d)^2) / sum_b n_b
 
-(the linearised standard error of a ratio; Cochran 1977, "Sampling techniques", chapter 6).
+(the linearised standard error of a ratio; Cochran 1977, "Sampling techniques", chapter 6). `forcegp validate` compares
+models on time that they were not fitted to, with motions and paired tests; this takes one fit of each.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
+from typing_extensions import override
 
-from forcegp.data import Dataset, time_blocks
+from forcegp.data import Dataset, farthest_rows, time_blocks
 from forcegp.data.dataset_arguments import require_rows
 from forcegp.errors import ForceGPError, InvalidInput, require_type
-from forcegp.evaluation.doubts import unfinished_search
-from forcegp.evaluation.evaluation import evaluate
-from forcegp.inference import Exact, OptimizerOptions, ProblemSize
-from forcegp.inference.memory import require_memory
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models import Noise, StructuredGP, StructuredPosterior
-from forcegp.models.search import training_rows
-from forcegp.models.structured.marginal_likelihood import MarginalLikelihood, Mean
-from forcegp.models.structured.prior_checks import check_prior
-from forcegp.models.training_data import ACCELERATION, TrainingData
-from forcegp.parallel import Backend, backend_for
-from forcegp.priors import ForcePrior
+from forcegp.fit import fit
+from forcegp.forces import Force
+from forcegp.model import Model
+from forcegp.posterior import StructuredPosterior
+from forcegp.robots.arguments import whole_number
+from forcegp.summary import Summary
 
 BLOCKS = 20
 """Stretches of time that the recording is cut into by default."""
 FEWEST_BLOCKS = 3
 STANDARD_ERRORS = 2.0
 """Differences below this many standard errors are not significant."""
-
-Progress = Callable[[str, int, int, float], None]
-"""Called as progress(candidate, restart, iteration, objective)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,155 +47,90 @@ class PriorScore:
     ------
     latents: unknown functions of one or more features.
     parameters: numbers that the search was free to choose.
-    nll: negative log marginal likelihood of all rows, in nats, at the parameters found.
-    leave_one_out, leave_block_out: log density of a row given all others, and of a stretch given all other stretches.
-    difference, standard_error: of `leave_block_out` to that of the best candidate, paired over stretches.
+    density: log density of a stretch given all other stretches.
+    difference, standard_error: of the density to that of the best candidate, paired over stretches.
     converged: whether the search for the parameters ended by itself.
-    mae, nlpd: on the test Dataset: mean absolute error of the acceleration, and negative log density per row.
     """
 
-    name: str
     latents: int
     parameters: int
-    nll: float
-    leave_one_out: float
-    leave_block_out: float
+    density: float
     difference: float
     standard_error: float
     converged: bool
-    mae: float | None = None
-    nlpd: float | None = None
-
-    @property
-    def is_as_good_as_the_best(self) -> bool:
-        """Whether the difference to the best is within two standard errors."""
-        return self.difference >= -STANDARD_ERRORS * self.standard_error
 
 
-COLUMNS: dict[str, Callable[[PriorScore], float | None]] = {
-    "marginal likelihood (NLL)": lambda score: score.nll,
-    "density of single rows left out": lambda score: -score.leave_one_out,
-    "test MAE": lambda score: score.mae,
-    "test NLPD": lambda score: score.nlpd,
-}
-"""Scores by which another candidate may be best, lower is better."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PriorComparison(Summary):
+    """Scores and fitted models of the candidates by name, in the order given."""
 
-CLEAR = 0.01
-"""Relative difference below which two scores do not disagree."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PriorComparison:
-    """Candidates in the order given, their scores, and the fitted models by name."""
-
-    scores: tuple[PriorScore, ...]
+    scores: Mapping[str, PriorScore]
     points: int
     blocks: int
     block_seconds: float
-    warnings: tuple[str, ...] = ()
-    posteriors: Mapping[str, StructuredPosterior] = field(default_factory=dict, repr=False)
+    posteriors: Mapping[str, StructuredPosterior] = field(default_factory=dict)
 
     @property
-    def best(self) -> PriorScore:
-        """The candidate whose left-out stretches are likeliest."""
-        return max(self.scores, key=lambda score: score.leave_block_out)
+    def supported(self) -> tuple[str, ...]:
+        """The best candidate, and those that are within two standard errors of it."""
+        within = {name: each.difference >= -STANDARD_ERRORS * each.standard_error for name, each in self.scores.items()}
+        return tuple(name for name, close in within.items() if close)
 
     @property
-    def supported(self) -> tuple[PriorScore, ...]:
-        """The best candidate, and those that the data cannot distinguish from it, in the order given."""
-        return tuple(score for score in self.scores if score.is_as_good_as_the_best)
-
-    @property
-    def preferred(self) -> PriorScore:
+    def preferred(self) -> str:
         """Of the supported ones that with the fewest latents, then parameters."""
-        return min(self.supported, key=lambda score: (score.latents, score.parameters, -score.leave_block_out))
+        each = self.scores
+        return min(self.supported, key=lambda name: (each[name].latents, each[name].parameters, -each[name].density))
 
     @property
     def verdict(self) -> str:
-        """Which prior the data support, in one sentence, and in another which columns of the table disagree."""
-        found = {what: self._best_by(key) for what, key in COLUMNS.items()}
-        named = "; ".join(f"{best.name} has the best {what}" for what, best in found.items() if best is not None)
-        if not named:
-            return self._supported
+        """Which forces the data support, in one sentence."""
+        names, preferred, stretches = (
+            self.supported,
+            self.preferred,
+            f"left-out stretches of {self.block_seconds:.3g} s",
+        )
+        if len(names) > 1:
+            tied = f"{', '.join(names[:-1])} and {names[-1]} cannot be distinguished in {stretches}"
+            return f"{tied}; {preferred} is the simplest."
+        second = max((name for name in self.scores if name != preferred), key=lambda name: self.scores[name].density)
+        other = self.scores[second]
         return (
-            f"{self._supported} Other columns disagree: {named}. The choice rests on left-out stretches, which "
-            "are what a model has not seen; if errors of the acceleration are what counts, take the best test MAE."
+            f"The data support {preferred}: it predicts {stretches} better than {second} does, by "
+            f"{-other.difference:.3g} nats per row (standard error {other.standard_error:.2g})."
         )
 
-    def _best_by(self, key: Callable[[PriorScore], float | None]) -> PriorScore | None:
-        """The candidate with the least value, if it is less than that of the preferred one by a hundredth of it."""
-        known = [(value, score) for score in self.scores if (value := key(score)) is not None]
-        mine = key(self.preferred)
-        if mine is None or not known:
-            return None
-        value, best = min(known, key=lambda entry: entry[0])
-        return best if value < mine - CLEAR * abs(mine) else None
-
-    @property
-    def _supported(self) -> str:
-        names = [score.name for score in self.supported]
-        preferred, stretches = self.preferred, f"left-out stretches of {self.block_seconds:.3g} s"
-        if len(names) == 1:
-            second = max((s for s in self.scores if s is not self.best), key=lambda score: score.leave_block_out)
-            return (
-                f"The data support {preferred.name}: it predicts {stretches} better than {second.name} does, by "
-                f"{-second.difference:.3g} nats per row (standard error {second.standard_error:.2g})."
-            )
-        tied = f"{', '.join(names[:-1])} and {names[-1]} cannot be distinguished in {stretches}"
-        if len({(score.latents, score.parameters) for score in self.supported}) == 1:
-            return f"{tied}, and have equally many parameters; {preferred.name} did best by a little."
-        if len({score.latents for score in self.supported}) == 1:
-            return f"{tied}, and have equally many latent functions; {preferred.name} has the fewest parameters."
-        noun = "function" if preferred.latents == 1 else "functions"
-        return f"{tied}; {preferred.name} is the simplest, with {preferred.latents} latent {noun}."
+    @override
+    def facts(self) -> dict[str, object]:
+        """The verdict and the density of each candidate."""
+        densities = {name: f"{score.density:.3f} nats per row" for name, score in self.scores.items()}
+        return {"verdict": self.verdict, **densities, "rows": self.points}
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the models, as plain JSON values."""
-        return {
-            "candidates": [
-                {**asdict(score), "supported": score.is_as_good_as_the_best, "best": score is self.best}
-                for score in self.scores
-            ],
-            "preferred": self.preferred.name,
-            "verdict": self.verdict,
-            "points": self.points,
-            "blocks": self.blocks,
-            "block_seconds": self.block_seconds,
-            "warnings": list(self.warnings),
-        }
+        scores = {name: asdict(score) for name, score in self.scores.items()}
+        sizes = {name: getattr(self, name) for name in ("points", "blocks", "block_seconds", "preferred", "verdict")}
+        return {"candidates": scores, **sizes}
 
 
 def compare_priors(
     dataset: Dataset,
-    priors: Mapping[str, ForcePrior],
+    candidates: Mapping[str, Force | Sequence[Force]],
     *,
     points: int | None = None,
-    system: MechanicalSystem | None = None,
-    mean: Mean = "analytical",
-    noise: Noise | None = None,
-    restarts: int | None = None,
-    seed: int = 0,
-    jobs: int | None = None,
-    backend: Backend | str | None = None,
-    hyperprior: bool = True,
-    options: OptimizerOptions | None = None,
+    model: Model | None = None,
     block_seconds: float | None = None,
-    test: Dataset | None = None,
-    progress: Progress | None = None,
+    **search: Any,
 ) -> PriorComparison:
-    """Fit a `StructuredGP` with each prior to the same rows, and compare how they predict stretches that are left out.
-
-    All rows are conditioned on exactly, however many there are; beyond 1500 the parameters are found on 600 of them.
+    """Fit the model with each candidate to the same rows, and compare how they predict stretches that are left out.
 
     Parameters
     ----------
-    priors: candidates by name, two or more; a sum of priors is one candidate.
-    points: rows to train on, far apart in (q, v, u); None takes all.
-    system: what is known; None takes that of the dataset.
+    candidates: unknown forces by name, two or more; several that act together are one candidate.
+    points: rows to train on, far apart in (q, v, u); None takes all. All are conditioned on exactly.
+    model: what is known; None takes that of the dataset.
     block_seconds: length of the stretches of time that are left out; None cuts the recording into 20.
-    test: another Dataset to score the candidates on as well.
-    mean, noise, restarts, seed, jobs, backend, hyperprior, options: as in `StructuredGP` and its `fit`, for each of
-        them.
+    search: restarts, seed, jobs, backend, hyperprior, options and progress as for `fit`, for each of them.
 
     Raises
     ------
@@ -213,16 +139,16 @@ def compare_priors(
     NotEnoughMemory: the exact covariances of the rows do not fit; give fewer points.
     """
     require_type("dataset", dataset, Dataset)
-    require_type("priors", priors, Mapping, " from names to priors")
-    workers = backend_for(backend, jobs)
-    known = dataset.system if system is None else system
+    require_type("candidates", candidates, Mapping, " from names to forces")
+    known = dataset.model if model is None else model
     if known is None:
-        raise InvalidInput("the dataset does not carry its robot; give system=MechanicalSystem(robot, contacts)")
-    if len(priors) < 2:
-        raise InvalidInput(f"there is nothing to compare {', '.join(priors) or 'with'}; give two priors or more")
-    if test is not None:
-        require_rows("test", test, dataset.joint_names, "the training data")
-    rows = training_rows(known.robot.joint_names, dataset, points)
+        raise InvalidInput("the dataset does not carry its robot; give model=Model(robot, contacts)")
+    if len(candidates) < 2:
+        raise InvalidInput(f"there is nothing to compare {', '.join(candidates) or 'with'}; give two forces or more")
+    require_rows("dataset", dataset, known.robot.joint_names, "the robot")
+    rows = dataset
+    if points is not None and whole_number("points", points, 2, len(dataset), "the rows of the dataset") < len(dataset):
+        rows = farthest_rows(dataset, points)
     seconds = block_seconds
     if seconds is None:
         seconds = sum(float(np.ptp(rows.time[rows.episode == episode])) for episode in rows.episodes) / BLOCKS
@@ -234,66 +160,27 @@ def compare_priors(
             f"the training rows fall into {len(blocks)} stretches of {seconds:.3g} s, too few to compare by; give "
             "shorter ones, or a longer recording"
         )
-    models = {name: _named(name, partial(StructuredGP, known, prior, mean, noise)) for name, prior in priors.items()}
-    sizes = [_named(name, partial(_checked_size, model, rows)) for name, model in models.items()]
-    needed = sum(8 * (size.rows * size.rank) ** 2 for size in sizes)  # all are kept
-    needed += max(Exact().required_bytes(size) for size in sizes)
-    what = f"{len(sizes)} exact posteriors of N={sizes[0].rows} rows"
-    require_memory(needed, what, "give fewer `points`, or fewer candidates", known.robot.device)
-    how: dict[str, Any] = {"restarts": restarts, "seed": seed, "backend": workers, "hyperprior": hyperprior}
-    how |= {"options": options, "engine": "exact"}  # whatever the number of rows: no other engine can leave rows out
-    posteriors = {}
-    for name, model in models.items():
-        note = None if progress is None else partial(progress, name)
-        posteriors[name] = _named(name, partial(model.fit, rows, **how, progress=note))
-    return _compared(posteriors, blocks, seconds, test)
-
-
-def _compared(
-    posteriors: Mapping[str, StructuredPosterior], blocks: Sequence[Sequence[int]], seconds: float, test: Dataset | None
-) -> PriorComparison:
+    models = {name: _named(name, partial(known.with_forces, own)) for name, own in candidates.items()}
+    # whatever the number of rows: no other engine can leave rows out
+    posteriors = {
+        name: _named(name, partial(fit, each, rows, engine="exact", **search)) for name, each in models.items()
+    }
     sizes = np.array([len(block) for block in blocks], dtype=np.float64)
     densities = {name: posterior.leave_out(blocks).log_density.numpy() for name, posterior in posteriors.items()}
     best = max(densities.values(), key=lambda density: float(density.sum()))
-    scores, notes = [], []
+    scores = {}
     for name, posterior in posteriors.items():
         difference, error = paired_difference(densities[name], best, sizes)
-        evaluation = None if test is None else evaluate(posterior, test)
-        of_it = unfinished_search(posterior) if evaluation is None else evaluation.warnings
-        notes += [(sentence, name) for sentence in of_it]
-        scores.append(
-            PriorScore(
-                name=name,
-                latents=len(posterior.model.prior.latent_names(posterior.system.robot)),
-                parameters=sum(value.numel() for value in posterior.result.parameters.values()),
-                nll=posterior.negative_log_likelihood,
-                leave_one_out=posterior.leave_out().total / float(sizes.sum()),
-                leave_block_out=float(densities[name].sum() / sizes.sum()),
-                difference=difference,
-                standard_error=error,
-                converged=posterior.result.converged,
-                mae=None if evaluation is None else evaluation.mae,
-                nlpd=None if evaluation is None else evaluation.nlpd,
-            )
+        scores[name] = PriorScore(
+            latents=len(posterior.model.unknown.latent_names(posterior.model.robot)),
+            parameters=sum(value.numel() for value in posterior.result.parameters.values()),
+            density=float(densities[name].sum() / sizes.sum()),
+            difference=difference,
+            standard_error=error,
+            converged=posterior.result.converged,
         )
-    return PriorComparison(
-        scores=tuple(scores),
-        points=int(sizes.sum()),
-        blocks=len(blocks),
-        block_seconds=float(seconds),
-        warnings=_told_once(notes, len(posteriors)),
-        posteriors=dict(posteriors),
-    )
-
-
-def _told_once(notes: Sequence[tuple[str, str]], candidates: int) -> tuple[str, ...]:
-    """Sentences, with the candidates that they are about where these are not all."""
-    whose: dict[str, list[str]] = {}
-    for sentence, name in notes:
-        whose.setdefault(sentence, []).append(name)
-    return tuple(
-        sentence if len(names) == candidates else f"{', '.join(names)}: {sentence}" for sentence, names in whose.items()
-    )
+    size: dict[str, Any] = {"points": len(rows), "blocks": len(blocks), "block_seconds": float(seconds)}
+    return PriorComparison(scores=scores, **size, posteriors=posteriors)
 
 
 def paired_difference(
@@ -305,20 +192,9 @@ def paired_difference(
     return mean, math.sqrt(count / (count - 1) * float(np.square(gain - sizes * mean).sum())) / rows
 
 
-def _checked_size(model: StructuredGP, rows: Dataset) -> ProblemSize:
-    """Refuse now what the fit would refuse, before hours are spent on another candidate; the fit warns."""
-    training = TrainingData.of(rows, model.system.robot.device)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        likelihood = MarginalLikelihood(model.system, model.prior, model.mean, training)
-        check_prior(likelihood)
-        with torch.no_grad():
-            return ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(training.a[0])}))
-
-
 def _named(name: str, make: Callable[[], Any]) -> Any:
     """What `make` returns; an error names the candidate."""
     try:
         return make()
     except ForceGPError as error:
-        raise type(error)(f"prior {name!r}: {error}") from error
+        raise type(error)(f"forces {name!r}: {error}") from error

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.data.motion_records import RecordedMotions
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models.rollout import Rollout
+from forcegp.model import Model
+from forcegp.posterior.rollout import Rollout
 from forcegp.robots.manifold import ConfigurationSpace
 
 INTERVAL = (0.025, 0.975)
@@ -38,29 +38,29 @@ class RolloutErrors:
     diverged_at: Int[np.ndarray, " motions"]
 
 
-def rollout_errors(rollout: Rollout, recorded: RecordedMotions, system: MechanicalSystem) -> RolloutErrors:
+def rollout_errors(rollout: Rollout, recorded: RecordedMotions, model: Model) -> RolloutErrors:
     """Compare rollouts (B, T+1, nv) with the motions from whose first rows they began."""
     tool = constraint = recorded_constraint = spread = inside = None
     actual = torch.as_tensor(np.array(recorded.q), device=rollout.q.device)
-    if system.contacts:
+    if model.contacts:
         lost = torch.isnan(rollout.q).any(-1)  # after a divergence
-        here, there = (system.robot.kinematics(q) for q in (torch.where(lost[..., None], actual, rollout.q), actual))
+        here, there = (model.robot.kinematics(q) for q in (torch.where(lost[..., None], actual, rollout.q), actual))
         apart = [
             torch.linalg.vector_norm(contact.position(here) - contact.position(there), dim=-1)
-            for contact in system.contacts
+            for contact in model.contacts
         ]
         tool = torch.where(lost, torch.nan, torch.stack(apart).amax(0)).cpu().numpy()
-        distances = torch.stack([contact.distance(there).abs() for contact in system.contacts]).amax(0)
+        distances = torch.stack([contact.distance(there).abs() for contact in model.contacts]).amax(0)
         if bool(distances.any()) or bool(rollout.constraint.nan_to_num().any()):
             constraint = rollout.constraint.abs().amax(-1).cpu().numpy()
             recorded_constraint = distances.cpu().numpy()
     if rollout.samples is not None or rollout.intervals is not None:
-        low, high = (end.cpu().numpy() for end in interval_about(rollout, rollout.q, system.robot.space))
-        spread, off = 0.5 * (high - low), apart_from(rollout.q, actual, system.robot.space).cpu().numpy()
+        low, high = (end.cpu().numpy() for end in interval_about(rollout, rollout.q, model.robot.space))
+        spread, off = 0.5 * (high - low), apart_from(rollout.q, actual, model.robot.space).cpu().numpy()
         inside = np.where(np.isnan(spread), np.nan, (low <= off) & (off <= high))
     return RolloutErrors(
         time=rollout.time.cpu().numpy(),
-        joint=apart_from(actual, rollout.q, system.robot.space).abs().cpu().numpy(),
+        joint=apart_from(actual, rollout.q, model.robot.space).abs().cpu().numpy(),
         tool=tool,
         constraint=constraint,
         recorded_constraint=recorded_constraint,

@@ -138,7 +138,7 @@ class FunctionalPosterior(FactorizedPosterior):
     kernels: LatentKernels
     features: tuple[Float[Tensor, "Nn _"], ...]
     system: FunctionalSystem
-    remedy: ClassVar[str] = "fit to accelerations, with StructuredGP.fit, for which single rows are what is observed"
+    remedy: ClassVar[str] = "fit to accelerations, for which single rows are what is observed"
 
     @classmethod
     def condition(cls, kernels: LatentKernels, weights: Float[Tensor, "N n"], terms: Terms) -> "FunctionalPosterior":

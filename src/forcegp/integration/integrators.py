@@ -16,8 +16,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError, require_known
-from forcegp.mechanics import MechanicalSystem
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
+from forcegp.model import Model
 from forcegp.robots import Kinematics
 from forcegp.robots.manifold import ConfigurationSpace
 
@@ -39,23 +39,23 @@ class ProjectedPosition:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintManifold:
-    """{(q, v): c(q) = 0, A(q) v = 0} of the contacts of a system; everything, if it has none.
+    """{(q, v): c(q) = 0, A(q) v = 0} of the contacts of a model; everything, if it has none.
 
     Distances are measured by the mass matrix, |dq|_M^2 = dq^T M dq, so that corrections act along M^-1 A^T like the
     contact forces themselves. Redundant contacts are legal: all inverses of A M^-1 A^T are pseudo-inverses.
     """
 
-    system: MechanicalSystem
+    model: Model
 
     def violation(
         self, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"]
     ) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
         """c(q) in m and A(q) v in m/s, for surfaces that are signed distances; NaN where q is."""
-        space = self.system.robot.space
+        space = self.model.robot.space
         lost = None if space.is_vector_space else torch.isnan(q).any(-1, keepdim=True)
         if lost is not None:  # no quaternion is made of NaN
             q = torch.where(lost, space.neutral().to(q), q)
-        c, A, _ = self._constraint(self.system.robot.kinematics(q))
+        c, A, _ = self._constraint(self.model.robot.kinematics(q))
         rate = (A @ v[..., None])[..., 0]
         return (c, rate) if lost is None else (c.masked_fill(lost, torch.nan), rate.masked_fill(lost, torch.nan))
 
@@ -67,11 +67,11 @@ class ConstraintManifold:
         surface, whatever the scale of the function that describes it (|s_p| = 1 for signed distances). States that do
         not converge are returned as such, for the caller to judge.
         """
-        space = self.system.robot.space
+        space = self.model.robot.space
         given_finite = torch.isfinite(q).all(-1)
         q = torch.where(given_finite[:, None], q, space.neutral().to(q.device) if space.groups else 0.0)
-        kinematics = self.system.robot.kinematics(q)
-        _, inverse_lower = factors(self.system.mass_matrix(kinematics))
+        kinematics = self.model.loaded_robot.kinematics(q)
+        _, inverse_lower = factors(self.model.mass_matrix_at(kinematics))
         iteration, differentiable = 0, torch.is_grad_enabled() and q.requires_grad
         while True:
             c, A, slope = self._constraint(kinematics)
@@ -86,7 +86,7 @@ class ConstraintManifold:
             A_white = torch.where(finite[:, None, None], A @ inverse_lower.mT, 0.0)
             white = _pseudo_inverse(A_white) @ torch.where(finite[:, None], c, 0.0)[..., None]
             q = torch.where(moving[:, None], space.integrate(q, -(inverse_lower.mT @ white)[..., 0]), q)
-            kinematics = self.system.robot.kinematics(q)
+            kinematics = self.model.robot.kinematics(q)
             iteration += 1
 
     def project_velocity(self, at: ProjectedPosition, v: Float[Tensor, "n nv"]) -> Float[Tensor, "n nv"]:
@@ -117,8 +117,8 @@ class ConstraintManifold:
 
     def _constraint(self, kinematics: Kinematics) -> tuple[Tensor, Tensor, Tensor]:
         """c (..., m), A (..., m, nv) and |s_p| (..., m)."""
-        batch, nv = kinematics.batch_shape, self.system.robot.nv
-        contacts = self.system.contacts
+        batch, nv = kinematics.batch_shape, self.model.robot.nv
+        contacts = self.model.contacts
         if not contacts:
             empty = kinematics.twists.new_zeros(*batch, 0)
             return empty, kinematics.twists.new_zeros(*batch, 0, nv), empty
@@ -361,29 +361,29 @@ class Projected(Integrator):
         return Step(at.q, v_next, a, at.converged)
 
 
-def _projected(system: MechanicalSystem) -> Projected:
-    switched = dict.fromkeys(contact.switch for contact in system.contacts if contact.switch is not None)
+def _projected(model: Model) -> Projected:
+    switched = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
     if switched:
         raise InvalidInput(
             f"integrator 'projected' holds all contacts at all times, and {', '.join(switched)} switch some of them; "
             "use another integrator, or contacts without a switch."
         )
-    return Projected(ConstraintManifold(system), system.robot.space)
+    return Projected(ConstraintManifold(model), model.robot.space)
 
 
-INTEGRATORS: dict[str, Callable[[MechanicalSystem], Integrator]] = {
-    "symplectic-euler": lambda system: SymplecticEuler(system.robot.space),
-    "rk4": lambda system: RungeKutta4(system.robot.space),
-    "implicit-midpoint": lambda system: ImplicitMidpoint(system.robot.space),
+INTEGRATORS: dict[str, Callable[[Model], Integrator]] = {
+    "symplectic-euler": lambda model: SymplecticEuler(model.robot.space),
+    "rk4": lambda model: RungeKutta4(model.robot.space),
+    "implicit-midpoint": lambda model: ImplicitMidpoint(model.robot.space),
     "projected": _projected,
 }
 """Integrators by the name that rollouts and the command line use."""
 
 
-def integrator_named(name: str, system: MechanicalSystem) -> Integrator:
-    """The integrator of that name for motions of `system`. Raises InvalidInput for any other name."""
+def integrator_named(name: str, model: Model) -> Integrator:
+    """The integrator of that name for motions of `model`. Raises InvalidInput for any other name."""
     require_known("integrator", name, "forcegp", INTEGRATORS, cutoff=0.4)
-    return INTEGRATORS[name](system)
+    return INTEGRATORS[name](model)
 
 
 def check_time_step(dt: Any) -> None:

@@ -3,19 +3,8 @@ from .gauss_principle import (
     State as State, fixed_frame as fixed_frame, fixed_point as fixed_point,
 )
 from .loops import LoopClosure as LoopClosure, loop_frame as loop_frame, loop_point as loop_point
-from .known_forces import (
-    KNOWN_FORCES as KNOWN_FORCES, Actuation as Actuation, Armature as Armature, ConstantJointForce as
-    ConstantJointForce, CoulombJointFriction as CoulombJointFriction, DirectionalJointFriction as
-    DirectionalJointFriction, KnownForce as KnownForce, LoadJointFriction as
-    LoadJointFriction, RigidBodyBias as RigidBodyBias, RotorInertia as RotorInertia, StribeckJointFriction as
-    StribeckJointFriction, ViscousJointFriction as ViscousJointFriction,
-)
 from .wheels import RollingContact as RollingContact, rolling as rolling
 from .surfaces import (
     Cylinder as Cylinder, Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
     Surface as Surface, surface_axes as surface_axes,
-)
-from .system import MechanicalSystem as MechanicalSystem
-from .thrusters import (
-    LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench, Thrusters as Thrusters,
 )

@@ -8,18 +8,19 @@ read from the one small pseudo-inverse A~^+, which also covers redundant constra
 H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import ContactError, InvalidInput, NumericalError
 from forcegp.mechanics.surfaces import Held, Surface
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import Inertials, broadcast_batch, checked_tensor, finite_vector
+from forcegp.robots.arguments import broadcast_batch, checked_tensor, finite_vector
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,14 @@ class Contact:
             raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")
         point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")
         object.__setattr__(self, "point", tuple(point.tolist()))
+
+    def check(self, robot: Robot) -> None:
+        """Raise UnknownFrame for a frame that is not there, ContactError where the contact constrains nothing."""
+        if robot.frame(self.frame)[0] < 0:
+            raise ContactError(
+                f"frame {self.frame!r} of {robot.name} is fixed in the world, so a contact there constrains nothing; "
+                "name a frame that moves."
+            )
 
     def more(self) -> dict[str, object]:
         """The fields that other contacts lack, as plain JSON values."""
@@ -150,7 +159,7 @@ class State:
     """Positions, velocities and inputs of equal batch, and the inertial parameters that hold there.
 
     `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators: u itself where each
-    joint has one. `inertials` maps link names to log-Cholesky parameters (..., 10), or is None for those of the URDF.
+    joint has one. `bodies` are standard parameters of the bodies (`Kinematics.torque_regressor`); None: the robot's.
     """
 
     q: Float[Tensor, "*batch nq"]
@@ -158,9 +167,35 @@ class State:
     u: Float[Tensor, "*batch nu"]
     robot: Robot
     kinematics: Kinematics
-    inertials: Mapping[str, Tensor] | None = None
+    bodies: Float[Tensor, "bodies 10"] | None = None
     inputs: tuple[str, ...] = ()
     delivered_by: "Callable[[State], Tensor] | None" = None
+
+    @property
+    def positions(self) -> Float[Tensor, "*batch nv"]:
+        """Positions of the joints; 0 in the places of joints of several degrees of freedom."""
+        if self.robot.space.is_vector_space:
+            return self.q
+        names = self.robot.joint_names
+        out = torch.zeros_like(self.v)
+        out[..., [names.index(name) for name in self.robot.single_joint_names]] = self.robot.space.singles(self.q)
+        return out
+
+    @cached_property
+    def mass_matrix(self) -> Float[Tensor, "*batch nv nv"]:
+        """M of the robot, with its armature."""
+        return self._dynamics[0]
+
+    @cached_property
+    def bias(self) -> Float[Tensor, "*batch nv"]:
+        """Coriolis, centrifugal and gravity forces."""
+        return self._dynamics[1]
+
+    @cached_property
+    def _dynamics(self) -> tuple[Tensor, Tensor]:
+        if self.bodies is None:
+            return self.kinematics.mass_matrix_and_bias()
+        return self.kinematics.dynamics_of_bodies(self.bodies)
 
     @property
     def delivered(self) -> Float[Tensor, "*batch nv"]:
@@ -174,7 +209,7 @@ class State:
         q: Tensor,
         v: Tensor,
         u: Tensor,
-        inertials: Inertials | None = None,
+        bodies: Float[Tensor, "bodies 10"] | None = None,
         inputs: tuple[str, ...] = (),
         delivered_by: "Callable[[State], Tensor] | None" = None,
     ) -> "State":
@@ -186,7 +221,7 @@ class State:
             u = checked_tensor("u", u, len(inputs), f"one value per input: {', '.join(inputs)}", robot.device)
         batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
         q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
-        return cls(q, v, u, robot, robot.kinematics(q, v), inertials, inputs, delivered_by)
+        return cls(q, v, u, robot, robot.kinematics(q, v), bodies, inputs, delivered_by)
 
 
 REDUNDANCY_TOLERANCE = 1e-9
@@ -249,7 +284,7 @@ class ConstrainedDynamics:
                 pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
             except torch.linalg.LinAlgError:
                 raise NumericalError(
-                    "the constraint matrix A is not finite; MechanicalSystem.check_states names the row and the contact"
+                    "the constraint matrix A is not finite; Model.check_states names the row and the contact"
                 ) from None
         else:
             pseudo_inverse = A_white.mT

@@ -11,18 +11,21 @@ first, which is t k near 0, and their multiplier a torque in Nm. In planar mecha
 are redundant, which is legal.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import ContactError, InvalidInput
 from forcegp.mechanics.gauss_principle import AXES, Contact, Row, placed
 from forcegp.mechanics.surfaces import Held
-from forcegp.robots import Kinematics
+from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import finite_vector
+from forcegp.robots.mjcf_model import LoopDescription
 
 Point = tuple[float, float, float]
 SECOND = ("second_frame", "second_point", "turning")
@@ -52,6 +55,14 @@ class LoopClosure(Contact):
         meaning = f" x, y, z in m, in frame {self.second_frame!r}"
         point = finite_vector("LoopClosure second_point", self.second_point, 3, meaning)
         object.__setattr__(self, "second_point", tuple(point.tolist()))
+
+    @override
+    def check(self, robot: Robot) -> None:
+        if robot.frame(self.frame)[0] == robot.frame(self.second_frame)[0]:
+            raise ContactError(
+                f"frames {self.frame!r} and {self.second_frame!r} of {robot.name} do not move against each other, so "
+                "they close no loop; name frames of two bodies."
+            )
 
     @override
     def more(self) -> dict[str, object]:
@@ -107,3 +118,19 @@ def loop_frame(frame_a: str, frame_b: str, switch: str | None = None) -> tuple[L
     origin = (0.0, 0.0, 0.0)
     turns = (LoopClosure(frame_a, origin, Held(axis), switch, frame_b, origin, turning=True) for axis in AXES)
     return (*loop_point(frame_a, origin, frame_b, origin, switch), *turns)
+
+
+def closing(loop: LoopDescription) -> tuple[LoopClosure, ...]:
+    """The contacts that close a loop of a file."""
+    if loop.turning:
+        return loop_frame(*loop.frames)
+    return loop_point(loop.frames[0], loop.points[0], loop.frames[1], loop.points[1])
+
+
+def described(loops: Sequence[LoopClosure]) -> list[LoopDescription]:
+    """Loops for a file: one for all contacts between the same two points."""
+    ends: dict[Any, bool] = {}
+    for loop in loops:
+        key = (loop.frame, loop.second_frame), (loop.point, loop.second_point)
+        ends[key] = ends.get(key, False) or loop.turning
+    return [LoopDescription(f"loop_{k}", x, y, turning) for k, ((x, y), turning) in enumerate(ends.items(), 1)]

@@ -84,7 +84,7 @@ def import_recordings(
     out: str | Path,
     mapping: ColumnMapping,
     *,
-    system: forcegp.mechanics.MechanicalSystem | None = None,
+    model: forcegp.Model | None = None,
     options: ImportOptions | None = None,
     report: Progress = lambda done, total, note: None,
 ) -> dict[str, Any]:
@@ -103,13 +103,13 @@ def import_recordings(
     if not out.parent.is_dir():
         raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot, wheels = None, set[str]()
-    if system is not None:  # wheels that roll turn as often as they like
-        robot = system.robot
-        rolling = [each for each in system.contacts if isinstance(each, forcegp.mechanics.RollingContact)]
+    if model is not None:  # wheels that roll turn as often as they like
+        robot = model.robot
+        rolling = [each for each in model.contacts if isinstance(each, forcegp.mechanics.RollingContact)]
         wheels = {robot.layout.bodies[robot.frame(each.frame)[0]].name for each in rolling}
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
-    joined = [on_one_clock(source, signal_plan(mapping, source, system, **lacks), out.parent) for _, source in sources]
+    joined = [on_one_clock(source, signal_plan(mapping, source, model, **lacks), out.parent) for _, source in sources]
     sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
     plans = [plan for _, plan in joined]
     plan = plans[0]
@@ -142,7 +142,7 @@ def import_recordings(
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
                     raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
         done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
-        with DatasetWriter(out, joint_names=plan.joints, units=plan.units, system=system) as writer:
+        with DatasetWriter(out, joint_names=plan.joints, units=plan.units, model=model) as writer:
             for number, (stretch, kept, layout) in enumerate(episodes):
                 report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
                 before = writer.rows

@@ -12,7 +12,7 @@ from forcegp.data import differentiate
 from forcegp.data.configurations import following, in_base
 from forcegp.data.dataset_fields import ROTATION, TRANSLATION
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping
 from forcegp.recordings.source import Source
 from forcegp.robots import Robot
@@ -61,19 +61,19 @@ def bases(robot: Robot) -> tuple[Group, ...]:
 
 
 def columns_of(
-    mapping: ColumnMapping, system: MechanicalSystem | None, joints: tuple[str, ...]
+    mapping: ColumnMapping, model: Model | None, joints: tuple[str, ...]
 ) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
     """By signal: name and SI unit of its columns in the order of the log, and names in the order of the Dataset.
 
     Unit None: whatever the actuator takes.
     """
-    if system is None:
+    if model is None:
         return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
-    robot, own = system.robot, system.robot.single_joint_names
+    robot, own = model.robot, model.robot.single_joint_names
     kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
     of_log = dict(zip(own, joints, strict=True))
-    driven = tuple(system.actuation.names) == own
-    switches = system.inputs[len(system.actuators) :]
+    driven = tuple(model.actuation.names) == own
+    switches = model.inputs[len(model.actuators) :]
 
     def unit(signal: str, name: str) -> str | None:
         if signal == "u" and not (driven and name in own):
@@ -82,10 +82,10 @@ def columns_of(
 
     written = mapping.orientation or ORIENTATIONS[0]
     velocities = tuple(of_log.get(name, name) for name in robot.joint_names)
-    inputs = tuple(of_log.get(name, name) if driven else name for name in system.inputs)
+    inputs = tuple(of_log.get(name, name) if driven else name for name in model.inputs)
     log = {"q": position_columns(robot, joints, written), "v": velocities, "u": inputs, "a": velocities}
     stored = position_columns(robot, own, "angles" if written == "angles" else ORIENTATIONS[0])
-    order = {"q": stored, "v": robot.joint_names, "u": system.inputs, "a": robot.joint_names}
+    order = {"q": stored, "v": robot.joint_names, "u": model.inputs, "a": robot.joint_names}
     return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
 
 
@@ -210,18 +210,16 @@ class Layout:
         return found.numpy()
 
 
-def layout_of(
-    mapping: ColumnMapping, system: MechanicalSystem | None, lacking: Mapping[str, Sequence[bool]], nv: int
-) -> Layout:
+def layout_of(mapping: ColumnMapping, model: Model | None, lacking: Mapping[str, Sequence[bool]], nv: int) -> Layout:
     """Where everything stands once positions are those of a Dataset.
 
     `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
     there where their axes turn.
     """
-    groups = () if system is None else bases(system.robot)
+    groups = () if model is None else bases(model.robot)
     sizes = dict.fromkeys(SIGNALS, nv)
-    if system is not None:
-        sizes |= {"q": system.robot.nq, "u": len(system.inputs)}
+    if model is not None:
+        sizes |= {"q": model.robot.nq, "u": len(model.inputs)}
     places, end = dict[str, slice](), 0
     for name in SIGNALS:
         if sizes[name] == 0 or name in lacking:
@@ -238,8 +236,8 @@ def layout_of(
             rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
             if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
                 raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
-    if system is None:
+    if model is None:
         return Layout(places, ConfigurationSpace(nv), derived=derived)
-    switches = range(places["u"].start + len(system.actuators), places["u"].stop)
-    gravity = tuple(system.robot.gravity.tolist())
-    return Layout(places, system.robot.space, groups, axes, gravity, derived, tuple(switches))
+    switches = range(places["u"].start + len(model.actuators), places["u"].stop)
+    gravity = tuple(model.robot.gravity.tolist())
+    return Layout(places, model.robot.space, groups, axes, gravity, derived, tuple(switches))

@@ -90,7 +90,7 @@ class SignalPlan:
 def signal_plan(
     mapping: ColumnMapping,
     source: Source,
-    system: forcegp.mechanics.MechanicalSystem | None,
+    model: forcegp.Model | None,
     *,
     may_lack_switches: bool = False,
 ) -> SignalPlan:
@@ -100,9 +100,9 @@ def signal_plan(
     With `may_lack_switches`, u may end with the actuators.
     Raises InvalidInput for columns, joints and numbers of them that do not fit, FileFormatError for missing columns.
     """
-    robot = None if system is None else system.robot
+    robot = None if model is None else model.robot
     joints = _joints(mapping, robot)
-    log, order = columns_of(mapping, system, joints)
+    log, order = columns_of(mapping, model, joints)
     guessed: list[str] = []
     found: dict[str, list[LinearExpression]] = {}
     for signal in SIGNALS:
@@ -110,18 +110,18 @@ def signal_plan(
         if patterns is None and log[signal]:
             names = tuple(log[signal])
             patterns = guessed_columns(signal, names, source)
-            if patterns is None and signal == "u" and may_lack_switches and system is not None and system.actuators:
-                patterns = guessed_columns(signal, names[: len(system.actuators)], source)
+            if patterns is None and signal == "u" and may_lack_switches and model is not None and model.actuators:
+                patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is not None:
                 guessed.append(f"{signal} = {', '.join(patterns)}")
                 found[signal] = [LinearExpression({name: 1.0}) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
-    switches = len({x.switch for x in (system.contacts if system and may_lack_switches else ())} - {None})
-    if system is not None and switches and len(found.get("u", ())) == len(system.inputs) - switches:
+    switches = len({x.switch for x in (model.contacts if model and may_lack_switches else ())} - {None})
+    if model is not None and switches and len(found.get("u", ())) == len(model.inputs) - switches:
         found["u"] = [*found.get("u", ()), *[LACKING] * switches]
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
-        if signal not in found and (system is None or log[signal]):
+        if signal not in found and (model is None or log[signal]):
             lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
             raise InvalidInput(
                 f"no columns for {signal} ({why}); name them with --{signal}"
@@ -135,9 +135,9 @@ def signal_plan(
                 * (0 < len(lacking) < len(joints))
                 + "."
             )
-    if system is None and not joints:
+    if model is None and not joints:
         example = ",".join(f"joint{index + 1}" for index in range(len(found["q"])))
-        raise InvalidInput(f"the joints have no names; add `joints`, for example {example}, or `system`.")
+        raise InvalidInput(f"the joints have no names; add `joints`, for example {example}, or `model`.")
     if mapping.time is None and mapping.step is None:
         used = [name for expressions in found.values() for item in expressions for name in item.weights]
         name = guessed_time(source, used)
@@ -174,7 +174,7 @@ def signal_plan(
         joints=tuple(order["v"]),
         units=units,
         signals=signals,
-        layout=layout_of(mapping, system, lacking, len(order["v"])),
+        layout=layout_of(mapping, model, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
         time=time,
         time_unit=log_unit("time", time_unit),
@@ -195,7 +195,7 @@ def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple
     if mapping.joints and sorted(mapping.joints) != sorted(own):
         raise InvalidInput(
             f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
-            "Give the columns of exactly these, or another `system`."
+            "Give the columns of exactly these, or another `model`."
         )
     return mapping.joints or own
 
@@ -257,7 +257,7 @@ def _signals(
             remedy = f"{remedy[:-1]}, and 0 for a joint that nothing drives."
         elif not names:
             remedy = (
-                "leave u out, or give actuators: motors of an MJCF file, or a file that MechanicalSystem.to_json wrote "
+                "leave u out, or give actuators: motors of an MJCF file, or a file that Model.to_json wrote "
                 "(`identified`)."
             )
         raise InvalidInput(

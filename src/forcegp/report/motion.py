@@ -10,19 +10,10 @@ from jaxtyping import Float
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.plots import style
-from forcegp.mechanics import (
-    Actuation,
-    Armature,
-    ConstrainedDynamics,
-    ObservedWrench,
-    RigidBodyBias,
-    RotorInertia,
-    Thrusters,
-)
-from forcegp.models import StructuredPosterior
-from forcegp.models.protocol import Posterior
-from forcegp.models.structured.components import term_slices
-from forcegp.priors import BaseWrench, ForcePrior
+from forcegp.forces import Actuation, BaseWrench, CoupledRotors, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.posterior import Posterior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
 
@@ -32,7 +23,7 @@ LONGEST_ARROW = 0.4
 """Of the reach of the robot, for a force that is large in its group."""
 LARGE = 98.0
 """Percentile of the largest force of each row: peaks do not make all other arrows short."""
-NOT_SHOWN = (Actuation, Thrusters, ObservedWrench, RigidBodyBias, Armature, RotorInertia)
+NOT_SHOWN = (Actuation, Thrusters, ObservedWrench, RigidBodies, Rotor, CoupledRotors)
 """Known forces that are no finding at a joint: what motors do, wind on a base, and inertia."""
 
 
@@ -107,8 +98,8 @@ def recorded_scene(
 
     Raises InvalidInput for a Dataset and posterior without system or rows in that time, MissingExtra without trimesh.
     """
-    system = dataset.system if posterior is None else posterior.system
-    if system is None:
+    model = dataset.model if posterior is None else posterior.model
+    if model is None:
         raise InvalidInput("the dataset holds no robot; import it with one, or give a fitted model, too.")
     rows = style.window(dataset, start, seconds)
     first, last = rows.time[[0, -1]]
@@ -116,42 +107,41 @@ def recorded_scene(
     grid = np.linspace(first, last, steps + 1)
     rows = rows.rows(np.unique(np.searchsorted(rows.time, grid - 1e-9).clip(0, len(rows) - 1)))
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
-    drawn, doubts = link_shapes(system.robot, shapes)
+    drawn, doubts = link_shapes(model.robot, shapes)
     with torch.no_grad():
         if isinstance(posterior, StructuredPosterior):
             dynamics = posterior.dynamics(q, v, u)
             arrows = learned_forces(posterior, dynamics)
         else:
-            dynamics = system.dynamics(q, v, u)
-            arrows = [_at_joints(system.robot, dynamics, "recorded u", dynamics.state.delivered, None)]
+            dynamics = model.dynamics(q, v, u)
+            arrows = [_at_joints(model.robot, dynamics, "recorded u", dynamics.state.delivered, None)]
         paths = [contact.position(dynamics.state.kinematics).cpu().numpy() for contact in dynamics.contacts]
-    poses = poses_of_links(system.robot, q, [shape.link for shape in drawn])
+    poses = poses_of_links(model.robot, q, [shape.link for shape in drawn])
     time = rows.time - rows.time[0]
-    return RecordedScene(system.robot, time, rows.q, drawn, poses, arrows, paths, reach(system.robot), doubts)
+    return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, paths, reach(model.robot), doubts)
 
 
 def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
     """What the model found at these states: joint forces, with the laws of its system, point and contact forces."""
-    prior, robot = posterior.model.prior, posterior.system.robot
-    B, latents = prior.mixing(dynamics), posterior.latents(dynamics, True)
+    prior, robot = posterior.trained.unknown, posterior.model.robot
+    B, latents = prior.direction(dynamics), posterior.latents(dynamics, True)
     of_joints = torch.zeros(B.shape[-1], dtype=torch.bool)
     groups = []
-    for name, term, which in term_slices(prior, robot):
+    for name, term, which in prior.named(robot):
         point = term.point_force(dynamics)
         if point is None:
             of_joints[which] = True
         else:
             force = latents.entries(which).through(point)
             groups.append(_at_point(name, _place(term, dynamics), force.mean, force.covariance))
-    known_forces = [force for force in posterior.system.known_forces if not isinstance(force, NOT_SHOWN)]
-    if bool(of_joints.any()) or known_forces:
+    forces = [force for force in posterior.model.laws if not isinstance(force, NOT_SHOWN)]
+    if bool(of_joints.any()) or forces:
         own = latents.through(B * of_joints)
-        mean = own.mean + sum(force.force(dynamics.state).expand_as(own.mean) for force in known_forces)
+        mean = own.mean + sum(force.force(dynamics.state).expand_as(own.mean) for force in forces)
         title = "learned joint forces" if posterior.carries_known_forces else "friction and other joint forces"
         groups.append(_at_joints(robot, dynamics, title, mean, own.std))
     if dynamics.contacts and posterior.predicts_forces:
-        known = not posterior.carries_known_forces
-        map_ = dynamics.contact_force_map(known)
+        map_ = dynamics.contact_force_map()
         matrix, offset = (map_.matrix @ B).unflatten(-2, (-1, 3)), map_.offset.unflatten(-1, (-1, 3))
         points: dict[tuple[object, ...], list[int]] = {}
         for index, contact in enumerate(dynamics.contacts):
@@ -165,7 +155,7 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
     return groups
 
 
-def _place(term: ForcePrior, dynamics: ConstrainedDynamics) -> torch.Tensor:
+def _place(term: Unknown, dynamics: ConstrainedDynamics) -> torch.Tensor:
     """World position (rows, 3) of the point at which a prior's force acts."""
     frame = term.link(dynamics.state.robot) if isinstance(term, BaseWrench) else getattr(term, "frame", None)
     if frame is None:

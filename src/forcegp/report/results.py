@@ -16,7 +16,7 @@ from forcegp.evaluation import (
     normal_force_figure,
     prediction_figure,
 )
-from forcegp.models.protocol import Posterior
+from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene
 from forcegp.report.page import Finding, Page, Picture, Table
 from forcegp.report.scene import recording
@@ -61,7 +61,7 @@ def model_page(
         "error, the band its 95 % interval.",
         motion_bands_figure(posterior, dataset, seconds=PICTURED),
     )
-    if posterior.system.contacts and posterior.predicts_forces:
+    if posterior.model.contacts and posterior.predicts_forces:
         steps["normal force"] = lambda: (
             "The forces of contacts, which no sensor measured.",
             normal_force_figure(posterior, dataset),

@@ -5,5 +5,5 @@ from .inertia import (
 )
 from .kinematics import Kinematics as Kinematics
 from .urdf import Joint as Joint
-from .structure import Link as Link, LinkInertia as LinkInertia
+from .structure import Link as Link
 from .robot import Robot as Robot

@@ -1,7 +1,7 @@
 """A model that MuJoCo compiled, as URDF elements, rotor inertias and closed loops (:mod:`forcegp.robots.mjcf`)."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -52,6 +52,8 @@ class Translation:
     loops: tuple[LoopDescription, ...] = ()
     motors: tuple[Motor, ...] = ()
     """All, if some act at sites of bodies or turn a ball joint."""
+    springs: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Stiffness (Nm/rad or N/m) and position at rest of joints that turn or slide."""
 
 
 class CompiledModel:
@@ -92,7 +94,8 @@ class CompiledModel:
         gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)
         text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
         locked = {self.joints[joint]: value for joint, value in self.locked.items()}
-        return Translation(text, gravity, self._rotor_inertias(), locked, loops, motors)
+        springs = self._springs() if self.for_system else {}
+        return Translation(text, gravity, self._rotor_inertias(), locked, loops, motors, springs)
 
     @staticmethod
     def _named(name: str, taken: set[str]) -> str:
@@ -273,6 +276,20 @@ class CompiledModel:
     def _equality(self, k: int) -> str:
         return self.model.equality(k).name or f"equality {k}"
 
+    def _springs(self) -> dict[str, tuple[float, float]]:
+        model, found = self.model, {}
+        for joint in range(model.njnt):
+            if self._is_sprung(joint):
+                rest = model.qpos_spring[model.jnt_qposadr[joint]]
+                found[self.joints[joint]] = float(model.jnt_stiffness[joint]), float(rest)
+        return found
+
+    def _is_sprung(self, joint: int) -> bool:
+        """Whether it has a linear spring, and one coordinate of its own."""
+        model = self.model
+        linear = model.jnt_stiffness[joint] and not _any(model, "jnt_stiffnesspoly", joint)
+        return bool(linear) and model.jnt_type[joint] >= 2 and joint not in self.couplings
+
     def _loops(self) -> Iterator[LoopDescription]:
         """Equalities of type connect and weld; what they need of frames becomes links."""
         model, kinds = self.model, self.mujoco.mjtEq
@@ -282,7 +299,7 @@ class CompiledModel:
                 continue
             name, data = self._equality(k), model.eq_data[k]
             if not self.for_system:
-                self._lose("closed loops (MechanicalSystem.from_mjcf has them)", name)
+                self._lose("closed loops (Model.from_mjcf has them)", name)
                 continue
             ends = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
             if model.eq_objtype[k] == int(self.mujoco.mjtObj.mjOBJ_SITE):
@@ -348,7 +365,10 @@ class CompiledModel:
         for joint in range(model.njnt):
             dof = model.jnt_dofadr[joint]
             where = self.joints[joint]
-            if model.jnt_stiffness[joint] or _any(model, "jnt_stiffnesspoly", joint):
+            if self._is_sprung(joint):
+                if not self.for_system:
+                    self._lose("springs (Model.from_mjcf has them)", where)
+            elif model.jnt_stiffness[joint] or _any(model, "jnt_stiffnesspoly", joint):
                 self._lose("springs", where)
             if _any(model, "dof_dampingpoly", dof):
                 self._lose("damping that is not linear", where)

@@ -145,7 +145,7 @@ class Robot(RobotStructure):
         Parameters are those of :meth:`from_urdf`, without ``root``: ``gravity`` (default: the file's), ``armature``
         (default: the file's), ``locked``, ``inertias``, ``base`` (default: as in the file) and ``strict``. A
         RobotFileWarning names what acts in MuJoCo and not here: springs, tendons, gains of actuators, closed loops
-        (which :meth:`MechanicalSystem.from_mjcf <forcegp.mechanics.MechanicalSystem.from_mjcf>` has) and others.
+        (which :meth:`Model.from_mjcf <forcegp.Model.from_mjcf>` has) and others.
 
         Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
         :class:`~forcegp.errors.MissingExtra` without the package mujoco.
@@ -179,7 +179,7 @@ class Robot(RobotStructure):
         strict: bool = False,
         for_system: bool = False,
     ) -> "tuple[Robot, Translation]":
-        """The robot of MJCF text, and what a system takes from it, which is noted as left out unless ``for_system``."""
+        """The robot of MJCF text, and what a model takes from it, which is noted as left out unless ``for_system``."""
         given = {"locked": locked, "inertias": inertias, "base": base}
         problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
         found = translate(text, path, inertias == "nearest", for_system, problems)

@@ -19,34 +19,8 @@ from forcegp.robots.tree import Tree, merged_inertias
 from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
 from forcegp.summary import Summary, listed
 
-INERTIAL_PARTS = ("mass", "com", "inertia")
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
 DOWN = ("down_x", "down_y", "down_z")
-ALIASES = {"center_of_mass": "com"}
-
-
-@dataclass(frozen=True)
-class LinkInertia:
-    """Some of a link's inertial parameters, to be estimated: ``parts`` out of 'mass', 'com' and 'inertia'.
-
-    What is not named keeps its physical value: the centre of mass in the link frame, and the inertia *about* it.
-    """
-
-    link: str
-    parts: tuple[str, ...] = INERTIAL_PARTS
-
-    def __post_init__(self) -> None:
-        if isinstance(self.parts, str):
-            raise InvalidInput(f"parts is the text {self.parts!r}; give a tuple such as ({self.parts!r},)")
-        parts = tuple(dict.fromkeys(ALIASES.get(part, part) for part in self.parts))
-        unknown = next((part for part in parts if part not in INERTIAL_PARTS), None)
-        if unknown is not None or not parts:
-            given = "nothing" if unknown is None else repr(unknown)
-            raise InvalidInput(
-                f"a link has the inertial parts {', '.join(INERTIAL_PARTS)}, and {given} was asked of {self.link!r}; "
-                "name one or more of them."
-            )
-        object.__setattr__(self, "parts", parts)
 
 
 @dataclass(frozen=True)
@@ -58,13 +32,6 @@ class Link:
     mass: float  # kg; 0 for a massless frame
     center_of_mass: tuple[float, float, float]  # m, in the link frame
     inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
-
-    def inertial(self, *parts: str) -> LinkInertia:
-        """Parts to learn, for ``StructuredGP.identify``: 'mass', 'com', 'inertia'; all three if none is named.
-
-        'center_of_mass' means 'com'. Raises :class:`~forcegp.errors.InvalidInput` for other parts.
-        """
-        return LinkInertia(self.name, parts or INERTIAL_PARTS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

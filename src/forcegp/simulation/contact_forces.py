@@ -31,33 +31,33 @@ class ViscousFriction:
 
 @dataclass(frozen=True)
 class DryFriction:
-    """Coulomb's law with the Stribeck effect, per newton of normal force, smooth at rest.
+    """Dry friction that depends on the velocity, per newton of normal force, smooth at rest.
 
     With the tangential velocity `p't` and its length s, `F = -mu(s) |N| p't / sqrt(s^2 + smoothing^2)` and
-    `mu(s) = coulomb + (static - coulomb) exp(-(s / stribeck_velocity)^2)`: Tustin's exponential in the Gaussian form of
+    `mu(s) = coulomb + (static - coulomb) exp(-(s / breakaway_velocity)^2)`: Tustin's exponential, as a Gaussian, of
     Bo and Pavelescu (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, section 2.1; Olsson et al. 1998, section 2.1).
     `static = coulomb` is Coulomb's law. The square root stands for the sign, so that there is no sticking: below
     `smoothing` the point creeps.
 
-    coulomb, static: dimensionless; stribeck_velocity, smoothing: m/s.
+    coulomb, static: dimensionless; breakaway_velocity, smoothing: m/s.
     """
 
     load_dependent: ClassVar[bool] = True
     coulomb: float
     static: float
-    stribeck_velocity: float
+    breakaway_velocity: float
     smoothing: float
 
     def coefficient(self, speed: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """`|F| / |N|` at tangential speeds [m/s]."""
-        level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.stribeck_velocity) ** 2))
+        level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.breakaway_velocity) ** 2))
         return np.asarray(level * speed / np.sqrt(speed**2 + self.smoothing**2))
 
     def force(self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """As of `ViscousFriction`, per newton of normal force; `normal` is a unit vector."""
         tangential = velocity - (normal @ velocity) * normal
         speed = np.sqrt(tangential @ tangential)
-        level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.stribeck_velocity) ** 2))
+        level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.breakaway_velocity) ** 2))
         return -level / np.sqrt(speed**2 + self.smoothing**2) * tangential
 
 

@@ -7,15 +7,17 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.model import Model
 from forcegp.robots import Robot
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.recording import RATE, recorded
 from forcegp.simulation.scenarios import FreeArmConfig
 
 FINE = 4  # steps between two rows
 STIFFNESS = 100.0  # of the controller in 1/s^2, critically damped
-COULOMB, STATIC, VISCOUS = 0.02, 0.03, 0.01  # of a joint's largest torque; viscous per rad/s
-STRIBECK, SMOOTH, SIZE, RATES = 0.1, 0.02, 0.35, (0.8, 3.5)  # [rad/s]; of the sines that joints follow [rad, rad/s]
+COULOMB, BREAKAWAY, VISCOUS = 0.02, 0.01, 0.01  # of a joint's largest torque; viscous per rad/s
+FALLING, SMOOTH, SIZE, RATES = 0.1, 0.02, 0.35, (0.8, 3.5)  # [rad/s]; of the sines that joints follow [rad, rad/s]
 ARMS = {  # URDF, posture, and inertia of geared rotors in parts of the largest torque [kg m^2 / Nm]
     "ur5-free": ("ur5.urdf", (0.0, -1.2, 1.4, -0.8, -1.5, 0.0), 0.01),
     "double-pendulum": ("double_pendulum.urdf", (0.4, -0.5), 0.0),
@@ -29,18 +31,16 @@ def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None
     most = np.array([joint.effort_limit for joint in robot.joints])
     robot = robot.with_armature(rotors * most)
     plant = robot.compile()
-    static = STATIC if config.joint_friction == "stribeck" else COULOMB
-    size = most if config.joint_friction != "none" else 0.0 * most
-
-    def friction(v: np.ndarray) -> np.ndarray:
-        dry = COULOMB + (static - COULOMB) * np.exp(-((v / STRIBECK) ** 2))
-        return -size * (dry * np.tanh(v / SMOOTH) + VISCOUS * v)
+    numbers = {"damping": VISCOUS * most, "level": COULOMB * most, "breakaway": BREAKAWAY * most}
+    friction = LawsOfJoints.named(
+        str(config.joint_friction), robot, {**numbers, "velocity_scale": SMOOTH, "velocity": FALLING}
+    )
 
     def acceleration(q: np.ndarray, v: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
         """At the row for dt = 0, else of a step that is implicit in friction, to first order: it may be stiff."""
         M, h = (x.numpy() for x in plant.mass_matrix_and_bias(torch.from_numpy(q), torch.from_numpy(v)))
-        slope = dt * size * (static / SMOOTH * (1.0 - np.tanh(v / SMOOTH) ** 2) + VISCOUS)
-        return np.linalg.solve(M + np.diag(slope), u + friction(v) - h)
+        slope = dt * friction.slope(v) if dt else np.zeros_like(v)
+        return np.linalg.solve(M + np.diag(slope), u + friction(v, u) - h)
 
     steps, rows = max(2, round(config.seconds * RATE)), []
     for episode in range(config.episodes):
@@ -55,13 +55,13 @@ def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None
             wanted = STIFFNESS * (home + ramp * x - q) + 2.0 * STIFFNESS**0.5 * (slope * x + ramp * dx - v)
             M, g = plant.mass_matrix(torch.from_numpy(q)), plant.gravity_forces(torch.from_numpy(q))
             u = np.clip(M.numpy() @ wanted + g.numpy(), -most, most)
-            rows.append((q, v, u, acceleration(q, v, u, 0.0), friction(v)))
+            rows.append((q, v, u, acceleration(q, v, u, 0.0), friction(v, u)))
             for _ in range(FINE):
                 v = v + acceleration(q, v, u, 1.0 / (RATE * FINE)) / (RATE * FINE)
                 q = q + v / (RATE * FINE)
             if progress is not None and k % RATE == 0:
                 progress(episode * steps + k, config.episodes * steps)
     q, v, u, a, Q_U = map(np.array, zip(*rows, strict=True))
-    system = MechanicalSystem(robot, known_forces=(Actuation(), RigidBodyBias()))
-    truth = {"Q_U": Q_U} | ({"Q_U.joint-friction": Q_U} if size.any() else {})
-    return recorded(config.arm, config, system, {"q": q, "v": v, "u": u, "a": a}, truth)
+    model = Model(robot, forces=(Actuation(), RigidBodies()))
+    truth = {"Q_U": Q_U} | ({"Q_U.joint-friction": Q_U} if friction.laws else {})
+    return recorded(config.arm, config, model, {"q": q, "v": v, "u": u, "a": a}, truth)

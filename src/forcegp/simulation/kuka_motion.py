@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.errors import MissingExtra, RobotModelError, SimulationError
+from forcegp.forces.registry import force_class
+from forcegp.robots import Robot
 from forcegp.robots.xml_text import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import (
@@ -111,14 +113,16 @@ def random_stream(config: KukaSurfaceConfig, episode: int, stream: int) -> np.ra
     return np.random.default_rng([config.seed, episode, stream])
 
 
-def simulate_episode(config: KukaSurfaceConfig, urdf: str, episode: int, report: Callable[[int], None]) -> Motion:
+def simulate_episode(
+    config: KukaSurfaceConfig, robot: Robot, urdf: str, episode: int, report: Callable[[int], None]
+) -> Motion:
     """One continuous motion of the arm. `report(steps done)` is called now and then.
 
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
-    joint_law = None if config.joint_friction == "none" else JointFrictionLaw(config)
+    joint_law = None if config.joint_friction == "none" else JointFrictionLaw(config, robot)
     columns: dict[str, np.ndarray] = {}
     if config.contact == "bullet":
         urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
@@ -186,8 +190,9 @@ def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
     """The law of the ideal contact."""
     if config.friction == "viscous":
         return ViscousFriction(config.viscous_coefficient)
-    static = config.static_coefficient if config.friction == "stribeck" else config.coulomb_coefficient
-    return DryFriction(config.coulomb_coefficient, static, config.stribeck_velocity, config.friction_smoothing)
+    falls = "breakaway" in force_class(str(config.friction)).coefficients
+    static = config.static_coefficient if falls else config.coulomb_coefficient
+    return DryFriction(config.coulomb_coefficient, static, config.breakaway_velocity, config.friction_smoothing)
 
 
 def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:

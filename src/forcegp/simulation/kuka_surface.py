@@ -8,7 +8,9 @@ import numpy as np
 from forcegp import __version__
 from forcegp.data import Dataset
 from forcegp.errors import SimulationError
-from forcegp.mechanics import Actuation, Baumgarte, Contact, MechanicalSystem, RigidBodyBias
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.mechanics import Baumgarte, Contact
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.simulation.kuka_motion import TOOL_LINK, Motion, kuka_urdf, simulate_episode
 from forcegp.simulation.recording import recorded
@@ -45,7 +47,7 @@ def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None =
             if progress is not None:
                 progress(done + step, config.steps)
 
-        motion = simulate_episode(config, urdf, episode, report)
+        motion = simulate_episode(config, robot, urdf, episode, report)
         _require_useful(config, robot, motion, episode)
         motions.append(motion)
     return _dataset(config, robot, motions)
@@ -70,16 +72,16 @@ def _require_useful(config: KukaSurfaceConfig, robot: Robot, motion: Motion, epi
         raise SimulationError(f"episode {episode}: {share:.1%} of the torques are at their limit. {remedy}")
 
 
-def _system(config: KukaSurfaceConfig, robot: Robot) -> MechanicalSystem:
+def _model(config: KukaSurfaceConfig, robot: Robot) -> Model:
     contacts = ()
     if config.surface != "none":
         contacts = (Contact(TOOL_LINK, config.tool_point, table_of(config).surface()),)
     # PyBullet's contact does not follow Baumgarte's law.
     stabilised = contacts and config.contact == "ideal"
-    return MechanicalSystem(
+    return Model(
         robot=robot,
         contacts=contacts,
-        known_forces=(Actuation(), RigidBodyBias()),
+        forces=(Actuation(), RigidBodies()),
         baumgarte=Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if stabilised else None,
     )
 
@@ -105,7 +107,7 @@ def _dataset(config: KukaSurfaceConfig, robot: Robot, motions: list[Motion]) -> 
     signals = {name: column(name) for name in ("q", "v", "u", "a", "time")}
     versions = {"forcegp": __version__, "pybullet": _pybullet_version(), "numpy": np.__version__}
     more = {"u": "commanded torque minus joint damping", "versions": versions}
-    return recorded("kuka-surface", config, _system(config, robot), signals, _truth(config, column), more)
+    return recorded("kuka-surface", config, _model(config, robot), signals, _truth(config, column), more)
 
 
 def _pybullet_version() -> str:

@@ -15,7 +15,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from forcegp.data import Dataset
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, Thrusters
+from forcegp.forces import Actuation, RigidBodies, Thrusters
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.simulation.recording import RATE, recorded
 from forcegp.simulation.scenarios import QuadrotorConfig
@@ -39,23 +40,23 @@ TURNING, QUICKEST = 0.5, 12.0  # of attitude: in parts of 1 / lag, and in rad/s
 def simulate_quadrotor(config: QuadrotorConfig, progress: Callable[[int, int], None] | None = None) -> Dataset:
     """Rows of q, v, commanded rotor speeds u and a; truth holds a and "Q_U", metadata the mean wind of each episode.
 
-    Q_U is all that the model of the system does not contain: what air does, a thrust that differs from the data sheet,
+    Q_U is all that the model does not contain: what air does, a thrust that differs from the data sheet,
     and late rotors.
     """
     robot = Robot.from_urdf(Path(__file__).parent / "quadrotor.urdf", base="floating")
     propellers = Thrusters("body", PLACES.tolist(), DATASHEET, (TORQUE * DATASHEET).tolist(), power=2)
-    system = MechanicalSystem(robot, (), (Actuation(), propellers, RigidBodyBias()))
+    model = Model(robot, (), (Actuation(), propellers, RigidBodies()))
     steps, parts = max(2, round(config.seconds * RATE)), []
     for episode in range(config.episodes):
         parts.append(_episode(robot, config, episode, steps))
         if progress is not None:
             progress(episode + 1, config.episodes)
     q, v, u, a, wind = (np.concatenate(part) for part in zip(*parts, strict=True))
-    model = system.dynamics(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(u))
-    Q_U = (model.M @ torch.from_numpy(a)[..., None])[..., 0] - model.Q_K
+    dynamics = model.dynamics(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(u))
+    Q_U = (dynamics.M @ torch.from_numpy(a)[..., None])[..., 0] - dynamics.Q_K
     mean = wind.reshape(config.episodes, steps, 3).mean(1).tolist()
     motion = {"q": q, "v": v, "u": u, "a": a}
-    return recorded("quadrotor", config, system, motion, {"Q_U": Q_U.numpy()}, {"wind": mean})
+    return recorded("quadrotor", config, model, motion, {"Q_U": Q_U.numpy()}, {"wind": mean})
 
 
 def _episode(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> tuple[np.ndarray, ...]:

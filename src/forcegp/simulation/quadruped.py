@@ -15,9 +15,12 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import NumericalError
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, fixed_point
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.mechanics import fixed_point
+from forcegp.model import Model
 from forcegp.robots import Robot, parameters_from_physical
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.recording import RATE, recorded
 from forcegp.simulation.scenarios import QuadrupedConfig
 
@@ -27,8 +30,8 @@ SHIFT, TURN = (0.02, 0.015, 0.025), (0.10, 0.10, 0.12)  # of the base in m and r
 LEAN = (0.07, 0.06)  # m, away from the foot that is lifted, so that the others carry the weight
 RATES = (1.5, 5.0)  # of the sines in rad/s
 PERIOD, LIFTED, HEIGHT, STRIDE = 3.0, (1.0, 2.0), 0.05, 0.03  # s; between which one foot is up; m
-COULOMB, STATIC, VISCOUS = 0.8, 1.3, 0.15  # Nm, Nm, Nms/rad in every joint
-STRIBECK, SMOOTH = 0.15, 0.02  # rad/s
+FRICTION = {"level": 0.8, "breakaway": 0.5, "damping": 0.15, "velocity_scale": 0.02, "velocity": 0.15}
+"""Of every joint, in Nm, Nms/rad and rad/s."""
 PLACE = (0.08, -0.04, 0.12)  # of the load in the trunk, m
 NEWTON = 20
 
@@ -37,12 +40,12 @@ def simulate_quadruped(config: QuadrupedConfig, progress: Callable[[int, int], N
     """Rows of q, v, u and a; truth holds a, the friction Q_U and the foot forces "lambda" in N, world axes."""
     robot = Robot.from_urdf(Path(__file__).parent / "quadruped.urdf", base="floating")
     contacts = tuple(contact for leg in LEGS for contact in fixed_point(f"{leg}_foot", switch=f"{leg}_stands"))
-    system = MechanicalSystem(robot, contacts, (Actuation(), RigidBodyBias()))
+    model = Model(robot, contacts, (Actuation(), RigidBodies()))
     loaded = _loaded(robot, config.payload)
     steps = max(2, round(config.seconds * RATE))
     parts = []
     for episode in range(config.episodes):
-        parts.append(_episode(loaded, system, config, episode, steps))
+        parts.append(_episode(loaded, model, config, episode, steps))
         if progress is not None:
             progress(episode + 1, config.episodes)
     q, v, u, a, Q_U, forces = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
@@ -50,7 +53,7 @@ def simulate_quadruped(config: QuadrupedConfig, progress: Callable[[int, int], N
     return recorded(
         "quadruped",
         config,
-        system,
+        model,
         {"q": q, "v": v, "u": u, "a": a},
         {"lambda": forces, "in_contact": stands, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
         {"payload": {"frame": "trunk", "mass": config.payload, "center": list(PLACE)}},
@@ -69,9 +72,7 @@ def _loaded(robot: Robot, payload: float) -> Robot:
     return robot.with_inertials({"trunk": parameters_from_physical(*values)})
 
 
-def _episode(
-    robot: Robot, system: MechanicalSystem, config: QuadrupedConfig, episode: int, steps: int
-) -> tuple[Tensor, ...]:
+def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, steps: int) -> tuple[Tensor, ...]:
     rng = np.random.default_rng([config.seed, episode])
     time = torch.arange(steps, dtype=torch.float64) / RATE
     home = robot.neutral()
@@ -96,12 +97,8 @@ def _episode(
     kinematics = robot.kinematics(q, v)
     drift = torch.stack([kinematics.frame_bias_acceleration(f"{leg}_foot")[:, :3] for leg in LEGS], 1)
     a = torch.cat([dV, joints(dV, ddx - drift)], -1)
-    Q_U = torch.zeros_like(v)
-    if config.joint_friction != "none":
-        static = STATIC if config.joint_friction == "stribeck" else COULOMB
-        w = v[:, 6:]
-        dry = COULOMB + (static - COULOMB) * torch.exp(-((w / STRIBECK) ** 2))
-        Q_U[:, 6:] = -dry * torch.tanh(w / SMOOTH) - VISCOUS * w
+    friction = LawsOfJoints.named(str(config.joint_friction), robot, FRICTION)
+    Q_U = torch.as_tensor(friction(v.numpy()))
     needed = robot.inverse_dynamics(q, v, a) - Q_U
     A = (J * stands[..., None, None]).flatten(1, 2)
     weight = -float(robot.gravity[2]) * robot.mass

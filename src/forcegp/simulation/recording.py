@@ -8,7 +8,7 @@ import numpy as np
 
 from forcegp import __version__
 from forcegp.data import Dataset, units_for
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 
 RATE = 240
 """Rows per second."""
@@ -17,7 +17,7 @@ RATE = 240
 def recorded(
     scenario: str,
     config: Any,
-    system: MechanicalSystem,
+    model: Model,
     motion: Mapping[str, np.ndarray],
     truth: Mapping[str, np.ndarray],
     metadata: Mapping[str, Any] | None = None,
@@ -27,7 +27,7 @@ def recorded(
     The noise has a stream of its own for each episode, so that it leaves the motion of a seed as it is. Rows are
     1 / RATE apart, unless `motion` has their time.
     """
-    nv, steps = system.robot.nv, len(motion["a"]) // config.episodes
+    nv, steps = model.robot.nv, len(motion["a"]) // config.episodes
     streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
     noise = np.concatenate([stream.standard_normal((steps, nv)) for stream in streams])
     return Dataset(
@@ -37,8 +37,8 @@ def recorded(
             "a": motion["a"] + config.noise * noise,
         },
         episode=np.repeat(np.arange(config.episodes), steps),
-        units=units_for(system.robot),
-        system=system,
+        units=units_for(model.robot),
+        model=model,
         noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
         truth={"a": motion["a"], **truth},
         metadata={

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from types import MappingProxyType
@@ -41,8 +41,33 @@ def require_integer(name: str, value: Any, lower: int, upper: int) -> None:
         raise InvalidInput(f"{name} is {value!r}; it must be an integer from {lower} to {upper}.")
 
 
-Friction = Literal["viscous", "coulomb", "stribeck"]
-JointFriction = Literal["none", "coulomb", "stribeck", "exponential", "asymmetric", "load", "lugre", "drift"]
+def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
+    """Raise InvalidInput for what is neither none, nor one of these, nor laws of joints."""
+    if name in ("none", *more):
+        return
+    from forcegp.forces.force import JointLaw  # torch, which lists of options do without
+    from forcegp.forces.registry import FORCES, force_class, parse_forces
+
+    try:
+        known = isinstance(name, str) and all(isinstance(law, JointLaw) for law in parse_forces(name))
+    except InvalidInput as error:
+        raise InvalidInput(f"joint_friction is {name!r}: {error}") from None
+    if not known:
+        laws = (each for each in FORCES if issubclass(force_class(each), JointLaw))
+        raise InvalidInput(f"joint_friction is {name!r}; give one of {', '.join(('none', *more, *laws))}.")
+
+
+def usual_dry_friction(config: Any) -> None:
+    """Put the law that most joints need in the place of None, and check others."""
+    if config.joint_friction is None:
+        from forcegp.forces.registry import USUAL_DRY
+
+        object.__setattr__(config, "joint_friction", USUAL_DRY)
+    require_joint_friction(config.joint_friction)
+
+
+OF_PLANTS = ("exponential", "asymmetric", "load", "lugre", "drift")
+"""Joint friction that no model has (`JointFrictionLaw`)."""
 Surface = Literal["plane", "tilted", "sphere", "none"]
 ContactKind = Literal["ideal", "bullet"]
 
@@ -105,16 +130,17 @@ class KukaSurfaceConfig:
     """ideal: a bilateral constraint from the first touch on. bullet: PyBullet's unilateral contact with Coulomb
     friction, without restitution, which the tool leaves now and then."""
 
-    friction: Friction | None = None
-    """Friction of the tool on the surface, the force that no model contains: viscous; or coulomb or stribeck, which
-    grow with the normal force. None is viscous for an ideal contact and coulomb, its only law, for PyBullet's."""
+    friction: str | None = None
+    """Friction of the tool on the surface, the force that no model contains: viscous; or a law of dry friction of
+    `forcegp.forces` by name, which grows with the normal force, and near rest where it has a breakaway. None is viscous
+    for an ideal contact and coulomb, its only law, for PyBullet's."""
     viscous_coefficient: float = 1.0
     """Viscous friction of the tool point on the surface [N/(m/s)]."""
     coulomb_coefficient: float = 0.3
     """Dry friction of the sliding tool per normal force."""
     static_coefficient: float = 0.5
-    """Dry friction near rest per normal force (stribeck only)."""
-    stribeck_velocity: float = 0.15
+    """Dry friction near rest per normal force, of laws with a breakaway."""
+    breakaway_velocity: float = 0.15
     """Speed over which the static coefficient falls to the sliding one [m/s]."""
     friction_smoothing: float = 0.05
     """Speed below which dry friction of the tool falls to zero [m/s]: a smooth sign, see `DryFriction`. The explicit
@@ -124,19 +150,19 @@ class KukaSurfaceConfig:
     """How many times as large friction is on the patch; 1 for no patch."""
     patch_x: tuple[float, float] = (0.0, 0.25)
     """The patch is the strip of the surface with x in this range [m]."""
-    joint_friction: JointFriction = "none"
-    """Friction of the joints that is not part of `u`, in addition to the force at the tool: Coulomb friction and
-    viscous friction, with "stribeck" and "exponential" more near rest. Of "asymmetric" (another force backwards, a hard
-    sign), "load", "lugre" (bristles that yield before they slide) and "drift" no kernel of `JointFriction` is the law
-    (`JointFrictionLaw`)."""
+    joint_friction: str = "none"
+    """Friction of the joints that is not part of `u`, besides the force at the tool: viscous friction and laws of
+    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below; or one
+    that no model has: "exponential" (more near rest), "asymmetric" (another force backwards, a hard sign), "load",
+    "lugre" (bristles that yield before they slide) or "drift" (`JointFrictionLaw`)."""
     joint_coulomb: tuple[float, float, float, float, float, float, float] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)
     """Coulomb friction of every joint [Nm]; small in the wrist, whose inertia carries no motors here: explicit steps
     would oscillate under more."""
     joint_static: tuple[float, float, float, float, float, float, float] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)
-    """Friction of every joint near rest [Nm] (stribeck, exponential and lugre)."""
+    """Friction of every joint near rest [Nm], of laws with a breakaway, exponential and lugre."""
     joint_viscous: tuple[float, float, float, float, float, float, float] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)
     """Viscous friction of every joint [Nms/rad] beyond `joint_damping`."""
-    joint_stribeck_velocity: float = 0.2
+    joint_breakaway_velocity: float = 0.2
     """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
     joint_smoothing: float = 0.1
     """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign, see `JointFrictionLaw`."""
@@ -208,6 +234,11 @@ class KukaSurfaceConfig:
             if getattr(self, name) not in get_args(choices):
                 allowed = ", ".join(get_args(choices))
                 raise InvalidInput(f"{name} is {getattr(self, name)!r}; it must be one of {allowed}.")
+        if self.friction != "viscous":
+            from forcegp.forces.registry import dry_laws
+
+            require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
+        require_joint_friction(self.joint_friction, OF_PLANTS)
         self._require_parts_that_fit()
 
     def _require_parts_that_fit(self) -> None:
@@ -268,7 +299,7 @@ class KukaSurfaceConfig:
 
 
 _POSITIVE = (
-    *("tool_mass", "tool_inertia", "clearance", "stribeck_velocity", "friction_smoothing", "joint_stribeck_velocity"),
+    *("tool_mass", "tool_inertia", "clearance", "breakaway_velocity", "friction_smoothing", "joint_breakaway_velocity"),
     *("joint_presliding", "joint_smoothing", "torque_limits", "controller_omega", "least_acceleration"),
 )
 _NOT_NEGATIVE = (
@@ -295,7 +326,7 @@ _RANGES: dict[str, Range] = {
     **dict.fromkeys(_FINITE, FINITE),
 }
 _LENGTHS = {item.name: len(item.default) for item in fields(KukaSurfaceConfig) if isinstance(item.default, tuple)}
-_CHOICES = {"friction": Friction, "joint_friction": JointFriction, "surface": Surface, "contact": ContactKind}
+_CHOICES = {"surface": Surface, "contact": ContactKind}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,17 +350,18 @@ class CommonConfig:
 class FreeArmConfig(CommonConfig):
     """PD control with gravity compensation along sines of random size and rate, two per joint, about a posture.
 
-    Friction is (c + (s - c) exp(-(v / v_s)^2)) tanh(v / w) + d v, with c, s and d in proportion to the largest torque
-    of a joint and s = c for "coulomb". `noise` in rad/s^2. Raises InvalidInput naming the field and its range.
+    `joint_friction` names laws of `forcegp.forces`, or "none"; None is dry friction with more near rest. With viscous
+    friction as well. Numbers that the name does not give are in proportion to the largest torque of a joint. `noise`
+    in rad/s^2. Raises InvalidInput naming the field and its range.
     """
 
     arm: Literal["ur5-free", "double-pendulum"]
-    joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
+    joint_friction: str | None = None
 
     @usable_arguments("FreeArmConfig")
     def __post_init__(self) -> None:
         self._check()
-        require_known("joint_friction", self.joint_friction, "a free arm", ("none", "coulomb", "stribeck"))
+        usual_dry_friction(self)
         require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
 
 
@@ -344,12 +376,12 @@ class QuadrupedConfig(CommonConfig):
     seconds: float = 30.0
     payload: float = 2.0
     lift: bool = True
-    joint_friction: Literal["none", "coulomb", "stribeck"] = "stribeck"
+    joint_friction: str | None = None
 
     @usable_arguments("QuadrupedConfig")
     def __post_init__(self) -> None:
         self._check(payload=NOT_NEGATIVE)
-        require_known("joint_friction", self.joint_friction, "a quadruped", ("none", "coulomb", "stribeck"))
+        usual_dry_friction(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,5 @@
-from .candidates import (
-    CANDIDATES as CANDIDATES, DEFAULT_MODELS as DEFAULT_MODELS, Candidate as Candidate, Training as Training,
-)
-from .comparison import (
-    IDENTIFICATIONS as IDENTIFICATIONS, Comparison as Comparison, Identification as Identification,
-    training_subset as training_subset,
-)
+from .candidates import CANDIDATES as CANDIDATES, Candidate as Candidate, Training as Training
+from .comparison import Comparison as Comparison, training_subset as training_subset
 from .figures import figures_of as figures_of
 from .paired_tests import SCORES as SCORES
 from .run import Validation as Validation, validate as validate

@@ -1,12 +1,12 @@
 """Figures of a comparison: errors per joint, calibration, and errors of predicted motions against their length."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from forcegp.evaluation.plots import style
-from forcegp.validation.candidates import MOTIONS
 from forcegp.validation.page import unit_of
 
 COLORS = {
@@ -110,13 +110,18 @@ def motions_figure(models: Mapping[str, Any], document: Mapping[str, Any]) -> Fi
     return figure
 
 
+def _unrefined(name: str) -> str:
+    """The name of a model without its motions."""
+    return re.sub(r"[@+]motions(:[^+]*)?$", "", name)
+
+
 def _looks(models: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """How every model is drawn: colours of its kind; earlier ones wider, so that curves which coincide are seen."""
-    kinds = {name.removesuffix(MOTIONS): model["kind"] for name, model in models.items()}
-    named = sorted(kinds, key=lambda base: not base.startswith("joint-friction"))  # which has one colour everywhere
+    kinds = {_unrefined(name): model["kind"] for name, model in models.items()}
+    named = sorted(kinds, key=lambda base: "gp:joint-friction" not in base)  # which has one colour everywhere
     looks = {}
     for below, name in enumerate(models, start=1 - len(models)):
-        base = name.removesuffix(MOTIONS)
+        base = _unrefined(name)
         alike = [other for other in named if kinds[other] == kinds[base]]
         turn, place = divmod(alike.index(base), len(COLORS[kinds[base]]))
         color, refined = COLORS[kinds[base]][place], name != base

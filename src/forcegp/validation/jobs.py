@@ -6,6 +6,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,13 @@ import numpy as np
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
-from forcegp.analytical import NoiseLevels
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, FileFormatError, ForceGPError
 from forcegp.jobs import Job, JobStore
-from forcegp.mechanics import MechanicalSystem
-from forcegp.validation.candidates import Candidate, Training
-from forcegp.validation.comparison import Comparison, Identification, identification_named, training_subset
+from forcegp.model import Model
+from forcegp.noise import Noise
+from forcegp.validation.candidates import Candidate, identified_model
+from forcegp.validation.comparison import Comparison
 from forcegp.validation.scores import acceleration_scores, mass_matrices, motion_scores, outside_range
 from forcegp.validation.splits import Split
 
@@ -30,43 +31,33 @@ IDENTIFICATION, MODEL = "identification", "model"
 def jobs_of(comparison: Comparison, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Job], list[Job]]:
     """Identifications, and the models, which read their results; those that use all rows with the first seed only."""
     configuration = hashlib.sha256(json.dumps(comparison.configuration(), sort_keys=True).encode()).hexdigest()
-    wanted = {each.identification for each in models.values() if each.identification is not None}
-    identifications: dict[str, Job] = {}
+    usual = comparison.identification
+    assert usual is not None, "it is resolved"
+    wanted = {usual, *(each.identification for each in models.values() if each.identification is not None)}
+    identifications: list[Job] = []
     fits: list[Job] = []
 
-    def job(
-        kind: str, name: str, split: int, seed: int, work: Candidate | Identification, read: Mapping[str, str]
-    ) -> Job:
+    def job(kind: str, name: str, split: int, seed: int, work: Candidate | str, read: Mapping[str, str]) -> Job:
         spec = {"configuration": configuration, "kind": kind, "name": name, "split": split, "seed": seed, **read}
-        inputs = tuple(sorted({*read.values()}))
         place = job_name(comparison.splits[split], seed, kind, name)
-        cost = work.cost if isinstance(work, Candidate) else 1.0
-        functions = (work.fit,) if isinstance(work, Candidate) else (work.identify, work.noise)
-        # where the functions are defined, which somebody else may have added
-        modules = tuple(sorted({_plain(function).__module__ for function in functions if function is not None}))
+        cost = 1.0 if isinstance(work, str) else work.cost
+        # where the function is defined, which somebody else may have added
+        modules = (__name__,) if isinstance(work, str) else (_plain(work.fit).__module__,)
+        inputs = tuple(sorted({*read.values()}))
         return Job(place, f"{__name__}:compute", spec, inputs, cost, (comparison, work), modules)
 
-    for seed in range(seeds):
-        for split in range(len(comparison.splits)):
-            for name in sorted({*wanted, comparison.identification}):
-                work = identification_named(name)
-                # seeds choose rows: one of all rows, and that of the mass matrix, is done once
-                if seed == 0 or (name in wanted and not work.all_rows):
-                    found = job(IDENTIFICATION, name, split, seed, work, {})
-                    identifications[found.name] = found
+    for number, split in enumerate(comparison.splits):
+        places = {name: job_name(split, 0, IDENTIFICATION, name) for name in sorted(wanted)}
+        identifications += [job(IDENTIFICATION, name, number, 0, name, {}) for name in places]
+        for seed in range(seeds):
             for name, each in models.items():
                 if each.all_rows and seed:
                     continue
-                read = {"mass_matrix": _identification_name(comparison, comparison.identification, split, 0)}
+                read = {"mass_matrix": places[usual]}
                 if each.identification is not None:
-                    read["mean"] = _identification_name(comparison, each.identification, split, seed)
-                fits.append(job(MODEL, name, split, seed, each, read))
-    return list(identifications.values()), fits
-
-
-def _identification_name(comparison: Comparison, name: str, split: int, seed: int) -> str:
-    seed = 0 if identification_named(name).all_rows else seed
-    return job_name(comparison.splits[split], seed, IDENTIFICATION, name)
+                    read["identified"] = places[each.identification]
+                fits.append(job(MODEL, name, number, seed, each, read))
+    return identifications, fits
 
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -90,14 +81,14 @@ def kept(store: JobStore, name: str) -> dict[str, Any]:
 
 
 def compute(
-    store: JobStore, spec: Mapping[str, Any], folder: Path, comparison: Comparison, work: Candidate | Identification
+    store: JobStore, spec: Mapping[str, Any], folder: Path, comparison: Comparison, work: Candidate | str
 ) -> dict[str, Any]:
     """Identify, or fit and score; what goes wrong is kept as well, for it is a result."""
     result: dict[str, Any] | None = None
     error: str | None = None
     with threadpool_limits(1):
         try:
-            if isinstance(work, Identification):
+            if isinstance(work, str):
                 result = _identify(comparison, spec, work)
             else:
                 result = _score(store, comparison, spec, work)
@@ -109,29 +100,21 @@ def compute(
     return {**{key: spec[key] for key in ("kind", "name", "seed")}, "split": split, "result": result, "error": error}
 
 
-def _identify(comparison: Comparison, spec: Mapping[str, Any], work: Identification) -> dict[str, Any]:
+def _identify(comparison: Comparison, spec: Mapping[str, Any], name: str) -> dict[str, Any]:
     train, _ = comparison.splits[spec["split"]].apply(comparison.rows)
-    rows = train if work.all_rows else training_subset(train, comparison.points, spec["seed"])
     start = time.process_time()
-    system = work.identify(comparison.system, rows, comparison.friction)
-    found: dict[str, Any] = {"how": work.summary, "training_rows": len(rows)}
-    if work.noise is not None:
-        noise = work.noise(comparison.system, rows, comparison.friction)
-        found["noise"] = {"acceleration": noise.acceleration.tolist(), "force": noise.force.tolist()}
-    return {"cpu_seconds": time.process_time() - start, **found, "system": system.to_dict()}
+    model = identified_model(name, comparison.model, train)
+    assert model.noise is not None, "it was found"
+    found: dict[str, Any] = {"how": name, "training_rows": len(train), "noise": model.noise.to_dict()}
+    return {"cpu_seconds": time.process_time() - start, **found, "model": model.known.to_dict()}
 
 
 def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], work: Candidate) -> dict[str, Any]:
     split = comparison.splits[spec["split"]]
     train, test = split.apply(comparison.rows)
-    rows = training_subset(train, comparison.points, spec["seed"])
     motions = comparison.motions(split)
-    identified: dict[str, MechanicalSystem | str] = {}
-    before, noise = 0.0, None
-    if work.identification is not None:
-        identified[work.identification], before, noise = identified_system(store, spec["mean"])
-    whole = train, split.apply(comparison.recording)[0], max(motions.horizons, default=1.0)
-    training = Training(rows, comparison.system, identified, spec["seed"], *comparison.search, noise, *whole)
+    identified, before = identified_before(store, spec["identified"]) if "identified" in spec else (None, 0.0)
+    training = comparison.training(train, split.apply(comparison.recording)[0], identified, spec["seed"])
     start = time.process_time()
     posterior = work.fit(training)
     seconds = before + time.process_time() - start
@@ -140,18 +123,18 @@ def _score(store: JobStore, comparison: Comparison, spec: Mapping[str, Any], wor
     for sentence in doubted:
         warnings.warn(sentence, DataWarning, stacklevel=1)  # the page shows what was warned of in a job
     scores["motions"] = motion_scores(posterior, motions, comparison.integrator)
-    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": len(rows), "test_rows": len(test), **scores}
+    rows = {"training_rows": len(training.rows), "test_rows": len(test)}
+    return {"cpu_seconds": seconds, "mass_matrix": whose, **rows, **scores}
 
 
-def identified_system(store: JobStore, name: str) -> tuple[MechanicalSystem | str, float, NoiseLevels | None]:
-    """The system of a finished identification, or why there is none, its CPU seconds and its noise if it has one."""
+def identified_before(store: JobStore, name: str) -> tuple[Model | str, float]:
+    """The model of a finished identification, or why there is none, and its CPU seconds."""
     found = kept(store, name)
     result = found["result"]
     if result is None:
-        return str(found["error"]), 0.0, None
-    noise = result.get("noise")
-    levels = None if noise is None else NoiseLevels(*(np.array(noise[kind]) for kind in ("acceleration", "force")))
-    return MechanicalSystem.from_dict(result["system"]), result["cpu_seconds"], levels
+        return str(found["error"]), 0.0
+    model = replace(Model.from_dict(result["model"]), noise=Noise.from_dict(result["noise"]))
+    return model, result["cpu_seconds"]
 
 
 def reference_mass(
@@ -159,12 +142,11 @@ def reference_mass(
 ) -> tuple[Float[np.ndarray, "rows nv nv"], str]:
     """The mass matrices that turn errors of every model into forces, and whose they are, as part of a sentence.
 
-    One and the same for all models and seeds of a split: of the system identified with the first seed, because a URDF
-    seldom holds rotor inertias; of the system as given where that identification failed.
+    One and the same for all models and seeds of a split: of the identified model, because a URDF seldom holds rotor
+    inertias; of the model as given where that identification failed.
     """
-    found = kept(store, name)
-    if found["result"] is None:
-        whose = f"the system as given, because its identification failed ({found['error'].rstrip('.')})"
-        return mass_matrices(test, comparison.system), whose
-    system = MechanicalSystem.from_dict(found["result"]["system"])
-    return mass_matrices(test, system), f"the system identified with seed 0 by {found['result']['how']}"
+    model, _ = identified_before(store, name)
+    if isinstance(model, str):
+        whose = f"the model as given, because its identification failed ({model.rstrip('.')})"
+        return mass_matrices(test, comparison.model), whose
+    return mass_matrices(test, model), f"the model identified from all training rows ({comparison.identification})"

@@ -213,8 +213,9 @@ def validate(
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     if not 0.0 <= margin < 1.0:
         raise InvalidInput(f"the margin is {margin:g}; it must be at least 0 and below 1, such as {MARGIN}.")
-    named = default_models(comparison.system) if models is None else models
-    chosen = candidates(named, comparison.system, comparison.identification)
+    named = default_models(comparison.model) if models is None else models
+    assert comparison.identification is not None, "it is resolved"
+    chosen = candidates(named, comparison.model, comparison.identification)
     configuration = comparison.configuration()
     store = JobStore.open(Path(folder), KIND, configuration, overwrite=overwrite)
     identifications, fits = jobs_of(comparison, chosen, seeds)
@@ -273,8 +274,8 @@ def _document(
 
 
 def _brief(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Without the system of an identification, which its own file holds."""
+    """Without the model of an identification, which its own file holds."""
     result = run["result"]
     if run["kind"] == "identification" and result is not None:
-        result = {name: value for name, value in result.items() if name != "system"}
+        result = {name: value for name, value in result.items() if name != "model"}
     return {**run, "result": result}

@@ -15,8 +15,8 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models import Posterior, observing
+from forcegp.model import Model
+from forcegp.posterior import Posterior, observing
 from forcegp.robots.manifold import ConfigurationSpace
 from forcegp.summary import plain
 
@@ -33,13 +33,13 @@ ROWS_PER_BLOCK = 4096
 CONSTANT = 1e-6  # of the largest standard deviation: less is rounding
 
 
-def mass_matrices(dataset: Dataset, system: MechanicalSystem) -> Float[np.ndarray, "_ nv nv"]:
+def mass_matrices(dataset: Dataset, model: Model) -> Float[np.ndarray, "_ nv nv"]:
     """M of every row [kg m^2, kg m or kg], rotors and armature included."""
     blocks = []
     with torch.no_grad():
         for start in range(0, len(dataset), ROWS_PER_BLOCK):
             q = torch.tensor(dataset.q[start : start + ROWS_PER_BLOCK])
-            blocks.append(system.mass_matrix(system.robot.kinematics(q)).cpu().numpy())
+            blocks.append(model.mass_matrix_at(model.loaded_robot.kinematics(q)).cpu().numpy())
     return np.concatenate(blocks)
 
 
@@ -67,7 +67,7 @@ def acceleration_scores(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """All scores of the held-out rows, and what a reader has to know beside them (`evaluation.doubts`).
 
-    Where the model has observers (`forcegp.models.observing`), they see the held-out rows before each one.
+    Where the model has observers (`forcegp.posterior.observing`), they see the held-out rows before each one.
     `mass` is the same for every model (`mass_matrices`); rows `outside` of the training range are scored apart, too.
 
     Intervals and densities are those of a measurement: with the noise of the model, or of the Dataset where that is
@@ -135,9 +135,9 @@ def outside_range(train: Dataset, test: Dataset) -> Bool[np.ndarray, " rows"]:
 
 
 def _postures(dataset: Dataset) -> np.ndarray:
-    if dataset.system is None:
+    if dataset.model is None:
         return dataset.q
-    robot = dataset.system.robot
+    robot = dataset.model.robot
     return robot.posture(torch.tensor(dataset.q, device=robot.device)).cpu().numpy()
 
 

@@ -3,11 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from forcegp.analytical import NoiseLevels
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models import Posterior
-from forcegp.validation.candidates import Training, candidate
-from forcegp.validation.comparison import Comparison, identification_named, training_subset
+from forcegp.posterior import Posterior
+from forcegp.validation.candidates import candidate, identified_model
+from forcegp.validation.comparison import Comparison
 
 ORDER = "motion", "force_rms", "nrmse"
 """Scores that decide, the first one that there is: where a robot goes is what simulators and controllers need."""
@@ -24,14 +22,8 @@ def fitted_on_all_rows(comparison: Comparison, name: str, seed: int = 0) -> Post
 
     Raises InvalidInput for names that are no model, and FitError where the fit fails.
     """
-    work, rows = candidate(name, comparison.system, comparison.identification), comparison.rows
-    identified: dict[str, MechanicalSystem | str] = {}
-    levels: NoiseLevels | None = None
-    if work.identification is not None:
-        method = identification_named(work.identification)
-        given = rows if method.all_rows else training_subset(rows, comparison.points, seed)
-        identified[work.identification] = method.identify(comparison.system, given, comparison.friction)
-        levels = None if method.noise is None else method.noise(comparison.system, given, comparison.friction)
-    subset = training_subset(rows, comparison.points, seed)
-    whole = rows, comparison.recording, max(comparison.horizons, default=1.0)
-    return work.fit(Training(subset, comparison.system, identified, seed, *comparison.search, levels, *whole))
+    assert comparison.identification is not None, "it is resolved"
+    work, rows = candidate(name, comparison.model, comparison.identification), comparison.rows
+    own = work.identification
+    identified = None if own is None else identified_model(own, comparison.model, rows)
+    return work.fit(comparison.training(rows, comparison.recording, identified, seed))

@@ -15,26 +15,30 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, require_known
 from forcegp.evaluation.force_errors import true_names
 from forcegp.evaluation.plots import style
-from forcegp.mechanics import (
+from forcegp.forces import (
     Actuation,
-    Armature,
-    ConstantJointForce,
-    ConstrainedDynamics,
-    LoadJointFriction,
-    MechanicalSystem,
-    RigidBodyBias,
-    RotorInertia,
+    ContactFriction,
+    CoupledRotors,
+    JointFriction,
+    LoadFriction,
+    Offset,
+    RigidBodies,
+    Rotor,
+    ToolForces,
+    Unknown,
+    UnknownForces,
 )
-from forcegp.models import StructuredPosterior
-from forcegp.models.protocol import Posterior
-from forcegp.models.structured.components import Curve, term_slices
-from forcegp.priors import ContactFriction, ForcePrior, JointFriction, NoForces, ToolForces
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.model import Model
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.components import Curve
+from forcegp.posterior.posterior import Posterior
 
 LARGEST_GRID = 12
 BEYOND = 0.18
 """Part of the visited range that is drawn on either side of it."""
 POINTS = 241
-NOT_OF_VELOCITY = (Actuation, RigidBodyBias, Armature, RotorInertia, ConstantJointForce, LoadJointFriction)
+NOT_OF_VELOCITY = (Actuation, RigidBodies, Rotor, CoupledRotors, Offset, LoadFriction)
 """Known forces that are no curve over the velocity of one joint."""
 LAWS = "friction laws"
 """What the panels of a model without processes are called."""
@@ -54,7 +58,7 @@ class CurvePanel:
 
     latent: str
     component: str
-    term: ForcePrior
+    term: Unknown
     index: int
     feature: int
     resisting: float
@@ -69,11 +73,11 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
     """
     if not isinstance(posterior, StructuredPosterior):
         return []
-    robot = posterior.model.system.robot
+    robot = posterior.model.robot
     names = posterior.latent_names
     widths = [z.shape[-1] for z in posterior.likelihood.standardization.shift]
     panels = []
-    for component, term, which in term_slices(posterior.model.prior, robot):
+    for component, term, which in posterior.trained.unknown.named(robot):
         for index, latent in enumerate(term.latent_names(robot)):
             place = which.start + index
             along = _velocity_along(term, latent, index) if widths[place] > 1 else None
@@ -84,18 +88,18 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
                 panels.append(CurvePanel(names[place], component, term, index, along, -1.0))
     if panels:
         return panels
-    with_law = [joint for joint in range(robot.nv) if law_forces(posterior.system, joint, np.ones(1)).any()]
-    return [CurvePanel(robot.joint_names[joint], LAWS, NoForces(), joint, 0, 1.0, joint) for joint in with_law]
+    with_law = [joint for joint in range(robot.nv) if law_forces(posterior.model, joint, np.ones(1)).any()]
+    return [CurvePanel(robot.joint_names[joint], LAWS, UnknownForces(), joint, 0, 1.0, joint) for joint in with_law]
 
 
-def law_forces(system: MechanicalSystem, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def law_forces(model: Model, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """What the friction laws of the system resist with, in Nm or N, where this joint moves alone; 0 without laws."""
-    robot = system.robot
+    robot = model.robot
     v = torch.zeros(len(velocities), robot.nv, dtype=torch.float64, device=robot.device)
     v[:, joint] = torch.tensor(velocities, dtype=v.dtype, device=v.device)
-    u = v.new_zeros(len(v), len(system.inputs))
-    state = system.state(robot.neutral().expand(len(v), -1), v, u)
-    laws = [force for force in system.known_forces if not isinstance(force, NOT_OF_VELOCITY)]
+    u = v.new_zeros(len(v), len(model.inputs))
+    state = model.state(robot.neutral().expand(len(v), -1), v, u)
+    laws = [law for law in model.laws if not isinstance(law, NOT_OF_VELOCITY)]
     return -sum((law.force(state).expand_as(v) for law in laws), torch.zeros_like(v))[:, joint].detach().cpu().numpy()
 
 
@@ -145,7 +149,7 @@ def friction_curves_figure(
     return figure
 
 
-def _velocity_along(term: ForcePrior, name: str, index: int) -> int | None:
+def _velocity_along(term: Unknown, name: str, index: int) -> int | None:
     """The feature that is the velocity along a tool force's own axis; None for other processes."""
     of_velocity = isinstance(term, ToolForces) and term.inputs in (("velocity",), ("velocity", "angular-velocity"))
     return index if of_velocity and name.startswith("force") else None
@@ -153,7 +157,7 @@ def _velocity_along(term: ForcePrior, name: str, index: int) -> int | None:
 
 def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:
     """What every panel shows: the component where there are several, and the joint or axis."""
-    robot = posterior.model.system.robot
+    robot = posterior.model.robot
     short = dict(zip(robot.joint_names, style.short_joint_names(robot.joint_names), strict=True))
     several = len({panel.component for panel in panels}) > 1
     titles = []
@@ -179,7 +183,7 @@ def _draw_curve(
     curve = None if panel.component == LAWS else _curve(posterior, panel, at)
     mean = np.zeros(POINTS) if curve is None else panel.resisting * curve.mean.cpu().numpy()
     spread = np.zeros(POINTS) if curve is None else style.QUANTILE * curve.std.cpu().numpy()
-    laws = np.zeros(POINTS) if panel.joint is None else law_forces(posterior.system, panel.joint, at)
+    laws = np.zeros(POINTS) if panel.joint is None else law_forces(posterior.model, panel.joint, at)
     mean = mean + laws
     inside = (at >= low) & (at <= high)
     axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
@@ -211,7 +215,7 @@ def _draw_curve(
     axes.locator_params(axis="x", nbins=6)
     if curve is not None:
         return curve.feature_names[panel.feature], curve.unit
-    slides = posterior.system.robot.joints[panel.index].type == "prismatic"
+    slides = posterior.model.robot.joints[panel.index].type == "prismatic"
     return ("velocity [m/s]", "N") if slides else ("velocity [rad/s]", "Nm")
 
 
@@ -228,7 +232,7 @@ def _visited(posterior: StructuredPosterior, panel: CurvePanel) -> Float[np.ndar
     if panel.component == LAWS:
         return posterior.training.v[:, panel.index].cpu().numpy()
     with torch.no_grad():
-        features = panel.term.features(posterior.likelihood.dynamics(posterior.parameters))
+        features = panel.term.features(posterior.likelihood.dynamics)
     return features[panel.index][:, panel.feature].cpu().numpy()
 
 
@@ -240,10 +244,10 @@ def _truth(
         return {}
     named = true_names(list(dict.fromkeys(panel.component for panel in panels)), dataset)
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRUE_POINTS).astype(int)))
-    system = posterior.model.system if dataset.system is None else dataset.system
+    model = posterior.model if dataset.model is None else dataset.model
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
     with torch.no_grad():
-        dynamics = system.dynamics(q, v, u)
+        dynamics = model.dynamics(q, v, u)
         found = {}
         for panel in panels:
             values = _true_latents(panel, named.get(panel.component), rows, dynamics)
@@ -254,7 +258,7 @@ def _truth(
             others = torch.cat([features[:, : panel.feature], features[:, panel.feature + 1 :]], dim=-1)
             latent = panel.resisting * values[:, panel.index]
             if panel.joint is not None:  # the truth is what the system of the dataset lacks
-                latent = latent + torch.tensor(law_forces(system, panel.joint, rows.v[:, panel.joint]))
+                latent = latent + torch.tensor(law_forces(model, panel.joint, rows.v[:, panel.joint]))
             kept = (torch.linalg.vector_norm(others, dim=-1) <= ALONG * own.abs()) & torch.isfinite(latent)
             found[panel.latent] = (own[kept].numpy(), latent[kept].numpy())
     return found
@@ -266,7 +270,7 @@ def _true_latents(panel: CurvePanel, name: str | None, rows: Dataset, dynamics: 
         return None
     directions = panel.term.point_force(dynamics)
     if directions is None:
-        key, directions = f"Q_U.{name}", panel.term.mixing(dynamics)
+        key, directions = f"Q_U.{name}", panel.term.direction(dynamics)
     else:
         key = f"force.{name}"
     if key not in rows.truth:

@@ -11,8 +11,8 @@ from forcegp.errors import ContactError
 from forcegp.evaluation.plots import style
 from forcegp.evaluation.plots.style import QUANTILE
 from forcegp.evaluation.predicted_rows import in_blocks
-from forcegp.models.protocol import Posterior
-from forcegp.models.structured.friction_margin import friction_margins
+from forcegp.posterior.friction_margin import friction_margins
+from forcegp.posterior.posterior import Posterior
 
 
 def slip_scores(posterior: Posterior, dataset: Dataset, coefficient: float) -> dict[str, dict[str, float]]:

@@ -28,7 +28,7 @@ def preparation_figure(dataset: Dataset, preparation: Preparation) -> Figure:
     axes: Any = figure.subplots(dataset.nv, 2, sharex=True, squeeze=False)
     names = style.short_joint_names(dataset.joint_names)
     units = {name: style.joint_units(dataset, name) for name in ("a", "u")}
-    inputs = dataset.joint_names if dataset.system is None else dataset.system.inputs
+    inputs = dataset.joint_names if dataset.model is None else dataset.model.inputs
     for joint in range(dataset.nv):
         panel = axes[joint, 0]
         _draw_filtered(panel, spectrum.frequency, spectrum.acceleration_density[:, joint], spectrum.step, preparation)
@@ -142,7 +142,7 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
         return style.joint_units(shown, "q")[joint]
     rows = log.correction.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
-    measured, fitted = rows.u[:, joint], log.fit.at(tau, rows)[:, joint]
+    measured, fitted = rows.u[:, joint], log.fit.at(log.robot, tau, rows)[:, joint]
     mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
     if mended:
         style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")

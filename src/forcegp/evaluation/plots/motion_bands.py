@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset, recorded_motions
 from forcegp.evaluation.plots import style
 from forcegp.evaluation.rollout_scores import apart_from, rollout_errors
-from forcegp.models import StructuredPosterior
-from forcegp.models.protocol import Posterior
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.posterior import Posterior
 
 LARGEST_GRID = 12
 SAMPLES = 24
@@ -34,7 +34,7 @@ def motion_bands_figure(
     drawn = isinstance(posterior, StructuredPosterior) and len(posterior.latent_names) > 0
     samples = SAMPLES if drawn and not calibrated else 0
     rollout = posterior.rollout(q0, v0, u, recorded.dt, integrator="rk4", samples=samples)
-    errors = rollout_errors(rollout, recorded, posterior.system)
+    errors = rollout_errors(rollout, recorded, posterior.model)
     joints = min(rows.nv, LARGEST_GRID)
     columns = 1 if joints < 3 else 2 if joints < 9 else 3
     figure = style.new_figure(11.0, 1.0 + 1.55 * -(-joints // columns))

@@ -15,7 +15,7 @@ from forcegp.evaluation.plots import style
 from forcegp.evaluation.plots.style import QUANTILE
 from forcegp.evaluation.predicted_rows import PredictedRows, predict_rows
 from forcegp.mechanics import Contact, Held, LoopClosure
-from forcegp.models.protocol import Posterior
+from forcegp.posterior.posterior import Posterior
 
 
 def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
@@ -84,13 +84,13 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
     Raises InvalidInput without contacts, and for models without forces.
     """
-    if not posterior.system.contacts or not posterior.predicts_forces:
+    if not posterior.model.contacts or not posterior.predicts_forces:
         raise InvalidInput(
             f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
             "forces."
         )
     rows = style.window(dataset, start, seconds)
-    contacts = len(posterior.system.contacts)
+    contacts = len(posterior.model.contacts)
     known = "lambda" in dataset.truth and dataset.truth["lambda"].shape[1] == contacts
     figure = style.new_figure(11.0 if known else 8.0, 1.2 + 2.4 * contacts)
     grid = figure.subplots(contacts, 2 if known else 1, squeeze=False, width_ratios=(2.4, 1.0) if known else None)
@@ -99,7 +99,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     if known:
         spread = np.unique(np.linspace(0, len(dataset) - 1, ERROR_ROWS).astype(int))
         every = _normal_forces(posterior, dataset.rows(spread))
-    for index, contact in enumerate(posterior.system.contacts):
+    for index, contact in enumerate(posterior.model.contacts):
         name, label = _contact_labels(contact)
         title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
         _draw_force(grid[index, 0], rows, forces, index, known)
@@ -108,7 +108,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
             title = _draw_errors(grid[index, 1], every, index, label.split()[-1].strip("[]"))
             style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")
     style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
-    held = any(isinstance(contact.surface, Held) for contact in posterior.system.contacts)
+    held = any(isinstance(contact.surface, Held) for contact in posterior.model.contacts)
     style.heading(figure, f"{'Contact' if held else 'Normal'} force after {len(posterior.training)} training points")
     return figure
 
@@ -142,7 +142,7 @@ def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
         assert multiplier is not None, "models with forces predict lambda"
         dynamics = posterior.dynamics(q, v, u)
         size = torch.linalg.vector_norm(dynamics.normals, dim=-1)
-        own = size if rows.system is None else torch.linalg.vector_norm(rows.system.dynamics(q, v, u).normals, dim=-1)
+        own = size if rows.model is None else torch.linalg.vector_norm(rows.model.dynamics(q, v, u).normals, dim=-1)
         truth = rows.truth.get("lambda")
         if truth is not None:
             truth = own.numpy() * truth if truth.shape == own.shape == size.shape else None

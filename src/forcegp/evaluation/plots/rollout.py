@@ -13,7 +13,7 @@ from forcegp.data.configurations import space_of
 from forcegp.data.motion_records import RecordedMotions
 from forcegp.evaluation.plots import style
 from forcegp.evaluation.rollout_scores import INTERVAL, RolloutErrors, apart_from, interval_about
-from forcegp.models.rollout import Rollout
+from forcegp.posterior.rollout import Rollout
 
 COLUMNS = 4
 SMALLEST_SHOWN = 1e-16

@@ -1,0 +1,291 @@
+"""Coordinates for the inertial parameters of bodies, which always belong to a body of positive density.
+
+They are relative to a reference ``P_0 = V V^T`` (V upper triangular) of each body, its pseudo-inertia in the URDF, so
+that one unit is one unit of the affine-invariant metric (Lee, Wensing & Park, "Geometric robot dynamic identification:
+a convex programming approach", T-RO 2020), whatever the mass, size and frame:
+
+    P = V F F^T V^T         F upper triangular, the log-Cholesky factor (Rucker & Wensing, RA-L 2022)
+
+and |log F F^T|_F is the distance.
+
+The distance is a vector norm, so that it can stand among the residuals of non-linear least squares.
+
+A body is often several links. With the factors of its old and new pseudo-inertia, ``P = V V^T`` and ``P' = U U^T``
+(upper triangular), every link gets ``C P_k C^T`` with ``C = U V^-1``: they add up to P', each stays physically
+possible, and links that were equal stay equal. Motions show nothing but their sum.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import block_diag
+
+from forcegp.errors import NonPhysicalInertia
+from forcegp.evidence.identifiability import body_names, body_pseudo_inertias, carrying
+from forcegp.forces import Body
+from forcegp.robots import Robot
+from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia, standard_basis
+from forcegp.robots.urdf_file import replace_inertial
+
+# symmetric matrices Z = sum_k z_k E_k, orthonormal in the Frobenius norm
+_ROWS, _COLUMNS = np.triu_indices(4)
+_SYMMETRIC = np.zeros((10, 4, 4))
+for _k, (_i, _j) in enumerate(zip(_ROWS, _COLUMNS, strict=True)):
+    _SYMMETRIC[_k, _i, _j] = _SYMMETRIC[_k, _j, _i] = 1.0 if _i == _j else 0.5**0.5
+# places of d1, d2, d3, s12, s23, s13, t1, t2, t3 in the log-Cholesky factor
+_PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+
+
+QUANTITIES = (
+    ("mass", "kg"),
+    *((f"center_of_mass.{x}", "m") for x in "xyz"),
+    *((f"inertia.{x}", "kg m^2") for x in ("xx", "xy", "xz", "yy", "yz", "zz")),
+)
+"""What people read of a body: inertia about its centre of mass."""
+_INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+# which of alpha, d1-3, s12, s23, s13, t1-3 each part of a body moves: a mass keeps the inertia about its centre
+PARTS = {"mass": np.zeros((1, 10)), "center_of_mass": np.eye(10)[7:], "inertia": np.eye(10)[1:7]}
+PARTS["mass"][0, :4] = 1.0, -1.0, -1.0, -1.0
+REPORTED = {"mass": slice(0, 1), "center_of_mass": slice(1, 4), "inertia": slice(4, 10)}
+
+
+class Bodies:
+    """Coordinates of n bodies, 0 at the reference pseudo-inertias (4, 4) each, which are definite.
+
+    Ten of each, alpha, d1-3, s12, s23, s13, t1-3, or fewer for those of which `priors` open some parts alone.
+    """
+
+    longest_step: ClassVar[float] = 1.0  # a mass by a factor of e^2
+
+    def __init__(self, references: Sequence[Float[np.ndarray, "4 4"]], priors: Sequence[Body]) -> None:
+        self.priors = tuple(priors)
+        self.factors = upper_cholesky(np.array(references).reshape(-1, 4, 4))
+        self._to_standard = np.linalg.pinv(standard_basis().numpy())
+        self._whole = tuple(len(prior.parts) == len(PARTS) for prior in self.priors)
+        own = [np.eye(10) if whole else np.concatenate([PARTS[part] for part in prior.parts]).T
+               for whole, prior in zip(self._whole, self.priors, strict=True)]  # fmt: skip
+        self._full = block_diag(*own) if own else np.zeros((0, 0))
+        self._weights = np.repeat([prior.strength**0.5 for prior in self.priors], 10)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self._full.shape[1]
+
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        """Which coordinates belong to each body."""
+        ends = np.cumsum([0, *(sum(len(PARTS[part]) for part in prior.parts) for prior in self.priors)])
+        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
+
+    @property
+    def quantities(self) -> tuple[tuple[str, str], ...]:
+        """Names and units of what people read of a body."""
+        return QUANTITIES
+
+    def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
+        """P of every body."""
+        return self._congruent(_log_cholesky(self._full @ x)[0])
+
+    def parameters(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10"]:
+        """Standard parameters."""
+        return self._standard(self.pseudo_inertias(x))
+
+    def chained(
+        self, x: Float[np.ndarray, " k"], regressor: Float[np.ndarray, "rows nv n 10"]
+    ) -> Float[np.ndarray, "rows nv k"]:
+        """Derivatives in the coordinates of what has these derivatives in the standard parameters of every body."""
+        own = self._standard(self._congruent(_log_cholesky(self._full @ x)[1])).swapaxes(-1, -2)
+        out, column = np.empty((*regressor.shape[:2], self.size)), 0
+        for body, derivative in enumerate(own):  # matrix products, where `einsum` would loop by itself
+            block = self._full[10 * body : 10 * body + 10]
+            width = sum(len(PARTS[part]) for part in self.priors[body].parts)
+            out[..., column : column + width] = regressor[:, :, body] @ (derivative @ block[:, column : column + width])
+            column += width
+        return out
+
+    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
+
+        Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley. Bodies of
+        which some parts are open move along x.
+        """
+        there = x + step
+        if not any(self._whole):
+            return there
+        inner, derivatives = _log_cholesky(self._full @ x)
+        inner = inner + np.einsum("nk,nkab->nab", (self._full @ step).reshape(-1, 10), derivatives)
+        values = np.linalg.eigvalsh(inner)
+        possible = (values[:, 0] > DEFINITE * values[:, -1]) & np.array(self._whole)
+        F = upper_cholesky(inner[possible])
+        scale, inside = F[:, 3, 3:], F[:, *np.transpose(_PLACES)] / F[:, 3, 3:]
+        whole = (self._full @ there).reshape(-1, 10)
+        whole[possible] = np.concatenate([np.log(scale), np.log(inside[:, :3]), inside[:, 3:]], axis=1)
+        out, column = there.copy(), 0
+        for k, prior in enumerate(self.priors):
+            width = sum(len(PARTS[part]) for part in prior.parts)
+            out[column : column + width] = whole[k] if possible[k] else there[column : column + width]
+            column += width
+        return out
+
+    def distance(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
+        """A vector whose norm is the distance from the references times the root of its weight, and its Jacobian."""
+        if not self.priors:
+            return np.zeros(0), np.zeros((0, 0))
+        inner, change = _log_cholesky(self._full @ x)
+        values, vectors = np.linalg.eigh(inner)
+        values = np.maximum(values, np.finfo(np.float64).tiny)
+        logs = np.log(values)
+        turned = np.swapaxes(vectors, -1, -2)
+        logarithm = vectors @ (logs[..., None] * turned)
+        # derivative of a matrix function (Daleckii & Krein): divided differences in the axes of the argument
+        gap = values[:, :, None] - values[:, None, :]
+        equal = abs(gap) <= 1e-7 * (values[:, :, None] + values[:, None, :])
+        mean = 0.5 * (values[:, :, None] + values[:, None, :])
+        divided = np.where(equal, 1.0 / mean, (logs[:, :, None] - logs[:, None, :]) / np.where(equal, 1.0, gap))
+        inside = turned[:, None] @ change @ vectors[:, None] * divided[:, None]
+        moved = vectors[:, None] @ inside @ turned[:, None]
+        jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved)) @ self._full
+        return self._weights * np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel(), self._weights[
+            :, None
+        ] * jacobian
+
+    def numbers(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
+        """`QUANTITIES` of every body, in axes with these poses in its frame."""
+        told = [self.physical(pseudo) for pseudo in _in_frames(self.pseudo_inertias(x), frames)]
+        each = [[mass, *center, *(inertia[at] for at in _INERTIA)] for mass, center, inertia in told]
+        return np.array(each).ravel()
+
+    def number_slopes(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
+        """Derivatives of `numbers` in the coordinates."""
+        if not self.priors:
+            return np.zeros((0, 0))
+        changes = _in_frames(self._congruent(_log_cholesky(self._full @ x)[1]), frames[:, None])
+        blocks = []
+        for pseudo, change in zip(_in_frames(self.pseudo_inertias(x), frames), changes, strict=True):
+            mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+            dm = change[:, 3, 3]
+            dc = (change[:, :3, 3] - dm[:, None] * center) / mass
+            outer = center[:, None] * dc[:, None, :]
+            dS = change[:, :3, :3] - dm[:, None, None] * np.outer(center, center)
+            dS = dS - mass * (outer + outer.swapaxes(1, 2))
+            dI = np.trace(dS, axis1=1, axis2=2)[:, None, None] * np.eye(3) - dS
+            blocks.append(np.concatenate([dm[None], dc.T, np.array([dI[:, *at] for at in _INERTIA])]))
+        return block_diag(*blocks) @ self._full
+
+    @staticmethod
+    def physical(pseudo: Float[np.ndarray, "4 4"]) -> tuple[float, np.ndarray, np.ndarray]:
+        """Mass, centre of mass, and inertia about it (3, 3)."""
+        return physical_of_pseudo_inertia(pseudo)
+
+    def _standard(self, pseudo: np.ndarray) -> np.ndarray:
+        return pseudo.reshape(*pseudo.shape[:-2], 16) @ self._to_standard.T
+
+    def _congruent(self, inner: np.ndarray) -> np.ndarray:
+        """V inner V^T for (n, ..., 4, 4)."""
+        V = self.factors.reshape(len(self.factors), *(1 for _ in range(inner.ndim - 3)), 4, 4)
+        return V @ inner @ V.swapaxes(-1, -2)
+
+
+def _in_frames(pseudo: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Pseudo-inertias in axes with these poses."""
+    there = np.linalg.inv(frames)
+    return there @ pseudo @ there.swapaxes(-1, -2)
+
+
+DEFINITE = 1e-9
+"""Matrices whose smallest eigenvalue is this fraction of the largest have factors in spite of rounding."""
+
+
+def upper_cholesky(matrices: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Upper triangular V with V V^T equal to each matrix. Raises numpy.linalg.LinAlgError where one is not definite."""
+    return np.linalg.cholesky(matrices[:, ::-1, ::-1])[:, ::-1, ::-1]
+
+
+def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """F F^T (n, 4, 4) and its derivatives (n, 10, 4, 4)."""
+    x = x.reshape(-1, 10)
+    scale = np.exp(x[:, 0])
+    F = np.zeros((len(x), 4, 4))
+    derivatives = np.zeros((len(x), 10, 4, 4))
+    F[:, 3, 3] = scale
+    for k, (i, j) in enumerate(_PLACES, start=1):
+        F[:, i, j] = scale * (np.exp(x[:, k]) if i == j else x[:, k])
+        derivatives[:, k, i, j] = F[:, i, j] if i == j else scale
+    derivatives[:, 0] = F
+    half = derivatives @ F.swapaxes(-1, -2)[:, None]
+    return F @ F.swapaxes(-1, -2), half + half.swapaxes(-1, -2)
+
+
+THIN = 1e-5
+"""Bodies with a second moment about the centre of mass below this fraction of that about the origin are thickened."""
+THICKNESS = 0.05
+"""Standard deviation of the mass that thickening adds, as a fraction of the body's size."""
+
+
+def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
+    """The robot with bodies of some thickness, since only they have coordinates; and the links that were changed.
+
+    Points, rods and plates (ideal ones, as simple URDFs have them) get an isotropic second moment.
+    """
+    text, changed = robot.urdf_text, []
+    for body, pseudo in zip(carrying(robot), body_pseudo_inertias(robot).cpu().numpy(), strict=True):
+        joint = robot.layout.bodies[body]
+        mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+        about_center = pseudo[:3, :3] - mass * np.outer(center, center)
+        size = max(np.trace(pseudo[:3, :3]), 1e-8 * mass)
+        if np.linalg.eigvalsh(about_center)[0] > THIN * size:
+            continue
+        links = [name for name, place in robot.layout.links.items() if place.body == body]
+        heaviest = max(links, key=lambda name: robot.link(name).mass)
+        link = robot.link(heaviest)
+        inertia = np.array(link.inertia) + 2.0 * THICKNESS**2 * size * np.eye(3)  # of the isotropic second moment
+        center = np.array(link.center_of_mass)
+        text = replace_inertial(text, heaviest, link.mass, center, inertia, source=robot.source)
+        changed.append(heaviest if heaviest == joint.child else f"{heaviest} (of {joint.child})")
+    return (robot.with_text(text) if changed else robot), tuple(changed)
+
+
+def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) -> Robot:
+    """A robot whose bodies of these numbers have these pseudo-inertias, in the frames of their joints' child links.
+
+    Raises NonPhysicalInertia, naming the bodies, where no body has them.
+    """
+    own, names = carrying(robot), body_names(robot)
+    impossible = [names[own.index(body)] for body, pseudo in wanted.items() if not _definite(pseudo)]
+    if impossible:
+        raise NonPhysicalInertia(
+            f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot; give the "
+            "log more motion, or a prior."
+        )
+    now = body_pseudo_inertias(robot).cpu().numpy()
+    change = {
+        body: upper_cholesky(pseudo[None])[0] @ np.linalg.inv(upper_cholesky(now[own.index(body)][None])[0])
+        for body, pseudo in wanted.items()
+    }
+    text = robot.urdf_text
+    for name, placement in robot.layout.links.items():
+        link, body = robot.link(name), placement.body
+        if link.joint is None or link.mass == 0.0 or body not in change:
+            continue
+        offset = np.linalg.inv(robot.layout.child_frames[body]) @ placement.offset
+        there = np.linalg.inv(offset) @ change[body] @ offset
+        # a congruence by [[A, t], [0, s]] moves the moments about the centre of mass by A alone: no cancellation
+        own_moments = pseudo_inertia(link.mass, np.zeros(3), np.array(link.inertia))[:3, :3]
+        A, shift, scale = there[:3, :3], there[:3, 3], there[3, 3]
+        center = (A @ np.array(link.center_of_mass) + shift) / scale
+        second = A @ own_moments @ A.T
+        inertia = np.trace(second) * np.eye(3) - second
+        text = replace_inertial(text, name, link.mass * scale**2, center, inertia, source=robot.source)
+    return robot.with_text(text)
+
+
+def _definite(pseudo: np.ndarray) -> bool:
+    try:
+        np.linalg.cholesky(pseudo)
+    except np.linalg.LinAlgError:
+        return False
+    return True

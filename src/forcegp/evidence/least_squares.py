@@ -1,0 +1,358 @@
+"""Weighted non-linear least squares: the noise of each joint is found along with the coordinates.
+
+Gaussian residuals of joint j with unknown variance are most likely where ``sum_j rows log(sum_n r_nj^2)`` is least;
+weighting each joint by the residuals of the last round until nothing changes finds that (iteratively reweighted least
+squares). The prior stands among the residuals. With `robust` residuals beyond 1.5 standard deviations count by their
+absolute value (soft L1), and the scale of each joint comes from the median.
+
+Residuals r_n = a_n - a^_n that have noise of both kinds are normal with covariance
+
+    S_n = diag(sigma_a^2) + M_n^-1 diag(sigma_F^2) M_n^-1,
+
+so joints of small inertia count less where the noise is one of forces. The two levels of every joint are those of
+largest likelihood (the model of `forcegp.posterior.Noise`). One level per joint would let rows of large M^-1 decide.
+Under constraints H of Gauss' principle stands in the place of M^-1.
+
+Joint forces along A^T are those of contacts and unknown. Of whitened residuals w and z = A^T / sigma they take the part
+in the span of z, and what is left, ``(1 - P) w``, has the likelihood in which they are integrated out under a flat
+prior (generalized least squares). Of joint j it has the mean square ``sum_n (1 - P_n)_jj`` where sigma is right.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from forcegp.errors import NumericalError
+
+ROWS = 2000
+"""Rows that levels are found from at most, evenly spread."""
+LEAST, MOST = 1e-3, 1e2
+"""Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
+of the search that goes further has a covariance that rounding makes singular."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """Standard deviations per joint: of accelerations [rad/s^2 or m/s^2] and of forces [Nm or N]."""
+
+    acceleration: Float[np.ndarray, " nv"]
+    force: Float[np.ndarray, " nv"]
+
+    @classmethod
+    def of(
+        cls,
+        residual: Float[np.ndarray, "rows nv"],
+        M: Float[np.ndarray, "rows nv nv"],
+        H: Float[np.ndarray, "rows nv nv"] | None = None,
+        near: "NoiseLevels | None" = None,
+        robust: bool = False,
+    ) -> "NoiseLevels":
+        """Those of largest likelihood, each between `LEAST` and `MOST` times the whole: Fisher scoring of logarithms.
+
+        `H` is that of Gauss' principle under constraints; None is M^-1. The search begins `near` others, if given.
+        With `robust`, outliers are moved to `OUTLYING` standard deviations first.
+        """
+        if robust:
+            most = OUTLYING * MAD * np.median(abs(residual), axis=0)
+            residual = residual.clip(-most, most)
+        chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
+        inverse = torch.as_tensor(np.linalg.inv(M[chosen]) if H is None else H[chosen])
+        r = torch.as_tensor(residual[chosen])
+        in_force = (torch.as_tensor(M[chosen]) @ r[..., None])[..., 0]
+        whole = torch.stack([x.square().mean(0).sqrt().clamp_min(1e-12) for x in (r, in_force)])
+        middle = np.full(whole.numel(), np.log(0.5))
+        low, high = np.log(LEAST), np.log(MOST)
+        x = middle
+        if near is not None:
+            x = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(low, high)
+
+        def at(x: np.ndarray) -> _Point:
+            """With the expected curvature tr(S^-1 dS S^-1 dS') / 2."""
+            acceleration, force = whole * torch.as_tensor(x).exp().view_as(whole)
+            lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
+            precision = torch.cholesky_inverse(lower)
+            weighted = (precision @ r[..., None])[..., 0]
+            # a weak pull to the middle keeps a level that the residuals do not inform from running away
+            value = 0.5 * (r * weighted).sum() + lower.diagonal(dim1=-2, dim2=-1).log().sum()
+            across = inverse @ precision
+            both = across @ inverse
+            left = torch.cat([precision.diagonal(dim1=-2, dim2=-1), both.diagonal(dim1=-2, dim2=-1)], -1).sum(0)
+            explained = torch.cat([weighted, (inverse @ weighted[..., None])[..., 0]], -1).square().sum(0)
+            squares = torch.cat([acceleration, force]).square()
+            curvature = torch.cat(
+                [
+                    torch.cat([precision.square().sum(0), across.square().sum(0).mT], 1),
+                    torch.cat([across.square().sum(0), both.square().sum(0)], 1),
+                ]
+            )
+            curvature = (2.0 * squares * squares[:, None] * curvature).numpy() + np.eye(len(x))
+            slope = (squares * (left - explained)).numpy() + x - middle
+            return _Point(x, float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature)
+
+        x, *_ = _minimized(at, x, (np.array(low), np.array(high)), np.inf, MOST_EVALUATIONS)
+        acceleration, force = whole.numpy() * np.exp(x).reshape(whole.shape)
+        return cls(acceleration, force)
+
+    def scaled(self, factor: float) -> "NoiseLevels":
+        """All levels times this."""
+        return NoiseLevels(factor * self.acceleration, factor * self.force)
+
+    def whitening(self, H: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
+        """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance. H as in `of`."""
+        inverse = torch.as_tensor(H)
+        S = _covariance(inverse, torch.as_tensor(self.acceleration), torch.as_tensor(self.force))
+        return np.linalg.inv(torch.linalg.cholesky(S).numpy())
+
+
+def _covariance(inverse: Tensor, acceleration: Tensor, force: Tensor) -> Tensor:
+    return torch.diag_embed(acceleration.square()).expand_as(inverse) + (inverse * force.square()) @ inverse.mT
+
+
+ROUNDS = 12
+"""Most rounds of reweighting."""
+MOST_EVALUATIONS = 300
+"""Of the residuals in one round."""
+CONTENT = 0.01
+"""Two steps in a row that lower the objective by less than so many nats end a round."""
+PASSES = 20
+"""Over the noise of residuals, in each round, where unknown forces are left out."""
+LEAST_NOISE = 1e-6
+"""Noise that is this fraction of the residual at the start counts as none: the data are exact."""
+SETTLED = 1e-3
+"""Relative change of the noise level that ends them."""
+BEND = 1.5
+"""Standard deviations beyond which a robust residual counts by its absolute value."""
+OUTLYING = 3.0
+"""Standard deviations beyond which a robust residual is an outlier where levels of noise are sought."""
+MAD = 1.4826
+"""Median absolute deviation of a normal distribution -> its standard deviation."""
+
+Residual = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""x -> residuals (rows, nv) and Jacobian (rows, nv, k); of the prior (p,) and (p, k)."""
+Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""x and a step -> where it leads: x + step to first order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where least squares ended.
+
+    `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k) there, `noise` (nv,) in units of the residual, `weight`
+    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and the message of the search. `span`
+    (rows, nv, m) are orthonormal directions of whitened residuals that unknown forces have, None for none. `expected`
+    is by how many nats the first step of the last round was to lower the objective.
+    """
+
+    x: Float[np.ndarray, " k"]
+    residual: Float[np.ndarray, "rows nv"]
+    jacobian: Float[np.ndarray, "rows nv k"]
+    noise: Float[np.ndarray, " nv"]
+    weight: Float[np.ndarray, "rows nv"]
+    prior_information: Float[np.ndarray, "k k"]
+    evaluations: int
+    settled: bool
+    span: Float[np.ndarray, "rows nv m"] | None = None
+    expected: float = 0.0
+
+    @property
+    def white(self) -> Float[np.ndarray, "rows nv"]:
+        """Residuals over their noise, without what unknown forces explain."""
+        return without(self.residual / self.noise, self.span)
+
+    def weighted(self, time: Float[np.ndarray, " nv"] | float = 1.0) -> Float[np.ndarray, "n k"]:
+        """The Jacobian (rows nv, k) over the noise, for residuals of which one in so many rows is independent."""
+        scaled = without(self.jacobian / self.noise[:, None], self.span) * np.sqrt(self.weight / time)[..., None]
+        return scaled.reshape(-1, scaled.shape[-1])
+
+    @property
+    def information(self) -> Float[np.ndarray, "k k"]:
+        """Gauss-Newton curvature of the data, each residual weighted by its noise."""
+        return self.weighted().T @ self.weighted()
+
+
+def weighted_least_squares(
+    residual: Residual,
+    prior: Residual,
+    start: Float[np.ndarray, " k"],
+    bounds: tuple[np.ndarray, np.ndarray],
+    *,
+    longest: Float[np.ndarray, " k"] | float = np.inf,
+    robust: bool = False,
+    progress: Callable[[int, float], None] | None = None,
+    held: Float[np.ndarray, "rows m nv"] | None = None,
+    known: Float[np.ndarray, " nv"] | None = None,
+    evaluations: int = MOST_EVALUATIONS,
+    moved: Moved = np.add,
+) -> Fit:
+    """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
+
+    `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
+    are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count. `known`
+    is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps follow `moved`: residuals
+    that are as good as linear along it have no curved valleys, in which searches creep.
+    """
+    last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
+
+    def at(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not last or not np.array_equal(last[0][0], point):
+            last[:] = [(point.copy(), residual(point))]
+        return last[0][1]
+
+    low, high = bounds
+    x = np.clip(start, low, high)
+    r, jacobian = at(x)
+    some = slice(None) if held is None else np.unique(np.linspace(0, len(r) - 1, min(ROWS, len(r))).astype(int))
+    seen = None if held is None else held[some]
+    span = _span(held, np.ones(r.shape[1]))
+    noise, total, settled = _noise(r, robust, span) if known is None else known, 0, False
+    converged, expected = False, 0.0
+    floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
+    for round_number in range(1, ROUNDS + 1):
+        span = _span(held, noise)
+        point = partial(_point, at, prior, noise, robust, span)
+        x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved)
+        total += nfev
+        r, jacobian = at(x)
+        before = noise
+        # forces of contacts hide most of it at first
+        for _ in range(0 if known is not None else 1 if held is None else PASSES):
+            noise = np.maximum(noise * _noise(r[some] / noise, robust, _span(seen, noise)), floor)
+        if progress is not None:
+            progress(round_number, float(np.sqrt((without(r, _span(held, np.ones_like(noise))) ** 2).mean())))
+        settled = bool((abs(noise - before) <= SETTLED * before).all())
+        if settled:
+            break
+    span = _span(held, noise)
+    weight = _weights(without(r / noise, span), robust)
+    in_prior = prior(x)[1]
+    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, total, settled and converged, span, expected)
+
+
+def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:
+    """The part of every row that is orthogonal to these orthonormal columns (or zeros)."""
+    if span is None:
+        return values
+    flat = values.reshape(*values.shape[:2], -1)
+    return (flat - span @ (span.swapaxes(1, 2) @ flat)).reshape(values.shape)
+
+
+def _span(held: np.ndarray | None, noise: np.ndarray) -> np.ndarray | None:
+    """Orthonormal columns for the directions `held` of residuals over this noise."""
+    if held is None:
+        return None
+    return orthonormal_columns(held / noise)
+
+
+def orthonormal_columns(directions: Float[np.ndarray, "rows m nv"]) -> Float[np.ndarray, "rows nv m"]:
+    """Of the space of these independent rows, the last of which may be zeros."""
+    columns = np.linalg.qr(directions.swapaxes(1, 2))[0]
+    return columns * (directions != 0.0).any(-1)[:, None, : columns.shape[-1]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Cost, gradient and Gauss-Newton curvature (both halved) at x."""
+
+    x: np.ndarray
+    cost: float
+    gradient: np.ndarray
+    curvature: np.ndarray
+
+
+def _minimized(
+    point: Callable[[np.ndarray], _Point],
+    x: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    longest: np.ndarray | float,
+    most: int,
+    moved: Moved = np.add,
+) -> tuple[np.ndarray, int, bool, float]:
+    """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
+
+    Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
+    """
+    low, high = bounds
+    here, damping, idle, first = point(x), 1e-4, 0, None
+    for evaluation in range(1, most + 1):
+        held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
+        free = ~held
+        curvature = here.curvature[np.ix_(free, free)]
+        step = np.zeros_like(here.x)
+        diagonal = np.diag(curvature.diagonal() + 1e-12)
+        step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
+        step /= max(1.0, float((abs(step) / longest).max()))
+        step = np.clip(here.x + step, low, high) - here.x
+        expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
+        first = expected if first is None else first
+        if abs(expected) <= 1e-3 * CONTENT or idle == 2:
+            return here.x, evaluation, True, first
+        trial = point(moved(here.x, step))
+        gain = (here.cost - trial.cost) / abs(expected)
+        if trial.cost < here.cost:
+            idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
+            here = trial
+        elif damping > 1e12:  # rounding hides any descent
+            return here.x, evaluation, True, first
+        # Marquardt's rule: trust the quadratic model more where it was right, less where it was wrong
+        damping = max(0.2 * damping, 1e-12) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
+    return here.x, most, False, first or 0.0
+
+
+def _point(
+    at: Residual, prior: Residual, noise: np.ndarray, robust: bool, span: np.ndarray | None, x: np.ndarray
+) -> _Point:
+    bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
+    with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
+        try:
+            (r, jacobian), (prior_r, prior_jacobian) = at(x), prior(x)
+        except (np.linalg.LinAlgError, NumericalError):  # a mass matrix that rounding made singular
+            return bad
+        white = without(r / noise, span)
+        weight = _weights(white, robust)
+        cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
+        flat = without(jacobian if (noise == 1.0).all() else jacobian / noise[:, None], span)
+        flat = (flat * np.sqrt(weight)[..., None] if robust else flat).reshape(-1, len(x))
+        gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
+        curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
+        cost = float(cost + 0.5 * (prior_r**2).sum())
+    if not (np.isfinite(cost) and np.isfinite(curvature).all()):
+        return bad
+    return _Point(x, cost, gradient, curvature)
+
+
+def _weights(white: np.ndarray, robust: bool) -> np.ndarray:
+    """Derivative of the soft L1 loss 2 BEND^2 (sqrt(1 + z) - 1) in r^2, z = (r / BEND)^2; 1 for plain squares."""
+    return (1.0 + (white / BEND) ** 2) ** -0.5 if robust else np.ones_like(white)
+
+
+def _noise(r: np.ndarray, robust: bool, span: np.ndarray | None) -> np.ndarray:
+    left = 1.0 if span is None else np.sqrt(np.maximum(1.0 - (span**2).sum(-1).mean(0), 1e-9))
+    r = without(r, span)
+    scale = MAD * np.median(abs(r), axis=0) if robust else np.sqrt((r**2).mean(axis=0))
+    return np.maximum(scale / left, 1e-12)  # data that the start explains exactly
+
+
+def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.ndarray, " rows"]) -> np.ndarray:
+    """Rows that one independent residual is worth, per joint: 1 + 2 sum of autocorrelations until they turn negative.
+
+    Filtered signals have residuals that resemble their neighbours; without this factor standard errors are too small.
+    The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).
+    """
+    total = (residual**2).sum(0)
+    times = np.ones(residual.shape[1])
+    open_ = np.ones(residual.shape[1], dtype=bool)
+    for lag in range(1, len(residual) - 1, 2):
+        pair = np.zeros(residual.shape[1])
+        for shift in (lag, lag + 1):
+            same = episode[shift:] == episode[:-shift]
+            pair += (residual[shift:] * residual[:-shift] * same[:, None]).sum(0) / np.maximum(total, 1e-300)
+        open_ &= pair > 0.0
+        if not open_.any():
+            break
+        times += np.where(open_, 2.0 * pair, 0.0)
+    return times

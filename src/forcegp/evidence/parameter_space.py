@@ -1,0 +1,405 @@
+"""The numbers of a model that a fit estimates, as coordinates x of size 1: bodies, then coefficients of laws.
+
+A law adds ``-f(parameters; z)`` to the torque that a motion needs, and a rotor ``I a``. One unit of a coordinate is the
+typical size of its number in the log, or a factor of e for numbers on a log scale; ten times smaller is likely as well.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.linalg import block_diag
+from torch import Tensor
+
+from forcegp.errors import InvalidInput
+from forcegp.evidence.bodies import Bodies, with_bodies
+from forcegp.evidence.identifiability import body_names, carrying
+from forcegp.forces import JointLaw, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
+from forcegp.forces.parameters import Body
+from forcegp.forces.registry import force_name
+from forcegp.mechanics import State
+from forcegp.model import Model
+
+LINEAR_SPREAD = 10.0
+"""Standard deviation of the weak prior on numbers that are not logarithms, in their sizes: as large as the torques."""
+FARTHEST = 25.0
+"""Largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10."""
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One coefficient of a law: the entries of it that are estimated.
+
+    `joints` are their places in v, or None for a number that all directions share. value = size x, or size e^x with
+    `logarithm`; a priori x has the mean `center` and the standard deviation `spread`.
+    """
+
+    law: int
+    name: str
+    joints: tuple[int, ...] | None
+    size: Float[np.ndarray, " k"]
+    start: Float[np.ndarray, " k"]
+    center: Float[np.ndarray, " k"]
+    spread: Float[np.ndarray, " k"]
+    low: Float[np.ndarray, " k"]
+    high: Float[np.ndarray, " k"]
+    logarithm: bool
+
+    def values(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """In SI units."""
+        return self.size * (np.exp(x) if self.logarithm else x)
+
+    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Derivatives of the values in x."""
+        return self.values(x) if self.logarithm else self.size
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """A body to be estimated: that of the robot which moves with joint `body`, or a payload on `link`."""
+
+    name: str
+    body: int
+    reference: Float[np.ndarray, "4 4"]
+    """Pseudo-inertia where the search begins, in the frame of the body."""
+    prior: Body
+    payload: int | None = None
+    """The number of the force, for a payload."""
+    offset: Float[np.ndarray, "4 4"] | None = None
+    """The pose of its link in the frame of the body."""
+
+
+class ParameterSpace:
+    """The parameters of a model that are open: `Law.learned`, `RigidBodies.learn`, payloads without a mass.
+
+    Parameters
+    ----------
+    model: laws and priors; payloads are on links that are chosen already.
+    typical: sizes of "force", "position", "velocity" and "inertia" of each joint in the log, (nv,) each.
+    """
+
+    def __init__(self, model: Model, typical: Mapping[str, Float[np.ndarray, " nv"]]) -> None:
+        self.model, self.typical = model, typical
+        self.own = carrying(model.robot)
+        self.carried = tuple(_carried(model))
+        self.bodies = Bodies([each.reference for each in self.carried], [each.prior for each in self.carried])
+        self.terms = tuple(_terms(model, typical))
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self.bodies.size + sum(len(term.size) for term in self.terms)
+
+    def split(self, x: Float[np.ndarray, " k"]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Coordinates of bodies, and of each term."""
+        of_bodies, rest = x[: self.bodies.size], x[self.bodies.size :]
+        ends = np.cumsum([len(term.size) for term in self.terms])
+        return of_bodies, np.split(rest, ends[:-1]) if self.terms else []
+
+    def _joined(self, of_bodies: np.ndarray, of_terms: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate([of_bodies, *of_terms])
+
+    @property
+    def start(self) -> Float[np.ndarray, " k"]:
+        """Where the search begins."""
+        return self._joined(np.zeros(self.bodies.size), [term.start for term in self.terms])
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest coordinates."""
+        free = np.full(self.bodies.size, np.inf)
+        return self._joined(-free, [t.low for t in self.terms]), self._joined(free, [t.high for t in self.terms])
+
+    @property
+    def longest_steps(self) -> Float[np.ndarray, " k"]:
+        """Most that a coordinate should change at once: infinite for those that the torque is linear in."""
+        each = [np.full_like(term.size, 1.0 if term.logarithm else np.inf) for term in self.terms]
+        return self._joined(np.full(self.bodies.size, self.bodies.longest_step), each)
+
+    def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """Distance from the prior in its standard deviations, and its Jacobian."""
+        of_bodies, of_terms = self.split(x)
+        distance, jacobian = self.bodies.distance(of_bodies)
+        values = [(own - term.center) / term.spread for own, term in zip(of_terms, self.terms, strict=True)]
+        slopes = [1.0 / term.spread for term in self.terms]
+        return self._joined(distance, values), block_diag(jacobian, np.diag(np.concatenate([[], *slopes])))
+
+    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """x + step to first order, along which parameters of bodies are straight (`Bodies.moved`)."""
+        count = self.bodies.size
+        return np.concatenate([self.bodies.moved(x[:count], step[:count]), x[count:] + step[count:]])
+
+    # --- what the coordinates are
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers that people read, in the order of `numbers`."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Name, unit, start and prior of each number: ten of a body, and every entry of a coefficient."""
+        stated = self._joined(np.zeros(self.bodies.size), [term.center for term in self.terms])
+        robot, starts = self.model.robot, self.numbers(stated)
+        out, place = [], 0
+        for each in self.carried:
+            for name, unit in self.bodies.quantities:
+                out.append(Parameter(f"{each.name}.{name}", unit, float(starts[place]), each.prior))
+                place += 1
+        for term in self.terms:
+            law = self.model.laws[term.law]
+            own = force_title(law)
+            label = own if len(law.coefficients) == 1 else f"{own}.{term.name}"
+            joints = [None] if term.joints is None else [robot.joint_names[j] for j in term.joints]
+            for k, joint in enumerate(joints):
+                unit = law.coefficients[term.name].unit if joint is None else law.unit(term.name, joint, robot)
+                kind = LogNormal if term.logarithm else Normal
+                center = term.values(term.center)[k]
+                spread = term.spread[k] if term.logarithm else term.spread[k] * term.size[k]
+                name = label if joint is None else f"{label}.{joint}"
+                out.append(Parameter(name, unit, float(starts[place]), kind(float(center), float(spread))))
+                place += 1
+        return tuple(out)
+
+    def numbers(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"]:
+        """What people read: mass, centre of mass and inertia about it of bodies, then coefficients, in SI units.
+
+        Rotor inertias include those that the robot has.
+        """
+        of_bodies, of_terms = self.split(x)
+        values = [self.bodies.numbers(of_bodies, self._frames)]
+        for own, term in zip(of_terms, self.terms, strict=True):
+            value = term.values(own)
+            if type(self.model.laws[term.law]).__name__ == "Rotor":
+                value = value + self.model.robot.armature.cpu().numpy()[list(term.joints or ())]
+            values.append(value)
+        return np.concatenate(values)
+
+    def number_slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n k"]:
+        """Derivatives of the numbers in the coordinates."""
+        of_bodies, of_terms = self.split(x)
+        slopes = [term.slopes(own) for own, term in zip(of_terms, self.terms, strict=True)]
+        return block_diag(self.bodies.number_slopes(of_bodies, self._frames), np.diag(np.concatenate([[], *slopes])))
+
+    @cached_property
+    def _frames(self) -> Float[np.ndarray, "n 4 4"]:
+        """Poses, in the frame of the body, of the axes in which its numbers are told."""
+        return np.array([np.eye(4) if x.offset is None else x.offset for x in self.carried]).reshape(-1, 4, 4)
+
+    # --- what the model is at x
+
+    def standard_parameters(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10"]:
+        """Of the bodies that are estimated."""
+        return self.bodies.parameters(x[: self.bodies.size])
+
+    def values(self, x: Float[np.ndarray, " k"]) -> dict[int, dict[str, Tensor]]:
+        """Coefficients of the laws that are estimated, by number of the law."""
+        out: dict[int, dict[str, Tensor]] = {}
+        for own, term in zip(self.split(x)[1], self.terms, strict=True):
+            law = self.model.laws[term.law]
+            named = out.setdefault(term.law, {name: self._whole(law, name) for name in law.coefficients})
+            value = torch.as_tensor(term.values(own), device=self.model.robot.device)
+            if term.joints is None:
+                named[term.name] = value[0]
+            else:
+                named[term.name] = named[term.name].index_copy(0, self._places(term), value)
+        return out
+
+    def _places(self, term: Term) -> Tensor:
+        return torch.tensor(term.joints, device=self.model.robot.device)
+
+    def _whole(self, law: Law, name: str) -> Tensor:
+        """A coefficient with one value per joint, those that are not estimated as they are."""
+        value = law.values[name].to(self.model.robot.device)
+        return value.expand(self.model.robot.nv).clone() if isinstance(law, JointLaw) else value
+
+    def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
+        """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""
+        values, robot = self.values(x), self.model.robot
+        pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list(self.model.laws)
+        for index, named in values.items():
+            laws[index] = laws[index].with_values(named)
+        wanted = {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}
+        if wanted:
+            robot = with_bodies(robot, wanted)
+        for k, each in enumerate(self.carried):
+            if each.payload is not None:
+                laws[each.payload] = self._payload(each, pseudo[k])
+        closed = (replace(law, learn=()) if isinstance(law, RigidBodies) else law for law in laws)
+        return replace(self.model, robot=robot, forces=(*closed, *self.model.unknown_forces))
+
+    def _payload(self, each: Carried, pseudo: Float[np.ndarray, "4 4"]) -> Payload:
+        assert each.offset is not None, "it is a payload"
+        assert each.payload is not None, "it is a payload"
+        there = np.linalg.inv(each.offset)
+        mass, center, inertia = self.bodies.physical(there @ pseudo @ there.T)
+        given = self.model.laws[each.payload]
+        assert isinstance(given, Payload), "its number is that of a payload"
+        return replace(given, mass=float(mass), center_of_mass=tuple(center), inertia=tuple(map(tuple, inertia)))
+
+    # --- what they do
+
+    @property
+    def under_load(self) -> bool:
+        """Whether a law that is estimated depends on the torque of the actuators."""
+        return any(self.model.laws[term.law].under_load for term in self.terms)
+
+    def torque(
+        self, x: Float[np.ndarray, " k"], state: State, a: Float[np.ndarray, "rows nv"], cache: dict[Any, Any]
+    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
+        """What the laws add to the torque of a motion, and the derivatives in their coordinates (without bodies).
+
+        `cache` holds features and directions of these states, which no coordinate changes.
+        """
+        count = self.size - self.bodies.size
+        total, jacobian = np.zeros_like(a), np.zeros((*a.shape, count))
+        values, of_terms, column = self.values(x), self.split(x)[1], 0
+        for index, law in self._estimated.items():
+            terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
+            basis = law.inertia_basis(self.model.robot)
+            if basis is not None:
+                moved = np.einsum("pij,nj->nip", basis.cpu().numpy(), a)
+                total += moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
+                derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
+            else:
+                if index not in cache:
+                    cache[index] = law.features(state), law.direction(state)
+                force, derivatives = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
+                total -= force
+            for (own, term), derivative in zip(terms, derivatives, strict=True):
+                width = len(term.size)
+                jacobian[..., column : column + width] = derivative * term.slopes(own)
+                column += width
+        return total, jacobian
+
+    @cached_property
+    def _estimated(self) -> dict[int, Law]:
+        return {index: self.model.laws[index] for index in dict.fromkeys(term.law for term in self.terms)}
+
+    def is_estimated(self, law: Law) -> bool:
+        """Whether coefficients of this law are among the coordinates."""
+        return any(law is each for each in self._estimated.values())
+
+    def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
+        """What the rotors that are estimated add to the mass matrix."""
+        total = np.zeros((self.model.robot.nv,) * 2)
+        values = self.values(x)
+        for index, law in self._estimated.items():
+            basis = law.inertia_basis(self.model.robot)
+            if basis is not None:
+                inertia = values[index][next(iter(law.coefficients))]
+                total += np.tensordot(inertia.cpu().numpy(), basis.cpu().numpy(), 1)
+        return total
+
+
+def force_title(law: Law) -> str:
+    """What parameters of a law are called by."""
+    try:
+        return force_name(law)
+    except InvalidInput:
+        return law.title
+
+
+def _derivatives(
+    law: Law, values: Mapping[str, Tensor], terms: Sequence[Term], features: tuple[Tensor, ...], B: Tensor | None
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The force (rows, nv) and, of minus that, derivatives in every entry of each term (rows, nv, k)."""
+    rows = features[0].shape[:-1]
+    wanted = {term.name for term in terms}
+    numbers = {
+        name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()
+    }
+    with torch.enable_grad():
+        # a number that all directions share has no last dimension to broadcast along
+        given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}
+        amplitude = law.amplitude(features, given)
+        out = []
+        for term in terms:
+            if term.joints is not None:  # amplitude j depends on entry j alone
+                slope = torch.autograd.grad(amplitude.sum(), numbers[term.name], retain_graph=True)[0]
+                places = list(term.joints)
+                each = torch.zeros(*rows, amplitude.shape[-1], len(places), dtype=slope.dtype, device=slope.device)
+                each[..., places, range(len(places))] = slope[..., places]
+            else:
+                parts = [
+                    torch.autograd.grad(amplitude[..., k].sum(), numbers[term.name], retain_graph=True)[0]
+                    for k in range(amplitude.shape[-1])
+                ]
+                each = torch.stack(parts, dim=-1)[..., None]
+            out.append(-(each if B is None else B @ each).cpu().numpy())
+    amplitude = amplitude.detach()
+    force = amplitude if B is None else (B @ amplitude[..., None])[..., 0]
+    return force.cpu().numpy(), out
+
+
+def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
+    robot, out = model.robot, []
+    singles = np.flatnonzero(np.isin(robot.joint_names, robot.single_joint_names))
+    for index, law in enumerate(model.laws):
+        for name in law.learned:
+            coefficient, given = law.coefficients[name], getattr(law, name)
+            per_joint = isinstance(law, JointLaw)
+            joints = singles if per_joint else np.zeros(1, dtype=int)
+            size = coefficient.size(typical)[joints]
+
+            def of(value: Any, joints: np.ndarray = joints, per_joint: bool = per_joint) -> np.ndarray:
+                array = np.asarray(torch.as_tensor(value).detach().cpu(), dtype=np.float64)
+                return (np.broadcast_to(array, (robot.nv,))[joints] if per_joint else array.reshape(1)).copy()
+
+            logarithm = coefficient.logarithm or isinstance(given, LogNormal)
+            low, high = np.full_like(size, coefficient.lowest), np.full_like(size, coefficient.highest)
+            if logarithm:
+                spread, start = np.ones_like(size), np.zeros_like(size)
+                low, high = (np.log(np.maximum(x, 1e-300)) for x in (low, high))
+                if not coefficient.logarithm:
+                    low, high = np.full_like(size, -FARTHEST), np.full_like(size, FARTHEST)
+                if isinstance(given, LogNormal):
+                    size = size if coefficient.logarithm else of(given.median)
+                    start, spread = np.log(of(given.median) / size), of(given.spread)
+                elif isinstance(given, Normal):
+                    start = np.log(of(given.mean) / size)
+                    spread = spread if given.std is None else of(given.std) / of(given.mean)
+                center = start
+            else:
+                if coefficient.unit != "1":
+                    low, high = low / size, high / size
+                else:
+                    low, high = low / coefficient.factor, high / coefficient.factor
+                center, start, spread = np.zeros_like(size), np.ones_like(size), np.full_like(size, LINEAR_SPREAD)
+                if isinstance(given, Normal):
+                    center = start = of(given.mean) / size
+                    spread = spread if given.std is None else of(given.std) / size
+            open_ = spread > 0.0
+            start = np.clip(start, low, high)
+            size, start, center, spread, low, high = (x[open_] for x in (size, start, center, spread, low, high))
+            places = tuple(joints[open_].tolist()) if per_joint else None
+            if open_.any():
+                out.append(Term(index, name, places, size, start, center, spread, low, high, logarithm))
+    return out
+
+
+def _carried(model: Model) -> list[Carried]:
+    robot, layout = model.robot, model.robot.layout
+    own, out = carrying(robot), []
+    named = dict(zip(own, body_names(robot), strict=True))
+    for index, law in enumerate(model.laws):
+        if isinstance(law, RigidBodies):
+            from forcegp.evidence.identifiability import body_pseudo_inertias
+
+            references = dict(zip(own, body_pseudo_inertias(robot).cpu().numpy(), strict=True))
+            for body, prior in law.bodies(own, robot).items():
+                if body not in references:
+                    raise InvalidInput(f"the body of joint {layout.bodies[body].name!r} has no mass; give it one.")
+                out.append(Carried(named[body], body, references[body], prior))
+        elif isinstance(law, Payload) and not law.known:
+            assert law.link is not None, "its link is chosen before"
+            body = layout.links[law.link].body
+            offset = np.linalg.inv(layout.child_frames[body]) @ layout.links[law.link].offset
+            titles = [isinstance(x, Payload) and not x.known for x in model.laws]
+            name = "payload" if sum(titles) == 1 else f"payload.{law.link}"
+            out.append(Carried(name, body, law.usual(offset), law.prior, index, offset))
+    return out

@@ -1,0 +1,322 @@
+"""Rows of a recording as least squares sees them: residuals of torque or acceleration, with exact Jacobians.
+
+With the standard parameters pi of the bodies, the laws that are estimated t(x; v, a) and the forces Q that are given,
+
+    torque           r = Y(q, v, a) pi + M_0 a + t(x; v, a) - Q
+    acceleration     r = a - a^,    a^ = (M(pi) + M_0 + M_t(x))^-1 (Q - bias(pi) - t(x; v, 0))
+
+where M_0 is the inertia of what is listed and not estimated. Differentiating M a^ = Q - bias - t,
+
+    dr/dpi = M^-1 Y(q, v, a^),    dr/dx = M^-1 dt/dx (v, a^).
+
+Feet that stand, closed loops and wheels add A^T lambda to Q, with A a = b and unknown lambda. Accelerations are then
+those of Gauss' principle, and H stands in the place of M^-1. Of the torques only the part that is orthogonal to the
+rows of A, row by row of the recording, is an equation without lambda.
+
+Friction g(x; v) |u| under load makes u the solution of u = z + g |u|, with z all other terms:
+
+    u = z / (1 - g s),    s = sign z = sign u for |g| < 1,    du/dx = (dz/dx + u s dg/dx) / (1 - g s).
+
+The measured |u| in its place would explain the measured torque by itself: g tends to 1, whatever the robot is.
+
+Where a and u are both noisy, the a* that was there is unknown as well. Over it, (e_a / sigma_a)^2 + (e_F / sigma_F)^2
+is least at
+
+    r^T S^-1 r,    S = M diag(sigma_a^2) M^T + diag(sigma_F^2),    a* = a - diag(sigma_a^2) M^T S^-1 r
+
+(errors in variables: Fuller, "Measurement Error Models", 1987, section 3.2). As S changes with pi, its derivative in pi
+is 2 Y(q, v, a*)^T S^-1 r. Least squares of torque take Y(q, v, a) there, whose noise draws inertias to zero: without a
+bound where rows are homogeneous in them, as those of a base without actuators are. Where contacts hold, A a* = b: a and
+its covariance are those under that condition.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.evidence.identifiability import standard_parameters
+from forcegp.evidence.least_squares import BEND, NoiseLevels, orthonormal_columns, without
+from forcegp.evidence.parameter_space import ParameterSpace
+from forcegp.forces import Law, RigidBodies
+from forcegp.forces.thrusters import OBSERVED
+from forcegp.mechanics import Contact, Held, LoopClosure, RollingContact, State
+from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
+from forcegp.model import Model
+
+
+def motion_residuals(
+    dataset: Dataset, model: Model
+) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
+    """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
+
+    What A^T lambda can explain, the forces of feet that stand, of loops and of wheels, is left out of the force
+    residual; under contacts that slide it holds the contact forces as well. Under friction that grows with |u| it is
+    what the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u|
+    shrinks the residual of any model.
+    """
+    require_type("dataset", dataset, Dataset)
+    q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=model.robot.device) for x in ("q", "v", "u", "a"))
+    dynamics = model.dynamics(q, v, u)
+    force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]
+    for friction in model.laws:
+        if friction.under_load:
+            ones, delivered = torch.ones_like(a), dynamics.state.delivered
+            idle, loaded = (friction.force(_under_load(dynamics.state, load)) for load in (0.0 * ones, ones))
+            without_load = delivered + (loaded - idle) * delivered.abs() - force  # z = u - g |u| - force
+            force = dynamics.state.delivered - without_load / (1.0 + (loaded - idle) * without_load.sign())
+    if model.contacts and not any(slides(contact) for contact in model.contacts):
+        held, _ = independent_rows(dynamics.A.cpu().numpy(), dynamics.b.cpu().numpy())
+        return without(force.cpu().numpy(), held.swapaxes(1, 2)), (a - dynamics.acceleration_map().offset).cpu().numpy()
+    return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
+
+
+def residual_scores(
+    force: Float[np.ndarray, "rows nv"], acceleration: Float[np.ndarray, "rows nv"], dataset: Dataset
+) -> dict[str, list[float]]:
+    """Per joint: rms of both residuals, and that of the acceleration over its standard deviation (nRMSE)."""
+    rms = np.sqrt((acceleration**2).mean(0))
+    spread = dataset.a.std(0)
+    return {
+        "force_rms": np.sqrt((force**2).mean(0)).tolist(),
+        "acceleration_rms": rms.tolist(),
+        "acceleration_nrmse": np.divide(rms, spread, out=np.full_like(rms, np.nan), where=spread > 0.0).tolist(),
+    }
+
+
+def _under_load(state: State, load: Tensor) -> State:
+    """The state with actuators that deliver these joint forces."""
+    return replace(state, delivered_by=lambda _: load)
+
+
+FIRST = 1e-2
+"""Of the root mean square of the residual forces, what rough searches take for noise of forces."""
+Positions = Float[np.ndarray, "rows nq"]
+Rows = Float[np.ndarray, "rows nv"]
+Inputs = Float[np.ndarray, "rows nu"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Accelerations of the rows, and the torque that they need, but for what is estimated.
+
+    `regressor` are derivatives in the standard parameters of the bodies that are estimated, `fixed` the torque of all
+    others and of inertias that are given, less the given forces.
+    """
+
+    a: Rows
+    regressor: Float[np.ndarray, "rows nv n 10"]
+    fixed: Rows
+
+
+class RecordedRows:
+    """States of one log of a model, the given forces there, and the terms of the equation of motion.
+
+    `loaded` tells whether payloads that are estimated were there. Contacts that slide are refused unless `any_contact`.
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        q: Positions,
+        v: Rows,
+        u: Inputs,
+        loaded: bool = True,
+        any_contact: bool = False,
+    ) -> None:
+        model, robot = space.model, space.model.loaded_robot
+        at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
+        self.space, self.loaded, self.v = space, loaded, np.array(v)
+        self.state = model.state(at_q, at_v, at_u)
+        self.kinematics = self.state.kinematics
+        self.delivered = self.state.delivered.cpu().numpy()
+        self.load = abs(self.delivered)
+        A, b, _ = model.constraint(self.state)
+        self.held, self.right = independent_rows(A.cpu().numpy(), b.cpu().numpy())
+        """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
+        self.force, self.inertia = np.zeros_like(self.v), np.zeros((robot.nv, robot.nv))
+        for force in kept_laws(space, any_contact):
+            self.force = self.force + force.force(self.state).detach().cpu().numpy()
+            added = force.added_inertia(robot)
+            self.inertia = self.inertia + (0.0 if added is None else added.detach().cpu().numpy())
+        self._armature = np.diag(robot.armature.cpu().numpy())
+        self._carriers = [each.body for each in space.carried]
+        self._there = np.array([1.0 if each.payload is None or loaded else 0.0 for each in space.carried])
+        # standard parameters of bodies that are not estimated; those of a payload come on top
+        self._stated = np.zeros((len(robot.layout.bodies), 10))
+        self._stated[space.own] = standard_parameters(robot).reshape(-1, 10).cpu().numpy()
+        own = [each.body for each in space.carried if each.payload is None]
+        self._stated[own] -= (
+            standard_parameters(model.robot).reshape(-1, 10).cpu().numpy()[[space.own.index(body) for body in own]]
+        )
+        self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
+
+    def moving(self, a: Rows) -> Motion:
+        """These rows with these accelerations."""
+        a = np.array(a)
+        Y = self.kinematics.torque_regressor(torch.as_tensor(a, device=self.kinematics.robot.device)).cpu().numpy()
+        fixed = Y.reshape(*a.shape, -1) @ self._stated.ravel() + a @ (self.inertia + self._armature) - self.force
+        return Motion(a, Y[:, :, self._carriers] * self._there[:, None], fixed)
+
+    def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
+        """The part of joint forces (first axis after the rows) that no lambda can explain."""
+        return without(values, self.held.swapaxes(1, 2))
+
+    def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Torque of the laws that are estimated and its derivatives, under the measured load or one that is given."""
+        measured = self.load if load is None else np.full_like(self.load, load)
+        state = _under_load(self.state, torch.as_tensor(measured, device=self.state.q.device))
+        return self.space.torque(x, state, a, self._caches[load])
+
+    def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Residual (rows, nv), derivatives in standard parameters and in x of the laws, and du/dz (rows, nv)."""
+        parameters = self.space.standard_parameters(x)
+        rigid = motion.fixed + motion.regressor.reshape(*motion.a.shape, -1) @ parameters.ravel()
+        if not self.space.under_load:
+            torque, in_x = self._terms(x, motion.a, 0.0)
+            return rigid + torque, motion.regressor, in_x, np.ones_like(self.v)
+        (torque, in_x), (loaded, loaded_in_x) = (self._terms(x, motion.a, load) for load in (0.0, 1.0))
+        z, g = rigid + torque + self.delivered, loaded - torque
+        sign = np.sign(z)
+        left = 1.0 - g * sign
+        u = z / left
+        in_x = (in_x + (u * sign)[..., None] * (loaded_in_x - in_x)) / left[..., None]
+        return u - self.delivered, motion.regressor / left[..., None, None], in_x, 1.0 / left
+
+    def acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """a^ (rows, nv), the mass matrices and H (rows, nv, nv). Raises NumericalError where a matrix is singular."""
+        given = self._stated.copy()
+        np.add.at(given, self._carriers, self.space.standard_parameters(x) * self._there[:, None])
+        parts = self.kinematics.dynamics_of_bodies(torch.as_tensor(given, device=self.kinematics.robot.device))
+        M, bias = (part.cpu().numpy() for part in parts)
+        M = M + self.inertia + self.space.added_inertia(x)
+        torque, _ = self._terms(x, np.zeros_like(self.v))
+        A, idle = self.held, np.logical_not(self.held.any(axis=-1))
+        try:
+            H = np.linalg.inv(M)
+            through = A @ H
+            among = through @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
+            lifted = np.linalg.solve(among, np.concatenate([through, self.right[..., None]], axis=-1))
+        except np.linalg.LinAlgError:
+            raise NumericalError(
+                "the mass matrix of the estimates is singular at a row; check the robot's file."
+            ) from None
+        acceleration = (through.swapaxes(1, 2) @ lifted[..., -1:])[..., 0]
+        H = H - through.swapaxes(1, 2) @ lifted[..., :-1]
+        return acceleration + (H @ (self.force - bias - torque)[..., None])[..., 0], M, H
+
+    def in_acceleration(self, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residual a - a^ and its derivatives, as `in_torque`."""
+        predicted, _, H = self.acceleration(x)
+        Y = self.moving(predicted).regressor
+        _, in_x = self._terms(x, predicted)
+        return a - predicted, (H @ Y.reshape(*predicted.shape, -1)).reshape(Y.shape), H @ in_x
+
+    def rough_noise(self, x: np.ndarray, a: Rows) -> NoiseLevels:
+        """With which all residuals are noise of accelerations.
+
+        So starts of all searches are: forces that nothing measures would explain any mass of a base there.
+        """
+        predicted, M, _ = self.acceleration(x)
+        residual = a - predicted
+        force = FIRST * np.sqrt(((M @ residual[..., None]) ** 2).mean((0, 2))).clip(1e-12)
+        return NoiseLevels(np.sqrt((residual**2).mean(0)).clip(1e-12), force)
+
+    def likely(
+        self, x: np.ndarray, measured: Motion, noise: NoiseLevels, robust: bool = False
+    ) -> "LikelyAccelerations":
+        """What was there where a and u are noisy, by the estimates at x and these levels of noise.
+
+        With `robust`, rows beyond what these levels explain count less, by the Cauchy loss log(1 + (rms / BEND)^2).
+        Forces of joints that nothing measures, as those of a base, belong to a*, since they move the robot.
+        """
+        _, M, H = self.acceleration(x)
+        needed, _, _, in_z = self.in_torque(x, measured)
+        M, a, robot = in_z[..., None] * M, measured.a, self.space.model.robot
+        of_joints = np.isin(robot.joint_names, robot.single_joint_names)
+        e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
+        A, idle = self.held, np.logical_not(self.held.any(axis=-1))
+        at_contacts = A @ e_a
+        among = at_contacts @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
+        gain = np.linalg.solve(among, at_contacts).swapaxes(1, 2)
+        moved = (gain @ (self.right[..., None] - A @ a[..., None]))[..., 0]
+        e_a = e_a - gain @ at_contacts
+        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
+        pushed = A * in_z[:, None]  # directions of contact forces; without them S is singular where contacts hold
+        S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * pushed.swapaxes(1, 2) @ pushed
+        whitening = np.linalg.inv(np.linalg.cholesky(S))
+        whitening = without(whitening, orthonormal_columns(pushed @ whitening.swapaxes(1, 2)))
+        at_contact = needed + (M @ moved[..., None])[..., 0]
+        white = whitening @ at_contact[..., None]
+        weighted = whitening.swapaxes(1, 2) @ white
+        there = self.moving(a + moved - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0])
+        if robust:  # of whole rows, since Y(a*) is the slope of their squares, not of single entries
+            equations = a.shape[1] - self.held.any(-1).sum(1)
+            mean_square = (white**2).sum((1, 2)) / np.maximum(equations, 1)
+            whitening = whitening / np.sqrt(1.0 + mean_square / BEND**2)[:, None, None]
+        return LikelyAccelerations(there, at_contact - self.in_torque(x, there)[0], whitening)
+
+
+@dataclass(frozen=True, eq=False)
+class LikelyAccelerations:
+    """Motions with the accelerations a* where a and u are noisy.
+
+    `offset` (rows, nv) are the forces that the measured a needs, once it obeys the contacts, less those of a*.
+    `whitening` (rows, nv, nv) are L^-1 with S = L L^T, without the directions of contact forces.
+    """
+
+    motion: Motion
+    offset: Rows
+    whitening: Float[np.ndarray, "rows nv nv"]
+
+    @cached_property
+    def white_regressor(self) -> Float[np.ndarray, "rows nv n 10"]:
+        """`white` of the regressor; the same wherever a search is."""
+        return self.white(self.motion.regressor)
+
+    def white(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
+        """Derivatives of forces as those of whitened residuals."""
+        return (self.whitening @ values.reshape(*self.motion.a.shape, -1)).reshape(values.shape)
+
+
+def kept_laws(space: ParameterSpace, any_contact: bool = False) -> tuple[Law, ...]:
+    """Laws not estimated, less the bias and what an observer found.
+
+    Raises InvalidInput for models without a bias, and for contacts that slide.
+    """
+    model = space.model
+    sliding = ", ".join(dict.fromkeys(contact.frame for contact in model.contacts if slides(contact)))
+    if sliding and not any_contact:
+        raise InvalidInput(
+            f"the robot touches something with {sliding} and slides on it, with friction that is not measured; "
+            "learn from a motion in the air (model.with_contacts([])), or give the model an unknown force there."
+        )
+    if model.carries_known_forces:
+        raise InvalidInput("the forces lack RigidBodies(); list it, since without gravity no number can be estimated.")
+    skipped: Sequence[type[Law]] = (RigidBodies, *OBSERVED)
+    return tuple(law for law in model.laws if type(law) not in skipped and not space.is_estimated(law))
+
+
+def slides(contact: Contact) -> bool:
+    """Whether friction can act along the contact: on a surface, other than at held points, loops and wheels."""
+    return not isinstance(contact, LoopClosure | RollingContact) and not isinstance(contact.surface, Held)
+
+
+def independent_rows(
+    A: Float[np.ndarray, "rows m nv"], b: Float[np.ndarray, "rows m"]
+) -> tuple[Float[np.ndarray, "rows r nv"], Float[np.ndarray, "rows r"]]:
+    """``A a = b`` with orthonormal rows, r of the largest rank; of smaller ranks the last ones are zero."""
+    if not A.shape[1]:
+        return A, b
+    left, sizes, right = np.linalg.svd(A, full_matrices=False)
+    counts = sizes > REDUNDANCY_TOLERANCE * np.maximum(sizes[:, :1], np.finfo(np.float64).tiny)
+    most = int(counts.sum(1).max())
+    scaled = (left.swapaxes(1, 2) @ b[..., None])[..., 0] / np.where(counts, sizes, 1.0)
+    return (right * counts[..., None])[:, :most], (scaled * counts)[:, :most]

@@ -1,0 +1,5 @@
+"""`fit`: the numbers and functions of a model, found from a log."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

@@ -1,0 +1,285 @@
+"""What data cannot teach a prior, and whether they bear out the contacts: checked before anything is fitted."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.data import Dataset, contact_doubts
+from forcegp.errors import ContactWarning, DataWarning, InvalidInput
+from forcegp.evidence.contacts import FAR_FROM_SURFACE
+from forcegp.evidence.likelihood import MarginalLikelihood, checked_values
+from forcegp.evidence.parameter_space import force_title
+from forcegp.evidence.training_data import CONSTANT
+from forcegp.forces import JointLaw, Law, Normal, Offset
+from forcegp.mechanics import State
+from forcegp.model import Model
+from forcegp.summary import listed
+
+INVISIBLE = 1e-9
+"""|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
+ROUNDING = 1e-12
+"""|M^-1 B_c| relative to the largest of them below which a latent moves nothing."""
+EQUAL = 1e-9
+"""Relative difference of two latents' effects and features below which they are the same."""
+
+LEFT_OUT = 0.1
+"""Share of what the known forces do that may lie where no latent acts, without a word."""
+SPAN = 1e-9
+"""Singular values of unit effects relative to the largest below which they are one effect fewer."""
+ROWS_LOOKED_AT = 500
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, DataWarning, stacklevel=6)
+
+
+def check_forces(likelihood: MarginalLikelihood, known: Model | None = None) -> None:
+    """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
+
+    Raises InvalidInput if the prior gives other shapes or types than it should, if no latent changes the acceleration
+    at any training point, if all of one term do nothing at all, if all features of a latent are constant (a tool or
+    joint that never moves), and if latents of two terms do the same in every row. Warns (DataWarning) of single
+    features that are constant, of latents that move nothing or that the constraint hides while others show, and, where
+    the model leaves out forces that are `known`, of those that no latent can take over.
+    """
+    dynamics = likelihood.dynamics
+    B, features = checked_values(likelihood.model.unknown, dynamics)
+    names = likelihood.model.unknown.latent_names(likelihood.model.robot)
+    if not names:
+        return
+    _check_features(likelihood, names, features)
+    effect = dynamics.H @ B
+    slices = likelihood.model.unknown.slices(likelihood.model.robot)
+    terms = [number for number, which in enumerate(slices) for _ in range(which.stop - which.start)]
+    shows = _check_visible(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
+    _check_distinct(names, terms, shows, effect, likelihood.standardization(features))
+    if known is not None and likelihood.model.carries_known_forces and not known.carries_known_forces:
+        rows = likelihood.training
+        with torch.no_grad():
+            Q_K = known.to(rows.q.device).dynamics(rows.q, rows.v, rows.u).Q_K
+        _check_known_forces(effect, (dynamics.H @ Q_K[..., None])[..., 0])
+
+
+def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
+    robot = likelihood.model.robot
+    labels = likelihood.model.unknown.feature_names(robot)
+    scalings = likelihood.model.unknown.scalings(robot)
+    idle: dict[tuple[str, ...], list[str]] = {}
+    for index, (name, z) in enumerate(zip(names, features, strict=True)):
+        if not z.shape[-1]:
+            continue
+        spread = z.var(0, correction=0).sqrt()
+        constant = spread <= CONSTANT * (1.0 + z.mean(0).abs())
+        known = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
+        which = tuple(label for label, flat in zip(known, constant.tolist(), strict=True) if flat)
+        if bool(constant.all()):
+            values = ", ".join(f"{value:.4g}" for value in z[0].tolist()[:4])
+            raise InvalidInput(
+                f"latent {name!r} depends on {', '.join(which)}, which is the same in all {len(z)} training rows "
+                f"({values}), so its function cannot be learned; give data in which it changes, or leave this "
+                "prior (or this joint) out"
+            )
+        ways = scalings[index]
+        if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
+            idle.setdefault(which, []).append(name)
+    for which, latents in idle.items():
+        _warn(
+            f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} depends "
+            "on it; leave that input out (inputs=...), or give data in which it changes"
+        )
+
+
+def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> list[bool]:
+    """Which latents show; `free` is what each would do without the contacts, `effect` what it does (N, nv, C)."""
+    size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
+    absent = (size <= ROUNDING * size.max()).tolist()
+    for term in set(terms):
+        own = [index for index, number in enumerate(terms) if number == term]
+        if all(absent[index] for index in own):
+            raise InvalidInput(
+                f"{_few([names[index] for index in own])} exerts no force at any training row; check frame, point and "
+                "contact of the prior, or leave it out"
+            )
+    if any(absent):
+        _warn(
+            f"{_few([name for name, nothing in zip(names, absent, strict=True) if nothing])} moves no joint at any "
+            "training row, so its posterior is its prior; give data in other postures, or leave it out "
+            "if the prior can do without"
+        )
+    hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
+    blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
+    remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
+    shows = [not (nothing or flat) for nothing, flat in zip(absent, hidden, strict=True)]
+    if not any(shows):
+        raise InvalidInput(
+            f"no data can identify {_few(blind)}: the contacts take the whole force, and the acceleration shows none "
+            f"of it; {remedy}"
+        )
+    if blind:
+        _warn(
+            f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
+            f"its posterior and that of the normal force are the prior; {remedy}"
+        )
+    return shows
+
+
+def _check_distinct(
+    names: Sequence[str], terms: Sequence[int], shows: Sequence[bool], effect: Tensor, features: Sequence[Tensor]
+) -> None:
+    """Latents of two terms with the same effect on the same features are one function; data see only their sum."""
+    columns = effect.flatten(0, 1)
+    norms = torch.linalg.vector_norm(columns, dim=0)
+    cosines = (columns.mT @ columns) / torch.outer(norms, norms).clamp_min(torch.finfo(columns.dtype).tiny)
+    for first, second in torch.nonzero(torch.triu(cosines.abs() > 1.0 - EQUAL, diagonal=1)).tolist():
+        one, other = features[first], features[second]
+        if terms[first] == terms[second] or not (shows[first] and shows[second]):
+            continue  # joints that the constraint couples; one prior makes its own latents independent
+        if one.shape == other.shape and bool(((one - other).abs() <= EQUAL * (1.0 + one.abs())).all()):
+            raise InvalidInput(
+                f"no data can separate {names[first]!r} and {names[second]!r}: both act in the same direction and "
+                "depend on the same inputs; leave one of them out"
+            )
+
+
+def _check_known_forces(effect: Tensor, known: Tensor) -> None:
+    """Whether the latents act where the known forces do: the part of `known` (N, nv) outside the span of `effect`."""
+    step = -(-len(known) // ROWS_LOOKED_AT)
+    effect, known = effect[::step], known[::step]
+    columns = effect / torch.linalg.vector_norm(effect, dim=-2, keepdim=True).clamp_min(torch.finfo(effect.dtype).tiny)
+    carried = (columns @ (torch.linalg.pinv(columns, rtol=SPAN) @ known[..., None]))[..., 0]
+    size = float(known.square().sum().sqrt())
+    share = float((known - carried).square().sum().sqrt()) / size if size > 0.0 else 0.0
+    if share > LEFT_OUT:
+        _warn(
+            f"without laws the unknown forces carry gravity, actuation and all else, but {share:.0%} of the "
+            "acceleration that these cause lies where none of them acts; give the model its laws, or add a force on "
+            "every joint, JointForces()"
+        )
+
+
+def _few(names: Sequence[str]) -> str:
+    return listed(map(repr, names))
+
+
+def warn_of_contacts(model: Model, dataset: Dataset) -> None:
+    """Warn where rows contradict the contacts, which a model would learn away as a force (`contact_doubts`)."""
+    if ("ignore", None, ContactWarning, None, 0) in warnings.filters:
+        return  # whoever wants none, as the command line after its own look, need not pay for it
+    for doubt in contact_doubts(dataset, model):
+        if doubt.numbers.get("distance", 0.0) > FAR_FROM_SURFACE:
+            continue  # check_distance refuses the rows or warns
+        warnings.warn(str(doubt), ContactWarning, stacklevel=4)
+
+
+def refuse_what_looks_alike(model: Model, dataset: Dataset) -> None:
+    """Name, before any search, forces that a log does not tell apart, and numbers that no row shows.
+
+    Raises InvalidInput for what has no answer at all: a law that is listed twice, and a constant force on a joint that
+    nothing drives while a contact may carry the same weight. Warns (DataWarning) of the rest, whose split the priors
+    decide: laws with the same force in every row, a law that an unknown force beside it can imitate, and coefficients
+    that change no force in any row.
+    """
+    titles = [force_title(law) for law in model.laws if law.learned]
+    if twice := [title for title in dict.fromkeys(titles) if titles.count(title) > 1]:
+        raise InvalidInput(f"forces hold {twice[0]!r} twice, which no log tells apart; leave one of them out.")
+    few = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, min(ROWS_LOOKED_AT, len(dataset))).astype(int)))
+    states = [torch.as_tensor(np.array(x), device=model.robot.device) for x in (few.q, few.v, few.u)]
+    with torch.no_grad():
+        state = model.state(*states)
+        pushes = [push for law in model.laws if law.learned for push in _pushes(law, state, model)]
+        _refuse_offsets_of_idle_joints(model, state)
+        if idle := [push.name for push in pushes if push.share <= ROUNDING]:
+            _warn(f"no row shows {listed(idle)}, so each stays at its prior; leave it out, or give a log that does.")
+        pushes = [push for push in pushes if push.share > ROUNDING]
+        _warn_of_same(pushes)
+        for title, term, _ in model.unknown.named(model.robot):
+            B, features = term.direction(model.dynamics(*states)), term.features(model.dynamics(*states))
+            imitated = [push for push in pushes if any(_imitates(z, B[..., c], push) for c, z in enumerate(features))]
+            if imitated:
+                laws = listed(dict.fromkeys(push.law for push in imitated))
+                _warn(
+                    f"gp:{title} can be what {laws} is: rows show only the sum, and the priors decide what is whose. "
+                    f"Predictions are those of the sum; for numbers of {laws} by themselves leave gp:{title} out."
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class _Push:
+    """What one coefficient of a law does: joint forces (rows, nv), and what they depend on, (rows, inputs)."""
+
+    name: str
+    law: str
+    force: Tensor
+    inputs: Tensor
+    share: float
+    """Size relative to the largest of its law."""
+
+
+def _pushes(law: Law, state: State, model: Model) -> list[_Push]:
+    """By entry of the first coefficient, which the force is linear in for the laws that forcegp brings."""
+    name, title = next(iter(law.coefficients)), force_title(law)
+    if law.inertia_basis(model.robot) is not None:
+        return []  # rotors push against accelerations, which no force of (q, v, u) does
+    joints = [model.robot.joint_names.index(joint) for joint in model.robot.single_joint_names]
+    features = law.features(state)
+    found = []
+    given = getattr(law, name)
+    known = given.std == 0.0 if isinstance(given, Normal) and given.std is not None else torch.tensor(False)
+    for joint in joints if isinstance(law, JointLaw) else [0]:
+        if bool(known.expand(model.robot.nv)[joint]):
+            continue
+        value = law.values[name].expand(model.robot.nv) if isinstance(law, JointLaw) else law.values[name]
+        step = torch.zeros_like(value)
+        step[..., joint if isinstance(law, JointLaw) else ()] = 1.0
+        change = [law.force_at(state, {**law.values, name: value + sign * step}) for sign in (1.0, 0.0)]
+        force = (change[0] - change[1]).expand_as(state.v)
+        inputs = torch.stack([z[..., joint] if isinstance(law, JointLaw) else z[..., 0] for z in features], dim=-1)
+        own = title if not isinstance(law, JointLaw) else f"{title}.{model.robot.joint_names[joint]}"
+        found.append(_Push(own, title, force, inputs, float(torch.linalg.vector_norm(force))))
+    largest = max((push.share for push in found), default=0.0)
+    return [replace(push, share=push.share / max(largest, 1e-300)) for push in found]
+
+
+def _warn_of_same(pushes: Sequence[_Push]) -> None:
+    columns = [push.force.flatten() / torch.linalg.vector_norm(push.force) for push in pushes]
+    same = [
+        f"{one.name} and {other.name}"
+        for (one, a), (other, b) in combinations(zip(pushes, columns, strict=True), 2)
+        if one.law != other.law and float((a @ b).abs()) > 1.0 - EQUAL
+    ]
+    if same:
+        _warn(
+            f"{listed(same)} are the same force in every row, so the priors decide what is whose; leave one of them "
+            "out, or give a log in which they differ."
+        )
+
+
+def _imitates(z: Tensor, B: Tensor, push: _Push) -> bool:
+    """Whether a function of `z` (rows, d) along `B` (rows, nv) can be this force."""
+    size = B.square().sum(-1)
+    amplitude = (B * push.force).sum(-1) / size.clamp_min(1e-300)
+    left = torch.linalg.vector_norm(push.force - amplitude[:, None] * B)
+    if float(left) > EQUAL * float(torch.linalg.vector_norm(push.force)):
+        return False
+    if float(amplitude.std()) <= EQUAL * float(amplitude.abs().mean()):
+        return True
+    among = [bool((z - x[:, None]).abs().amin(-1).amax() <= EQUAL * (1.0 + x.abs().amax())) for x in push.inputs.T]
+    return bool(z.shape[-1]) and all(among)
+
+
+def _refuse_offsets_of_idle_joints(model: Model, state: State) -> None:
+    """A constant on a joint that nothing drives is whatever a contact carries there: weight, with any sign."""
+    if not model.contacts or not any(isinstance(law, Offset) and law.learned for law in model.laws):
+        return
+    idle = state.delivered.abs().amax(0) == 0.0
+    names = [joint for joint in model.robot.single_joint_names if bool(idle[model.robot.joint_names.index(joint)])]
+    if names and not bool(idle.all()):
+        raise InvalidInput(
+            f"nothing drives {listed(names)}, so an offset there can carry the weight that the contact carries, with "
+            "any sign; leave 'offset' out, or give Offset(Normal(0.0, std)) a std of 0 at it."
+        )

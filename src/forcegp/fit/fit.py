@@ -1,0 +1,385 @@
+"""`fit`: the numbers and functions of a model, found from a log; the one entry for every kind of evidence."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.memory import with_memory
+from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
+from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows
+from forcegp.evidence.contacts import check_distance
+from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
+from forcegp.evidence.parameter_space import ParameterSpace
+from forcegp.fit.checks import check_forces, refuse_what_looks_alike, warn_of_contacts
+from forcegp.fit.independent import fit_independent
+from forcegp.fit.joint import CHANGE, MOST_ROUNDS, estimates_beside, numbers_beside
+from forcegp.fit.motion_fit import refine_on_motions
+from forcegp.fit.objective import LOG_VARIANCE_SPREAD, FitObjective, Search, with_variance_priors
+from forcegp.fit.physical import fit_physical, typical_sizes, with_payloads_placed
+from forcegp.fit.refinement import (
+    fit_with_refined_loads,
+    independent_rows,
+    learning_rows,
+    on_all_rows,
+    require_memory_to_learn,
+)
+from forcegp.fit.search import (
+    ALL_ROWS,
+    MOST_POINTS_FOR_RESTARTS,
+    FitProgress,
+    described_rows,
+    learns_noise,
+    noise_of_windows,
+    resolved_noise,
+)
+from forcegp.fit.widening import widened
+from forcegp.forces import IndependentAccelerations, UnknownForces
+from forcegp.forces.registry import described_force
+from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
+from forcegp.model import Model
+from forcegp.parallel import backend_for
+from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.observed_wrench import in_air, unobserved
+from forcegp.robots.arguments import whole_number
+
+CONTINUE_FROM = (250, 500)
+"""Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
+
+
+@usable_arguments("fit")
+def fit(
+    model: Model,
+    dataset: Dataset,
+    evidence: Evidence | Sequence[Evidence] | None = None,
+    *,
+    baseline: Dataset | None = None,
+    points: int | None = None,
+    rows: int | None = None,
+    restarts: int | None = None,
+    seed: int = 0,
+    jobs: int | None = None,
+    backend: Any = None,
+    hyperprior: bool = True,
+    options: OptimizerOptions | None = None,
+    start: Mapping[str, Tensor] | Posterior | None = None,
+    engine: Engine | str = "auto",
+    learning_points: int | None = None,
+    progress: FitProgress | None = None,
+) -> Any:
+    """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
+
+    Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
+    kernels and noise by marginal likelihood; where both are open, in turn. Then the functions are conditioned on the
+    rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
+
+    Parameters
+    ----------
+    model: what is known, for example `dataset.model.with_forces(JointFriction())`. Laws without numbers are estimated.
+    dataset: rows with the joints of the robot in its order; nothing in it is changed.
+    evidence: what is learned from: `Accelerations()`, `Torques()`, `Windows(seconds)` of raw signals, and beside one of
+        these `Motions(seconds)`, which refines what it found. None stands for accelerations where functions are
+        unknown, and else for torques, with noisy accelerations where the base moves.
+    baseline: a second log, of the same robot without the payloads that are estimated.
+    points: learn functions from this many rows (or windows), those that lie farthest apart in (q, v, u); None: all.
+    rows: of models without unknown functions, use so many at most, evenly spread; None: 5,000, fewer beyond eight
+        degrees of freedom.
+    restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
+        factors, every other one from a smoother start; the best final value wins, and by default starts that fall
+        behind two earlier ones are dropped (`settings["restart_status"]`). None means 4 up to 400 points, where
+        local optima cost most and searches cost little, and 1 beyond, which then begins where searches on 250 and
+        500 of the rows ended.
+    seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
+    jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
+    backend: where restarts run: `Serial()`, `Joblib(jobs)`, a `Backend` of your own, or a name, "serial", "joblib".
+        None is this process for one job and processes of this machine for several.
+    hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
+        maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
+    options: the search itself; None is `fit.search.default_options`, which is content sooner beyond 400 points.
+    start: hyper-parameters at which the first search begins instead of moments, for example
+        `posterior.hyperparameters` of a fit to fewer points; those that are missing start from moments. With
+        `Motions` alone, the posterior to refine.
+    engine: how the posterior is computed from all points: "exact", "inducing", or one of
+        `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
+        memory, with the reason in `settings["engine_reason"]`.
+    learning_points: find the hyper-parameters on this many of the points, those that lie farthest apart; None means
+        all up to 1500 and 600 beyond. The posterior is that of all points.
+    progress: called as progress(restart, iteration, objective) where the restarts run in this process. The restart is
+        `ALL_ROWS` while all rows are taken in, and while numbers of laws and bodies are sought.
+
+    Where the model has a friction that is proportional to the normal force, and no `expected` friction is given,
+    the fit is repeated with the normal force under the friction that was found, until it settles.
+
+    Raises
+    ------
+    InvalidInput: the dataset does not fit the model, forces look alike, or an argument is out of range.
+    DatasetError: a log is too short for a payload.
+    ContactError: a contact cannot hold at some row, or no row touches its surface.
+    FitError: no restart could be evaluated; the message names the cause.
+    NotEnoughMemory: the engine, or the likelihood of the learning points, would need more than is free.
+    NumericalError: the engine failed, for example to reach its tolerance.
+    """
+    require_type("model", model, Model, ", for example dataset.model")
+    rest, refinement = _chosen(evidence, model, start)
+    dataset = _checked(model, dataset, rest, refinement)
+    logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
+    if isinstance(start, Posterior):
+        posterior: Any = start
+    elif isinstance(rest, Torques) or (model.is_open and not model.unknown_forces and isinstance(rest, Accelerations)):
+        if model.unknown_forces:
+            raise InvalidInput(
+                "torques are evidence for numbers of laws and bodies; functions are learned from accelerations, with "
+                "noise of the forces (Noise(None, force=..., learn=True)), which is the same likelihood."
+            )
+        posterior = _of_numbers(model, logs, rest, rows, seed, progress)
+    else:
+        if baseline is not None:
+            raise InvalidInput(
+                "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
+            )
+        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
+        posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points, rest)
+    if refinement is None:
+        return posterior
+    report = None if progress is None else partial(progress, ALL_ROWS)
+    return refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, report)
+
+
+def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start: Any) -> tuple[Any, Motions | None]:
+    """The evidence to begin with, and the motions that refine what it found."""
+    given = () if evidence is None else (evidence,) if isinstance(evidence, Evidence) else tuple(evidence)
+    if not all(isinstance(each, Evidence) for each in given):
+        raise InvalidInput(f"evidence is {evidence!r}; give Accelerations(), Torques(), Windows(S) or Motions(S).")
+    motions = [each for each in given if isinstance(each, Motions)]
+    others = [each for each in given if not isinstance(each, Motions)]
+    if len(motions) > 1 or len(others) > 1:
+        raise InvalidInput(
+            f"evidence is {', '.join(map(str, given))}: the same rows twice; give one of accelerations, torques and "
+            "windows, and motions beside it if these shall refine it."
+        )
+    refinement = motions[0] if motions else None
+    if isinstance(start, Posterior) and (refinement is None or others):
+        raise InvalidInput("start is a posterior; it is refined by Motions() alone: give that as the evidence.")
+    if others:
+        return others[0], refinement
+    if model.unknown_forces or not model.is_open:
+        return Accelerations(), refinement
+    fixed = model.robot.space.is_vector_space
+    return Torques() if fixed else Torques(noisy="both"), refinement
+
+
+def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
+    """The log, if it has what the evidence needs; of rows that are equal the first alone, with a warning."""
+    remedy = "; the model comes first, as in fit(model, dataset)"
+    require_rows("dataset", dataset, model.robot.joint_names, "the robot", remedy)
+    if len(dataset) < 2:
+        raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
+    for each in (evidence, refinement):
+        if each is not None:
+            each.check(dataset)
+    dataset = with_memory(dataset, model)
+    if isinstance(evidence, Windows) or refinement is not None or model.memory.names:
+        return dataset
+    _, first = np.unique(np.hstack([dataset.q, dataset.v, dataset.u, dataset.a]), axis=0, return_index=True)
+    if len(first) == len(dataset):
+        return dataset
+    warnings.warn(
+        f"{len(dataset) - len(first)} of {len(dataset)} rows equal another one and count once: a row written twice is "
+        "no second measurement.",
+        DataWarning,
+        stacklevel=4,
+    )
+    return dataset.rows(np.sort(first))
+
+
+def _of_numbers(
+    model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int, progress: FitProgress | None
+) -> StructuredPosterior:
+    """Laws and bodies alone, from all rows."""
+    report = None if progress is None else partial(progress, ALL_ROWS)
+    if rows is not None:
+        whole_number("rows", rows, 1)
+    refuse_what_looks_alike(model, logs[0])
+    found = fit_physical(model, logs, evidence, rows, report)
+    trained = replace(found.model, noise=found.noise)
+    training = TrainingData.of(found.rows, model.robot.device)
+    result = OptimizationResult({}, found.history[-1], found.history, "Gauss-Newton steps", found.estimates.settled,
+                                found.estimates.evaluations, 0.0)  # fmt: skip
+    settings = described_rows(found.rows, logs[0]) | {
+        "seed": seed,
+        "evidence": str(evidence),
+        "forces": [described_force(force) for force in model.forces],
+        "noise": found.noise.to_dict(),
+    }
+    noise = found.noise.parameters(model.robot.nv, model.robot.device)
+    return StructuredPosterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)
+
+
+@dataclass(frozen=True, eq=False)
+class _Functions:
+    """How unknown functions are learned, and numbers beside them."""
+
+    model: Model
+    search: Search
+    engine: Engine | str
+    learning_points: int | None
+
+    def fitted(self, dataset: Dataset, points: int | None, evidence: Evidence) -> Posterior:
+        """From rows or windows."""
+        if isinstance(evidence, Windows):
+            return self._of_windows(dataset, points, evidence)
+        plain = unobserved(self.model)
+        if len(plain.inputs) < len(self.model.inputs) and dataset.u.shape[1] == len(plain.inputs):
+            return replace(self, model=plain).fitted(dataset, points, evidence)
+        if any(isinstance(force, IndependentAccelerations) for force in self.model.unknown_forces):
+            return fit_independent(self.model, dataset, points, self.search)
+        if found := in_air(self.model, dataset):
+            settings, seen = found
+            assert seen.model is not None, "it was given one"
+            learned: Any = replace(self, model=seen.model).fitted(
+                replace(seen, model=seen.model.known), points, evidence
+            )
+            return learned.with_model(unobserved(learned.model)).with_settings(**settings)
+        return self._of_rows(dataset, points)
+
+    def _of_rows(self, dataset: Dataset, points: int | None) -> StructuredPosterior:
+        """From accelerations: hyper-parameters from some of the rows, the posterior from all."""
+        chosen = engine_of(self.engine)
+        all_rows = dataset
+        if points is not None:
+            points = whole_number("points", points, 2, len(dataset), "the rows of the dataset")
+            all_rows = dataset if points == len(dataset) else farthest_rows(dataset, points)
+        if chosen is not None:
+            # now, not after the search
+            chosen.require_memory(problem_size(self.model, len(all_rows)), self.model.robot.device)
+        ordered = len(all_rows) < len(dataset)
+        rows = independent_rows(all_rows) if learns_noise(self.model.noise, dataset) else all_rows
+        if points is not None:  # which rows these are is not the caller's choice
+            all_rows = rows
+        rows = learning_rows(rows, self.learning_points, ordered=ordered)
+        described = described_rows(all_rows, dataset)
+        hyperprior, progress = self.search.hyperprior, self.search.progress
+        own = replace(self, search=replace(self.search, start=self._continuation(rows, dataset)))
+        fitted = widened(own._with_numbers(rows, dataset), hyperprior)
+        warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
+        report = None if progress is None else partial(progress, ALL_ROWS)
+        return on_all_rows(fitted, all_rows, chosen, described, hyperprior, report)
+
+    def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> StructuredPosterior:
+        """From windows: hyper-parameters and the posterior from all of them."""
+        if not isinstance(engine_of(self.engine) or Exact(), Exact) or self.learning_points is not None:
+            raise InvalidInput(
+                "engine and learning_points are for rows with accelerations; windows are conditioned on exactly, and "
+                "all are learned from: leave both out, and give fewer points if it takes too long"
+            )
+        windows = evidence.windows(dataset, points)
+        own = replace(self, model=replace(self.model, noise=noise_of_windows(self.model.noise, windows)))
+        fitted = own._with_numbers(windows, dataset)
+        reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
+        described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
+        return widened(fitted, self.search.hyperprior).with_settings(
+            **described, engine=Exact().to_dict(), engine_reason=reason
+        )
+
+    def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
+        """Where a single search on many rows begins: at the end of searches on fewer of them."""
+        search = self.search
+        if search.start is not None or len(rows) <= MOST_POINTS_FOR_RESTARTS or search.restarts not in (None, 1):
+            return search.start
+        _, options = search.resolved(len(rows))
+        stages = [stage for stage in CONTINUE_FROM if 1.5 * stage < len(rows)]
+        ordered = farthest_rows(rows, stages[-1])
+        start: Mapping[str, Tensor] | None = None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # the fit to all rows gives it
+            for stage in stages:
+                begin = replace(search, restarts=1, start=start, options=options)
+                closed = replace(self, search=begin)
+                start = closed._search(ordered.rows(slice(stage)), dataset).hyperparameters
+        return start
+
+    def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
+        """Searches for functions and for numbers of laws and bodies in turn, where these are open."""
+        if not self.model.is_open:
+            return self._with_loads(rows, dataset)
+        given = rows.nodes if isinstance(rows, WindowedRows) else rows
+        refuse_what_looks_alike(self.model, given)
+        typical = typical_sizes(self.model, [given])
+        model = with_payloads_placed(self.model, [dataset], typical)
+        space = ParameterSpace(model, typical)
+        x = self._first_numbers(space, dataset)
+        again, posterior, found, change = self, None, None, np.inf
+        for _ in range(MOST_ROUNDS):
+            with warnings.catch_warnings():
+                if posterior is not None:
+                    warnings.simplefilter("ignore", DataWarning)  # the first search gave it, of the same rows
+                here = replace(space.model_at(x), noise=self.model.noise)
+                posterior = replace(again, model=here)._search(rows, dataset, beside_numbers=True)
+            x, found, change = numbers_beside(posterior, space, x)
+            again = replace(self, search=replace(self.search, restarts=1, start=posterior.hyperparameters))
+            if change < CHANGE:
+                break
+        assert found is not None, "there was a round"
+        here = replace(space.model_at(x), noise=self.model.noise)
+        posterior = replace(again, model=here)._search(rows, dataset, beside_numbers=True)
+        estimates = replace(estimates_beside(space, found, len(rows)), settled=change < CHANGE)
+        return replace(posterior, estimates=estimates)
+
+    def _first_numbers(self, space: ParameterSpace, dataset: Dataset) -> np.ndarray:
+        """Where numbers begin: what all rows show without unknown functions, or the numbers of the model."""
+        if not space.model.robot.space.is_vector_space:  # unknown forces look like mass there
+            return space.start
+        bare = replace(space.model, forces=space.model.laws, noise=None)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)
+                solution = fit_physical(bare, [dataset], Accelerations())
+        except InvalidInput:  # contacts that slide, which only functions beside it explain
+            return space.start
+        low, high = space.bounds
+        return np.clip(solution.x, low, high) if len(solution.x) == space.size else space.start
+
+    def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
+        """One search, or more under the normal force that friction changes."""
+        first = self._search(rows, dataset)
+
+        def again(forces: UnknownForces, last: StructuredPosterior) -> StructuredPosterior:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)  # the first fit gave it, of the same rows
+                begin = replace(self.search, restarts=1, start=last.hyperparameters)
+                model = replace(self.model, forces=(*self.model.laws, *forces.terms))
+                return replace(self, model=model, search=begin)._search(rows, dataset)
+
+        return fit_with_refined_loads(first, again)
+
+    def _search(
+        self, rows: Dataset | WindowedRows, dataset: Dataset, beside_numbers: bool = False
+    ) -> StructuredPosterior:
+        """One search on these rows or windows of the log with the model as it is, and the exact posterior there."""
+        noise = resolved_noise(self.model.noise, rows)
+        model = replace(self.model, noise=noise)
+        training = TrainingData.of(rows, model.robot.device)
+        likelihood = MarginalLikelihood(model, training)
+        model.check_states(training.q, training.v, training.u)
+        check_distance(model, training)
+        check_forces(likelihood, dataset.model)
+        require_memory_to_learn(likelihood)
+        described = described_rows(rows, dataset) | {"noise": noise.to_dict()}
+        # before the search: a force of one's own may fail there
+        described["forces"] = [described_force(force) for force in model.forces]
+        learned_noise, fixed = likelihood.split_noise
+        kernels = likelihood.kernels
+        if beside_numbers and self.search.hyperprior:
+            kernels, described["log_variance_spread"] = with_variance_priors(kernels), LOG_VARIANCE_SPREAD
+        objective = FitObjective(likelihood, kernels, noise, fixed, self.search.hyperprior)
+        starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
+        result, of_search = self.search.best(objective, starts)
+        found = result.parameters | fixed, result, {**described, **of_search}
+        return StructuredPosterior.conditioned(model, training, *found, estimates=Estimates())

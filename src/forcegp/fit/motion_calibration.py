@@ -1,0 +1,155 @@
+"""Calibration of the intervals of motions on stretches of training time that are left out in turn."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.data.motion_records import RecordedMotions, recorded_motions
+from forcegp.errors import InvalidInput, require_type
+from forcegp.evidence.training_data import TrainingData
+from forcegp.fit.motion_fit import refine_on_motions
+from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.posterior.motion_intervals import DEVIATIONS, HORIZONS, MotionIntervals
+from forcegp.posterior.observed_wrench import in_own_air, observing, require_unobserved
+from forcegp.posterior.rollout import Rollout
+
+FOLDS = 4
+SAMPLES = 16
+STEP = 0.005  # s, the longest; of several rows where the recording has shorter ones
+STARTS = 4  # motions that begin within one longest horizon
+LEVEL = 0.95
+AnyPosterior = TypeVar("AnyPosterior", bound=Posterior)
+
+
+def calibrated(
+    posterior: AnyPosterior,
+    dataset: Dataset,
+    horizons: Sequence[float] = HORIZONS,
+    *,
+    integrator: str = "rk4",
+    report: Callable[[int, int], None] | None = None,
+) -> AnyPosterior:
+    """The same model with intervals of motions that hold: of stretches of the training time, left out in turn.
+
+    For each of four stretches the model is made again from the other rows at the same hyper-parameters (refined on
+    their motions if it was), and predicts motions in the stretch. `rollout(...).interval()` then uses the widths.
+    Of a model that observes wind, those are of what `observing` gives for this model and a recording.
+
+    Parameters
+    ----------
+    dataset: the recording that the model learned from, in equal steps of time.
+    horizons: lengths of the motions in s, at which widths are found.
+    integrator: of these motions, as for `rollout`.
+    report: called as report(stretch, stretches).
+
+    Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
+    """
+    require_type("posterior", posterior, Posterior, ", as in calibrated(posterior, log)")
+    if not isinstance(posterior, StructuredPosterior):
+        raise InvalidInput(
+            f"a {posterior.description} would have to be trained again for every stretch that is left out; take a "
+            "model with physics."
+        )
+    intervals = _intervals(posterior, dataset, horizons, integrator, report)
+    return posterior.with_settings(motion_intervals=intervals.to_dict())
+
+
+def _intervals(
+    posterior: StructuredPosterior,
+    dataset: Dataset,
+    horizons: Sequence[float],
+    integrator: str,
+    report: Callable[[int, int], None] | None,
+) -> MotionIntervals:
+    require_type("dataset", dataset, Dataset)
+    require_unobserved(posterior, "intervals of motions")
+    wanted = tuple(sorted(set(horizons)))
+    if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
+        raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
+    parts = _folds(dataset, wanted[-1])
+    errors, spreads, kept, inputs = [], [], wanted, posterior.model.inputs
+    for number, inside in enumerate(parts):
+        if report is not None:
+            report(number, len(parts))
+        other, rows = observing(_without(posterior, dataset.rows(~inside)), dataset.rows(inside))
+        motions = _motions(rows, wanted[-1])
+        kept = tuple(h for h in wanted if h >= motions.dt)
+        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES if len(other.latent_names) else 0}
+        rollout: Rollout = other.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, **how)
+        at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
+        inputs, sampled = other.model.inputs, rollout.samples is not None
+        true_q, true_v = (torch.tensor(x[:, at], device=rollout.q.device) for x in (motions.q, motions.v))
+        away = rollout.space.difference(rollout.q[:, at], true_q), true_v - rollout.v[:, at]
+        error = [each.abs().cpu().numpy() for each in away]
+        stds = (rollout.std("q"), rollout.std("v")) if sampled else ()
+        spread = [std[:, at].cpu().numpy() for std in stds] or [np.zeros_like(each) for each in error]
+        errors.append(np.stack(error, axis=2))
+        spreads.append(np.stack(spread, axis=2))
+    error, spread = np.concatenate(errors), np.concatenate(spreads)  # (motions, H, 2, nv)
+    lasting = np.isfinite(error + spread).all(axis=(1, 2, 3))
+    if not lasting.any():
+        raise InvalidInput(f"no motion of {wanted[-1]:g} s could be predicted to its end; give shorter horizons.")
+    error, spread = error[lasting], spread[lasting]
+    rms = np.sqrt(np.square(error).mean(0)).clip(np.finfo(float).tiny)
+    level = min(1.0, LEVEL * (1.0 + 1.0 / len(error)))
+    scores = [error / np.sqrt(np.square(s) + np.square(rms)) for s in (spread, np.zeros_like(spread))]
+    factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
+    return MotionIntervals(np.array(kept), rms, factors, inputs)
+
+
+def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
+    """Rows of stretches of time that are left out in turn: quarters of every episode, or of all episodes."""
+    numbers = np.zeros(len(dataset), dtype=int)
+    long = 0
+    for episode in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == episode)
+        lasting = float(np.ptp(dataset.time[rows]))
+        if lasting >= FOLDS * seconds:
+            numbers[rows] = np.minimum((np.arange(len(rows)) * FOLDS) // len(rows), FOLDS - 1)
+        else:
+            numbers[rows], long = long % FOLDS, long + (lasting >= seconds)
+    parts = [numbers == fold for fold in range(FOLDS)]
+    used = [part for part in parts if _lasts(dataset, part, seconds)]
+    if len(used) < 2:
+        raise InvalidInput(
+            f"intervals need two stretches of {seconds:g} s at least, of which one is left out in turn; give shorter "
+            "horizons, or a longer recording."
+        )
+    return used
+
+
+def _lasts(dataset: Dataset, part: np.ndarray, seconds: float) -> bool:
+    return any(
+        float(np.ptp(dataset.time[rows])) >= seconds
+        for episode in dataset.episodes
+        if len(rows := np.flatnonzero(part & (dataset.episode == episode)))
+    )
+
+
+def _motions(part: Dataset, seconds: float) -> RecordedMotions:
+    """Motions of that length all over the rows, `STARTS` in the time of one."""
+    count = max(1, int(STARTS * sum(np.ptp(part.time[part.episode == e]) for e in part.episodes) / seconds))
+    found = recorded_motions(part, count, seconds)
+    stride = max(1, int(STEP / found.dt))
+    steps = found.u.shape[1] // stride
+    u = found.u[:, : steps * stride].reshape(len(found.u), steps, stride, -1).mean(axis=2)
+    ends = slice(0, steps * stride + 1, stride)
+    return RecordedMotions(found.rows, stride * found.dt, found.q[:, ends], found.v[:, ends], u)
+
+
+def _without(posterior: StructuredPosterior, rest: Dataset) -> StructuredPosterior:
+    """The model from the other rows: as many of them, at the same hyper-parameters; refined on motions if it was."""
+    refined = posterior.settings.get("motions")
+    if refined is not None:
+        return refine_on_motions(posterior, rest, refined["seconds"], refined["bodies"])
+    own = posterior.training
+    rest = in_own_air(posterior, rest)
+    rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
+    given = replace(TrainingData.of(rows, own.q.device), reference=own.reference or own)
+    how = posterior.hyperparameters, posterior.result, posterior.settings, posterior.engine
+    return replace(posterior.conditioned(posterior.trained, given, *how), target=posterior.target)

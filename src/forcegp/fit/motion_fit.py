@@ -1,0 +1,334 @@
+"""What moves is what is fitted: known forces, inertias and latent functions refined on recorded positions.
+
+Accelerations of a log are filtered and differentiated; their errors resemble each other over the filter's memory and
+integrate into motions. Here the recording is cut into windows k of some tenths of a second to some seconds, and
+
+    1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |w|^2 + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2
+
+is minimised over the windows' initial states x_k, joint friction and inertias p, and the weights w of the latent
+functions f_c = phi_c . w_c, which are standard normal a priori (`inference.inducing.WeightSpace`): the Gaussian process
+is the regulariser. sigma_j is what motions leave unexplained, tau_j how many rows of a window one independent residual
+is worth (`evidence.least_squares.correlation_time`): without it a window at 1 kHz would count as a thousand facts.
+
+Gauss-Newton with Levenberg's damping; initial states are eliminated window by window (Schur complement); motions and
+their derivatives come from the implicit midpoint rule (`integration.midpoint_sensitivities`), with
+
+    da/dp = -H (Y dpi/dp + d(tau)/dp),    da/dw_c = H b_c phi_c(z_c)^T
+
+of the torque regressor Y, joint terms tau and mixing b_c. The covariance of w is the inverse of the Gauss-Newton
+curvature, with all other unknowns marginalised (Laplace).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.data.motion_records import RecordedMotions, all_motions
+from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError
+from forcegp.evidence.least_squares import correlation_time
+from forcegp.fit.motion_unknowns import SCALES, Unknowns
+from forcegp.inference.cholesky import factorize
+from forcegp.inference.engines import InducingWeights
+from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.observed_wrench import in_own_air, require_unobserved, unobserved
+from forcegp.robots.manifold import ConfigurationSpace
+
+Report = Callable[[int, float], None]
+STEP = 0.005
+"""Longest step in s: shorter where the recording has shorter ones, of which several make a step."""
+SPEED = 0.02
+"""Standard deviation of a window's initial velocity, relative to that of all velocities: it comes from a filter."""
+ITERATIONS, ROUNDS = 12, 8
+"""Most steps for given noise, and times that the noise is estimated anew."""
+CONTENT = 0.1
+"""Nats by which a step must be expected to lower the objective for the search to go on."""
+MOST_DAMPING = 1e6
+"""Beyond it steps are too small to matter."""
+SETTLED = 0.02
+"""Relative change of the noise that ends the rounds."""
+SUPPORT = 15.0
+"""Nats of evidence below which a function is left out: three times what counts as decisive (Kass & Raftery, "Bayes
+factors", JASA 1995), for how many rows are independent is known to a factor. Where laws were all there was, functions
+had up to 12 in ten simulated logs; where there was more, a million."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Unknowns x, initial states (K, 2 nv), the motions from there, and the objective."""
+
+    x: Tensor
+    states: Tensor
+    motions: WindowMotions
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class MotionFit:
+    """The recorded windows, the unknowns and the noise that residuals have: what is minimised, and how."""
+
+    recorded: RecordedMotions
+    stride: int
+    unknowns: Unknowns
+
+    @property
+    def h(self) -> float:
+        """The step in s."""
+        return self.stride * self.recorded.dt
+
+    @cached_property
+    def q(self) -> Float[Tensor, "K rows nq"]:
+        """Recorded positions at the ends of the steps."""
+        return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
+
+    @cached_property
+    def u(self) -> Float[Tensor, "K T nv"]:
+        """Actuator forces, their mean over each step."""
+        return torch.as_tensor(self.recorded.u.copy()).unflatten(1, (-1, self.stride)).mean(2)
+
+    @cached_property
+    def start(self) -> Float[Tensor, "K state"]:
+        """Recorded initial states; where a base moves, the step 0 from the recorded position stands for that."""
+        q, v = self.recorded.q[:, 0], self.recorded.v[:, 0]
+        return torch.as_tensor(np.concatenate([q if self.space.is_vector_space else np.zeros_like(v), v], axis=-1))
+
+    @cached_property
+    def space(self) -> ConfigurationSpace:
+        """Of positions."""
+        return self.unknowns.start.model.robot.space
+
+    def residual(self, motions: WindowMotions) -> Float[Tensor, "K rows nv"]:
+        """Steps that lead from the recorded positions to those of the motions."""
+        return self.space.difference(self.q, motions.q)
+
+    def spread(self, sigma: Tensor) -> Float[Tensor, " state"]:
+        """Standard deviations of initial states about the recorded ones."""
+        speed = torch.as_tensor(self.recorded.v.copy()).square().mean((0, 1)).sqrt()
+        return torch.cat([sigma, (SPEED * speed).clamp_min(1e-9)])
+
+    def at(self, x: Tensor, states: Tensor, noise: Tensor, sigma: Tensor, near: WindowMotions | None) -> _Point:
+        """The point, its motions sought from those of another; infinitely bad where there are none."""
+        q, space = self.q, self.space
+        steps = space.difference(q[:, :-1], q[:, 1:])
+        guess = space.integrate(q[:, :-1], 0.5 * steps), steps / self.h
+        if near is not None:
+            guess = near.middle_q, near.middle_v
+        q0, v0 = states.split(steps.shape[-1], dim=-1)
+        if not space.is_vector_space:
+            q0 = space.integrate(q[:, 0], q0)
+        try:
+            accelerations = self.unknowns.accelerations(x)
+            # a trial step that leads to motions so far from these is too long, whatever they are
+            patient = near is None
+            motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, derivatives=True, patient=patient)
+        except (NumericalError, NonPhysicalInertia):  # a step that went too far
+            nowhere_q, nowhere_v = (q.new_full(x.shape, math.nan) for x in (q, self.recorded.v))
+            motions = WindowMotions(nowhere_q, nowhere_v, *guess, torch.zeros(len(q), dtype=torch.bool))
+        residual = self.residual(motions) / noise
+        away = (states - self.start) / self.spread(sigma)
+        from_prior, _ = self.unknowns.prior(x)
+        cost = 0.5 * float(residual.square().sum() + away.square().sum() + from_prior.square().sum())
+        good = bool(motions.found.all()) and math.isfinite(cost)
+        return _Point(x, states, motions, cost if good else math.inf)
+
+    def whitened(self, here: _Point, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Residuals of the windows (K, n) and their Jacobians in states (K, n, 2 nv) and unknowns (K, n, P)."""
+        motions, r = here.motions, self.residual(here.motions)
+        in_start, in_parameters = motions.in_start, motions.in_parameters
+        if not self.space.is_vector_space and in_start is not None and in_parameters is not None:
+            # steps from the motions change those from the recording, and steps of the start those from its motion
+            turned, start, nv = self.space.chart_matrix(r), in_start.clone(), r.shape[-1]
+            start[..., :nv] @= torch.linalg.inv(self.space.chart_matrix(here.states[:, :nv]))[:, None]
+            in_start, in_parameters = turned @ start, turned @ in_parameters
+        parts = r[..., None], in_start, in_parameters
+        r, A, B = ((part / noise[:, None]).flatten(1, 2) for part in parts if part is not None)
+        return r[..., 0], A, B
+
+    def curvature(
+        self, here: _Point, noise: Tensor, sigma: Tensor, damping: float = 0.0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gauss-Newton's matrix and right side for x, and (G, g) with the change of states g - G dx, (K, 2 nv, ...).
+
+        Diagonals are 1 + `damping` times as large, those of states as well: near a reversal of dry friction a motion
+        hangs on its start.
+        """
+        r, A, B = self.whitened(here, noise)
+        weight = self.spread(sigma) ** -2
+        of_states, mixed = A.mT @ A + torch.diag(weight), A.mT @ B
+        of_states.diagonal(dim1=1, dim2=2).mul_(1.0 + damping)
+        pull = (A.mT @ r[..., None]) + (weight * (here.states - self.start))[..., None]
+        solved = torch.linalg.solve(of_states, torch.cat([mixed, -pull], dim=-1))
+        G, g = solved[..., :-1], solved[..., -1]
+        values, jacobian = self.unknowns.prior(here.x)
+        N = (B.mT @ B).sum(0) + jacobian.mT @ jacobian
+        N.diagonal().mul_(1.0 + damping)
+        right = -(B.mT @ r[..., None] + mixed.mT @ g[..., None]).sum(0)[:, 0] - jacobian.mT @ values
+        return N - (mixed.mT @ G).sum(0), right, G, g
+
+    def expected(self, here: _Point, noise: Tensor, sigma: Tensor, dx: Tensor, change: Tensor) -> float:
+        """The objective that linearised motions have after a step."""
+        r, A, B = self.whitened(here, noise)
+        r = r + (A @ change[..., None])[..., 0] + B @ dx
+        away = (here.states + change - self.start) / self.spread(sigma)
+        values, jacobian = self.unknowns.prior(here.x)
+        return 0.5 * float(r.square().sum() + away.square().sum() + (values + jacobian @ dx).square().sum())
+
+    def step(self, x: Tensor, N: Tensor, right: Tensor) -> Float[Tensor, " P"]:
+        """The change that solves N dx = right. Coordinates that it would take beyond their limits end there.
+
+        All others are solved for again, given those, for with latent functions beside them they depend on each other.
+        """
+        low, high, longest = self.unknowns.limits
+        free, dx = torch.ones_like(x, dtype=torch.bool), torch.zeros_like(x)
+        while bool(free.any()):
+            dx[free] = torch.linalg.solve(N[free][:, free], right[free] - N[free][:, ~free] @ dx[~free])
+            beyond = free & ((x + dx < low) | (x + dx > high))
+            if not bool(beyond.any()):
+                break
+            dx[beyond] = (x + dx).clamp(low, high)[beyond] - x[beyond]
+            free &= ~beyond
+        return dx / max(1.0, float((dx.abs() / longest).max())) if len(dx) else dx
+
+    def minimized(
+        self, here: _Point, noise: Tensor, sigma: Tensor, damping: float, report: Callable[[float], None]
+    ) -> tuple[_Point, float]:
+        """Levenberg-Marquardt for given noise, from that damping; the last damping as well."""
+        here = self.at(here.x, here.states, noise, sigma, here.motions)
+        for _ in range(ITERATIONS):
+            N, right, G, g = self.curvature(here, noise, sigma, damping)
+            dx = self.step(here.x, N, right)
+            change = g - G @ dx
+            foreseen = here.cost - self.expected(here, noise, sigma, dx, change)
+            if not foreseen > CONTENT or damping > MOST_DAMPING:
+                break
+            there = self.at(here.x + dx, here.states + change, noise, sigma, here.motions)
+            gain = (here.cost - there.cost) / foreseen
+            # Marquardt's rule: trust the linear model more where it was right, less where it was wrong
+            damping = max(0.2 * damping, 1e-9) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
+            if gain > 0.0:
+                here = there
+                report(float(self.residual(here.motions).square().mean().sqrt()))
+        return here, damping
+
+    def solved(self, report: Callable[[float], None], x: Tensor) -> tuple["MotionFit", _Point, Tensor, Tensor]:
+        """The minimum that is reached from x, the noise and sigma that residuals have there, and the scales of weights.
+
+        Raises NumericalError where no motion is found near the recorded one.
+        """
+        one = torch.ones(self.space.nv, dtype=x.dtype)
+        here, damping = self.at(x, self.start, one, one, None), 1e-3
+        if not math.isfinite(here.cost):
+            raise NumericalError(
+                f"no motion of {self.h * self.u.shape[1]:g} s is found near the recorded one; give fewer seconds, or a "
+                "model that fits the accelerations better."
+            )
+        sigma, noise = self.noise(here.motions)
+        fit = self
+        for _ in range(ROUNDS):
+            here, damping = fit.minimized(here, noise, sigma, damping, report)
+            before, (sigma, noise) = torch.cat([noise, fit.unknowns.scales]), self.noise(here.motions)
+            if fit.unknowns.weights.count:
+                N, *_ = fit.curvature(here, noise, sigma)
+                fit = replace(fit, unknowns=fit.unknowns.rescaled(here.x, N))
+            if bool(((torch.cat([noise, fit.unknowns.scales]) - before).abs() <= SETTLED * before).all()):
+                break
+        if not fit.unknowns.weights.count:
+            return fit, here, noise, sigma
+        N, *_ = fit.curvature(here, noise, sigma)
+        weak = fit.unknowns.support(here.x, N) < SUPPORT
+        if bool(weak.any()):
+            scales = torch.where(weak, SCALES[0], fit.unknowns.scales)
+            fit = replace(fit, unknowns=replace(fit.unknowns, scales=scales))
+            here, _ = fit.minimized(here, noise, sigma, damping, report)
+        return fit, here, noise, sigma
+
+    def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
+        """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
+        residual = self.residual(motions)
+        sigma = residual.square().mean((0, 1)).sqrt().clamp_min(1e-12)
+        window = np.repeat(np.arange(len(residual)), residual.shape[1])
+        time = torch.as_tensor(correlation_time((residual / sigma).flatten(0, 1).cpu().numpy(), window))
+        return sigma, sigma * time.clamp_min(1.0).sqrt()
+
+
+@torch.no_grad()
+def refine_on_motions(
+    posterior: StructuredPosterior, dataset: Dataset, seconds: float, bodies: bool, report: Report | None = None
+) -> StructuredPosterior:
+    """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
+
+    `report(step, rms of q in rad or m)` is called after each step. Where a base moves, errors of positions are steps in
+    its axes. Observed wind counts as known. Raises InvalidInput for models without physics, windows that no episode has
+    room for and uneven steps, NumericalError where no motion is found near the recorded one.
+    """
+    if not isinstance(posterior, StructuredPosterior):
+        raise InvalidInput(f"a {posterior.description} has no forces that motions could refine; leave Motions() out.")
+    require_unobserved(posterior, "refinements on motions")
+    if posterior.carries_known_forces:
+        raise InvalidInput(
+            "the model has no rigid bodies in its mean, so its processes hold gravity and inertia, which motions of "
+            "seconds do not tell; give it RigidBodies()."
+        )
+    seen = in_own_air(posterior, dataset)
+    if seen is not dataset:
+        assert seen.model is not None, "it was given one"
+        posterior = posterior.with_model(seen.model)
+    recorded, stride = all_motions(seen, seconds, STEP)
+    unknowns = Unknowns.of(posterior, seen, bodies)
+    done = 0
+
+    def say(rms: float) -> None:
+        nonlocal done
+        done += 1
+        if report is not None:
+            report(done, rms)
+
+    fit = MotionFit(recorded, stride, unknowns)
+    found = _refined(*fit.solved(say, unknowns.first), seconds, bodies)
+    return found if seen is dataset else replace(found, target=unobserved(found.model))
+
+
+def _refined(
+    fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float, bodies: bool
+) -> StructuredPosterior:
+    """The posterior there, with the covariance of the weights and of the numbers."""
+    N, *_ = fit.curvature(here, noise, sigma)
+    unknowns = fit.unknowns
+    (x, _), others = unknowns.split(here.x), unknowns.sizes[0]
+    weights = replace(unknowns.weights, mean=here.x[others:])
+    if weights.count:
+        marginal = N[others:, others:]
+        if others:
+            marginal = marginal - N[others:, :others] @ torch.linalg.solve(N[:others, :others], N[:others, others:])
+        weights = replace(weights, precision=factorize((0.5 * (marginal + marginal.mT)).clone))
+    found = unknowns.posterior(here.x, weights)
+    engine = found.engine if not weights.count else InducingWeights(tuple(len(z) for z in weights.points))
+    told = {
+        "seconds": seconds,
+        "bodies": bodies,
+        "windows": len(fit.recorded.rows),
+        "step": fit.h,
+        "rms": sigma.tolist(),
+        "scales": unknowns.scales.tolist(),
+        "not_told": [
+            name for name, s in zip(found.latent_names, unknowns.scales, strict=True) if float(s) <= SCALES[0]
+        ],
+    }
+    estimates = found.estimates
+    if others:
+        space, covariance = unknowns.space, torch.linalg.inv(N)[:others, :others].cpu().numpy()
+        prior = space.prior(x)[1]
+        estimates = Estimates.of_covariance(
+            space.parameters, space.numbers(x), space.number_slopes(x), covariance, prior,
+            evidence=f"motions of {seconds:g} s", rows=fit.recorded.q.shape[0] * fit.recorded.q.shape[1],
+        )  # fmt: skip
+    found = replace(found, engine=engine, estimates=estimates)
+    return found.with_settings(motions=told, engine=engine.to_dict(), widening=1.0)

@@ -1,0 +1,269 @@
+"""Fitting again: on all rows from what some rows gave, and with the normal force that a fit has found.
+
+docs/how-to/large-data.md describes the first. Solved for the second, Q_U would no longer be affine in the latent
+functions, and inference no longer exact (`python -m benchmarks.force_pictures contact-friction` draws the curve with
+and without).
+"""
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset, farthest_rows
+from forcegp.data.preparation import memory
+from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
+from forcegp.evidence.contacts import check_distance
+from forcegp.evidence.likelihood import MarginalLikelihood
+from forcegp.evidence.training_data import TrainingData
+from forcegp.fit.objective import FitObjective
+from forcegp.forces import UnknownForces
+from forcegp.forces.contact_friction import JAMMING, TabulatedCurve, refined_loads
+from forcegp.inference import (
+    Choice,
+    Engine,
+    Exact,
+    Inducing,
+    InducingPosterior,
+    OptimizerOptions,
+    ProblemSize,
+    choose_engine,
+    minimize_objective,
+)
+from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
+from forcegp.inference.linear_functionals import require_memory_for_functionals
+from forcegp.inference.memory import require_memory
+from forcegp.inference.threads import blas_threads
+from forcegp.noise import ACCELERATION
+from forcegp.posterior import StructuredPosterior
+from forcegp.robots.arguments import whole_number
+
+FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9  # rows that noise is learned from, and the share of them that needs no word
+LEARNING_ROWS = 600
+"""Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
+
+Iteration = Callable[[int, float], None]
+"""Called as report(iteration, objective)."""
+
+
+def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
+    """The rows that hyper-parameters are found on: all, or those that lie farthest apart.
+
+    `ordered`: the rows come in that order already. None means all rows up to 1500, and 600 beyond.
+    Raises InvalidInput for a number out of range.
+    """
+    count = len(rows)
+    if learning_points is None:
+        learning_points = count if count <= MOST_EXACT_ROWS else LEARNING_ROWS
+    if whole_number("learning_points", learning_points, 0) < 2:
+        raise InvalidInput(f"learning_points is {learning_points}; hyper-parameters need at least 2 rows")
+    if learning_points >= count:
+        return rows
+    return rows.rows(slice(learning_points)) if ordered else farthest_rows(rows, learning_points)
+
+
+def independent_rows(rows: Dataset) -> Dataset:
+    """Those that lie further apart in time than a filter makes them alike; of two, the one that comes first.
+
+    Noise that is learned is taken for independent. Where rows of a filtered log lie close together, errors that change
+    slowly would look like forces, and the noise like none. Warns where many rows are left out, and where so few are
+    left that all stay.
+    """
+    seconds = memory(rows.metadata) * (1.0 - 1e-9)
+    if seconds == 0.0:
+        return rows
+    kept, found = [], dict[tuple[int, int], float]()  # at most one time in a stretch of that length
+    for row, (time, episode) in enumerate(zip(rows.time.tolist(), rows.episode.tolist(), strict=True)):
+        place = int(time // seconds)
+        if all(abs(found.get((episode, place + k), np.inf) - time) >= seconds for k in (-1, 0, 1)):
+            found[episode, place] = time
+            kept.append(row)
+    if len(kept) > WARNED_OF * len(rows):
+        return rows.rows(np.array(kept))
+    alike = f"{len(kept)} of {len(rows)} rows lie {seconds:.2g} s apart, which the filter of the log makes alike"
+    few = len(kept) < FEWEST_INDEPENDENT
+    what = "so few that all are taken, and learned noise may be none" if few else "from which alone noise is learned"
+    warnings.warn(f"{alike}: {what}; give a longer log, or `noise` if it is known", DataWarning, stacklevel=4)
+    return rows if few else rows.rows(np.array(kept))
+
+
+def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
+    """Raise NotEnoughMemory where the exact likelihood of these rows or windows does not fit into memory."""
+    weights = likelihood.training.weights
+    if weights is not None:
+        robot = likelihood.model.robot
+        require_memory_for_functionals(weights, robot.nv, len(likelihood.model.unknown.latent_names(robot)))
+        return
+    with torch.no_grad():
+        size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
+    remedy = "find hyper-parameters on fewer rows: `learning_points=600`, or give fewer points"
+    what = f"the likelihood of N={size.rows} rows with its gradients"
+    require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
+
+
+def on_all_rows(
+    fitted: StructuredPosterior,
+    rows: Dataset,
+    engine: Engine | None,
+    described: Mapping[str, Any],
+    hyperprior: bool,
+    report: Iteration | None = None,
+) -> StructuredPosterior:
+    """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
+
+    `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
+    """
+    reference = training = fitted.training
+    likelihood, latent = fitted.likelihood, fitted.latent
+    if len(rows) != len(reference.q):
+        training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
+        likelihood = replace(likelihood, training=training)
+        fitted.trained.check_states(training.q, training.v, training.u)
+        check_distance(fitted.trained, training)
+    with torch.no_grad():
+        size = ProblemSize.of(likelihood.terms(fitted.hyperparameters))
+    if engine is None or not size.latents:
+        choice = choose_engine(size, training.q.device)
+    else:
+        choice = Choice(engine, f"{engine.name}: as asked for")
+    with blas_threads(training.q.numel()):
+        if training is not reference or not isinstance(choice.engine, Exact):
+            latent = likelihood.condition(fitted.kernels, fitted.hyperparameters, choice.engine)
+        left_out = latent.left_out if isinstance(latent, InducingPosterior) else 0.0
+        if engine is None and isinstance(choice.engine, Inducing) and left_out > choice.engine.tolerance:
+            choice = choose_engine(size, training.q.device, inducing=False)
+            short = f"fewer inducing points leave out {left_out:.2g} of the noise variance of a row"
+            choice = Choice(choice.engine, f"{choice.reason}; {short}")
+            latent = likelihood.condition(fitted.kernels, fitted.hyperparameters, choice.engine)
+        settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
+        settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
+        posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
+        return refined(posterior, hyperprior, report)
+
+
+TOLERANCE = 1e-6
+"""Fraction of the bound by which an iteration must lower it for the search to go on."""
+
+
+def refined(
+    posterior: StructuredPosterior, hyperprior: bool, report: Callable[[int, float], None] | None = None
+) -> StructuredPosterior:
+    """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
+
+    Where physical parameters were learned they and all others stay, for their standard errors belong together. Warns
+    where inducing points leave out so much that the posterior is an approximation.
+    """
+    engine, latent = posterior.engine, posterior.latent
+    if not isinstance(latent, InducingPosterior):
+        return posterior
+    left_out, tolerance = latent.left_out, engine.tolerance if isinstance(engine, Inducing) else 0.0
+    if not posterior.estimates and isinstance(engine, Inducing) and engine.refine and left_out <= tolerance:
+        likelihood, kernels = posterior.likelihood, posterior.kernels
+        noise, (_, fixed) = posterior.likelihood.noise, posterior.likelihood.split_noise
+        held = {name: posterior.hyperparameters[name] for name in fixed}
+        start = {name: value for name, value in posterior.hyperparameters.items() if name not in held}
+        objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
+        options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
+        result = minimize_objective(objective, start, options, report)
+        parameters = {**posterior.hyperparameters, **result.parameters}
+        latent = likelihood.condition(kernels, parameters, engine)
+        assert isinstance(latent, InducingPosterior), "its engine is"
+        left_out = latent.left_out
+        change = f"{result.history[0]:.1f} -> {result.value:.1f}"
+        note = f"on all rows, {result.evaluations} evaluations: {change} ({result.status})"
+        spent = replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds)
+        posterior = replace(posterior, hyperparameters=parameters, result=spent, latent=latent).with_settings(
+            refined=note
+        )
+    if left_out > max(ENOUGH, tolerance):
+        points = sum(map(len, posterior.latent.features))
+        warnings.warn(
+            f"{points} inducing points leave out {left_out:.2g} of the noise variance of a row, so that the posterior "
+            "is an approximation with wider intervals than the exact one; give more points, or take `engine='exact'`",
+            NumericalWarning,
+            stacklevel=4,
+        )
+    return posterior
+
+
+ROUNDS = 8
+"""Most fits after the first; measured with dry friction that falls with speed, 3 to 5 are enough."""
+SETTLED = 1e-3
+"""Relative change of the mixing vectors (root mean square over training rows) below which the loads have settled."""
+NOTICEABLE = 2.0
+"""Nats that rounds differ by without telling anything."""
+PLACES = 60
+"""Velocities at which a curve is tabulated, of those that the data visited."""
+BEYOND = (1.2, 1.5, 2.0, 3.0, 5.0)
+"""Multiples of the largest and smallest visited velocity at which it is tabulated as well: continued from the last two
+of `PLACES`, whose difference is noise, it would soon be far from the curve itself.
+"""
+
+
+def fit_with_refined_loads(
+    first: StructuredPosterior,
+    again: Callable[[UnknownForces, StructuredPosterior], StructuredPosterior],
+    rounds: int = ROUNDS,
+) -> StructuredPosterior:
+    """`first` itself, or the last of the fits that follow it with the normal forces of the one before.
+
+    Where an earlier one is more likely by more than `NOTICEABLE`, or the loads have not settled, the most likely one.
+
+    Every round is an exact fit of a legitimate prior: friction proportional to a given function of the state. What
+    changes from round to round is that function, towards the normal force under the friction that was found.
+    `again(prior, posterior)` fits with another prior, beginning from the parameters of a posterior. Warns
+    (NumericalWarning) where the normal forces have not settled after `rounds` fits, and where friction as the last one
+    expects it nearly jams a contact.
+    """
+    given = first.trained.unknown  # whose terms hold the expectations of the user
+    best = last = first
+    with warnings.catch_warnings():  # what an early round expects may jam without meaning anything
+        warnings.filterwarnings("ignore", JAMMING, NumericalWarning)
+        for fits in range(rounds + 1):
+            prior = refined_loads(given, last.trained.robot, lambda name, p=last: _table(p, name))
+            if prior is None:
+                return first
+            change = _change(last, prior)
+            if change < SETTLED:
+                # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
+                if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE:
+                    best = last
+                break
+            if fits == rounds:
+                warnings.warn(
+                    f"the normal forces of load-dependent friction would still change by {change:.1%} after {rounds} "
+                    "refinements; the most likely fit is kept. Give expected=COEFFICIENT to hold them fixed.",
+                    NumericalWarning,
+                    stacklevel=3,
+                )
+                break
+            last = again(prior, last).with_settings(load_refinements=fits + 1)
+            if last.negative_log_likelihood < best.negative_log_likelihood:
+                best = last
+    if best is not first:
+        with torch.no_grad():
+            best.trained.unknown.direction(best.likelihood.dynamics)  # warns where the friction that was found jams
+    return best
+
+
+def _table(posterior: StructuredPosterior, latent: str) -> TabulatedCurve:
+    """The posterior mean of a friction curve over the velocities that the data visited, 0 included, and beyond."""
+    visited = posterior.curve(latent, points=2).visited[:, 0]
+    low, high = float(visited[0].clamp_max(0.0)), float(visited[1].clamp_min(0.0))
+    high = max(high, low + 1e-6)
+    at = torch.linspace(low, high, PLACES, dtype=torch.float64)
+    below, above = ([end * factor for factor in BEYOND] if end else [] for end in (low, high))
+    places = [*reversed(below), *at.tolist(), *above]
+    mean = posterior.curve(latent, torch.tensor(places, dtype=torch.float64)).mean
+    return TabulatedCurve(tuple(places), tuple(mean.tolist()))
+
+
+def _change(posterior: StructuredPosterior, prior: UnknownForces) -> float:
+    """How much the other prior's mixing vectors differ at the training points."""
+    with torch.no_grad():
+        dynamics = posterior.likelihood.dynamics
+        old, new = posterior.trained.unknown.direction(dynamics), prior.direction(dynamics)
+    return float((new - old).square().mean().sqrt() / old.square().mean().sqrt())

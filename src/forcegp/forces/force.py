@@ -1,0 +1,247 @@
+"""`Force`: one class for all that acts on the joints; `Law`: a force that is known but for a few numbers.
+
+    Q(x) = sum_k B_k(x) g_k(z_k(x, s))
+
+with directions B, features z, amplitudes g and perhaps a state s that remembers. The amplitude of a `Law` is a formula
+with coefficients; that of an `Unknown` force (`forcegp.forces.unknown`) is a function with a Gaussian process prior. A
+new law is one subclass with `features` and `amplitude` and an entry in `forcegp.forces.FORCES`: then it acts in
+predictions, motions and compiled programs, its coefficients are estimated from logs of every kind, and files carry it.
+"""
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.forces.parameters import Coefficient, LogNormal, Normal, joint_unit
+from forcegp.mechanics.gauss_principle import Contact, State
+from forcegp.robots import Robot
+from forcegp.robots.arguments import by_joint
+
+PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
+Number = PerJoint | Normal | LogNormal | None
+"""A number of a law: given (one, one per joint, or by joint name), or estimated under a prior; None: a weak one."""
+AnyForce = TypeVar("AnyForce", bound="Force")
+AnyLaw = TypeVar("AnyLaw", bound="Law")
+
+
+class Force(ABC):  # noqa: B024  # laws and unknown forces have their own
+    """What acts on the joints of a robot."""
+
+    names: tuple[str, ...] = ()
+    """Columns of u that belong to this force."""
+
+    @property
+    def title(self) -> str:
+        """What the force is called where forces are listed, for example "joint-friction"."""
+        return re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()
+
+    def bound_to(self: AnyForce, robot: Robot) -> AnyForce:
+        """The same with its numbers checked and in the order of the robot's joints."""
+        return self
+
+    def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
+        """Raise InvalidInput where this force means nothing: on a frame or contact that is not there."""
+        return
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields of a dataclass as plain JSON values, without those that are None."""
+        given = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]  # forces are dataclasses
+        return {name: plain(value) for name, value in given.items() if value is not None}
+
+
+def plain(value: Any) -> Any:
+    """A field of a force as JSON values, which `forcegp.forces.force_from_dict` turns back."""
+    if isinstance(value, Normal | LogNormal):
+        return {type(value).__name__: {f.name: plain(getattr(value, f.name)) for f in fields(value)}}
+    if isinstance(value, Tensor | np.ndarray):
+        return torch.as_tensor(value).detach().tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
+
+
+class Law(Force):
+    """A force that is known but for its coefficients. A subclass is a frozen dataclass with a field for each of these.
+
+    The first coefficient decides: a law that is given it is known, and other coefficients that are not given have their
+    defaults. A law that is not given it is estimated by `forcegp.fit`, with all coefficients that are not given.
+    """
+
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {}
+    """Its numbers by the names of their fields."""
+    under_load: ClassVar[bool] = False
+    """Whether it depends on the torque of the actuators, `State.delivered`, and grows in proportion to its size."""
+
+    def direction(self, state: State) -> Float[Tensor, "*#batch nv k"] | None:
+        """B: joint force (Nm or N) per unit of each amplitude; None where the amplitudes are the joint forces."""
+        return None
+
+    @abstractmethod
+    def features(self, state: State) -> tuple[Float[Tensor, "*batch _"], ...]:
+        """z: what the amplitudes depend on."""
+
+    @abstractmethod
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Float[Tensor, "*batch k"]:
+        """g(z) at coefficients by name, in torch operations; its sign is that which accelerates."""
+
+    def force(self, state: State) -> Float[Tensor, "*#batch nv"]:
+        """Joint force (..., nv) in Nm or N, with the sign that accelerates the joint."""
+        return self.force_at(state, self.values)
+
+    def force_at(self, state: State, values: Mapping[str, Tensor]) -> Float[Tensor, "*#batch nv"]:
+        """`force` at other coefficients."""
+        amplitude, B = self.amplitude(self.features(state), values), self.direction(state)
+        return amplitude if B is None else (B @ amplitude[..., None])[..., 0]
+
+    def inertia_basis(self, robot: Robot) -> Float[Tensor, "k nv nv"] | None:
+        """What one unit of each entry of the first coefficient adds to the mass matrix; None for laws without inertia.
+
+        Such a law has no amplitude of its own.
+        """
+        return None
+
+    def added_inertia(self, robot: Robot) -> Float[Tensor, "nv nv"] | None:
+        """What this adds to the mass matrix, in kg m^2 or kg."""
+        basis = self.inertia_basis(robot)
+        if basis is None:
+            return None
+        return torch.tensordot(self.values[next(iter(self.coefficients))].expand(len(basis)), basis, 1)
+
+    def memory_names(self, robot: Robot) -> tuple[str, ...]:
+        """Names of the numbers that it remembers from the motion before, columns of u; none for most laws."""
+        return ()
+
+    def remembered(self, state: State) -> Float[Tensor, "*batch m"]:
+        """What it remembers at these states."""
+        names = self.memory_names(state.robot)
+        first = state.inputs.index(names[0])
+        return state.u[..., first : first + len(names)]
+
+    def memory_start(self, robot: Robot) -> Float[Tensor, " m"]:
+        """What it remembers before anything has moved."""
+        return torch.zeros(len(self.memory_names(robot)), dtype=torch.float64, device=robot.device)
+
+    def remember(self, memory: Float[Tensor, "*batch m"], step: Tensor, dt: float) -> Float[Tensor, "*batch m"]:
+        """The memory after the joints have moved by `step` (..., nv) in dt: exact and differentiable."""
+        return memory
+
+    @property
+    def values(self) -> dict[str, Tensor]:
+        """Coefficients by name; of those that are to be estimated the start: what a prior expects, else a default."""
+        return {name: self._value(name) for name in self.coefficients}
+
+    def _value(self, name: str) -> Tensor:
+        given, coefficient = getattr(self, name), self.coefficients[name]
+        if isinstance(given, Normal):
+            given = given.mean
+        elif isinstance(given, LogNormal):
+            given = given.median
+        return torch.as_tensor(coefficient.default if given is None else given, dtype=torch.float64)
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Names of the coefficients that a fit estimates."""
+        given = {name: getattr(self, name) for name in self.coefficients}
+        open_ = any(value is None for value in list(given.values())[:1])
+        return tuple(
+            name
+            for name, value in given.items()
+            if isinstance(value, Normal | LogNormal) or (value is None and (open_ or self._has_prior()))
+        )
+
+    def _has_prior(self) -> bool:
+        return any(isinstance(getattr(self, name), Normal | LogNormal) for name in list(self.coefficients)[:1])
+
+    def with_values(self: AnyLaw, values: Mapping[str, Tensor]) -> AnyLaw:
+        """The same law with these coefficients, which are known then."""
+        return replace(self, **values)  # type: ignore[type-var]  # laws are dataclasses
+
+    def open(self: AnyLaw) -> AnyLaw:
+        """The same law with all coefficients to be estimated, from the values that they have."""
+        return self.with_values({name: Normal(value) for name, value in self.values.items()})  # type: ignore[arg-type]
+
+    def unit(self, name: str, joint: str, robot: Robot) -> str:
+        """Of a coefficient, at a joint that turns or slides."""
+        return joint_unit(self.coefficients[name].unit, joint in robot.joint_names and slides(joint, robot))
+
+
+def slides(joint: str, robot: Robot) -> bool:
+    """Whether a joint is prismatic."""
+    return any(each.name == joint and each.type == "prismatic" for each in robot.joints)
+
+
+class JointLaw(Law):
+    """A law that acts in every joint of one degree of freedom by itself: all coefficients have one value per joint.
+
+    The amplitude of a joint depends on the coefficients of that joint alone. `features` are (..., nv) each; joints of
+    several degrees of freedom, such as a base that moves, have coefficients 0.
+    """
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        """The velocities."""
+        return (state.v,)
+
+    @override
+    def bound_to(self: AnyLaw, robot: Robot) -> AnyLaw:
+        return replace(self, **{name: self._bound(name, robot) for name in self.coefficients})  # type: ignore[type-var]
+
+    def _bound(self, name: str, robot: Robot) -> Any:
+        given, coefficient = getattr(self, name), self.coefficients[name]
+        if isinstance(given, Normal | LogNormal):
+            first, second = (f.name for f in fields(given))
+            spread = getattr(given, second)
+            parts = {first: self._numbers(name, getattr(given, first), robot, coefficient)}
+            if spread is not None:
+                parts[second] = self._numbers(name, spread, robot, Coefficient("1"))
+            return replace(given, **parts)
+        if given is None and name in self.learned:
+            return None
+        return self._numbers(name, coefficient.default if given is None else given, robot, coefficient)
+
+    def _numbers(self, name: str, given: Any, robot: Robot, coefficient: Coefficient) -> Tensor:
+        """One per joint, checked."""
+        what = f"{type(self).__name__} {name}"
+        remedy = "a number, one per joint, or a mapping from joint names"
+        values = as_numbers(what, by_joint(given, robot.joint_names, robot.name), robot, remedy)
+        if values.dim() == 0:  # one number for every joint, but not for bases that move
+            driven = [joint in robot.single_joint_names or coefficient.logarithm for joint in robot.joint_names]
+            values = values * torch.tensor(driven, dtype=values.dtype, device=values.device)
+        values = values.clone()  # which keeps the graph
+        if values.shape != (robot.nv,):
+            raise InvalidInput(
+                f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
+                f"{', '.join(robot.joint_names)}"
+            )
+        least = "a finite number"
+        good = torch.isfinite(values)
+        if coefficient.logarithm:
+            good, least = good & (values > 0), "a finite number > 0"
+        elif coefficient.lowest == 0.0:
+            good, least = good & (values >= 0), "a finite number >= 0"
+        if not bool(good.all()):
+            raise InvalidInput(f"{what} is {values.tolist()}; every joint needs {least}.")
+        return values
+
+    @override
+    def _value(self, name: str) -> Tensor:
+        return super()._value(name)
+
+
+def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:
+    """A tensor in float64 on the robot's device. Raises InvalidInput, with what to give, for what has no numbers."""
+    try:
+        return torch.as_tensor(given, dtype=torch.float64, device=robot.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(f"{name} is {given!r}; give {remedy}.") from None

@@ -1,0 +1,250 @@
+"""Forces by name: as files carry them, and as commands and quick scripts write them.
+
+    viscous, stribeck:level=1.2, payload:tool0, gp:joint-friction:kernel=matern-3/2
+
+are names out of `FORCES`, of unknown forces behind "gp:", with options FIELD=VALUE (the first field needs no name).
+"""
+
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from inspect import Parameter, signature
+from itertools import accumulate
+from typing import Any
+
+from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
+from forcegp.forces.force import Force, Law
+from forcegp.forces.parameters import Body, LogNormal, Normal
+
+FORCES: dict[str, str | type[Force]] = {
+    "actuation": "actuation.Actuation",
+    "thrusters": "thrusters.Thrusters",
+    "observed-wrench": "thrusters.ObservedWrench",
+    "observed-wind": "thrusters.ObservedWind",
+    "rigid-bodies": "rigid_bodies.RigidBodies",
+    "payload": "rigid_bodies.Payload",
+    "viscous": "viscous.Viscous",
+    "direction": "viscous.DirectionalFriction",
+    "coulomb": "dry_friction.Coulomb",
+    "stribeck": "dry_friction.Stribeck",
+    "load": "dry_friction.LoadFriction",
+    "offset": "offset.Offset",
+    "spring": "offset.Spring",
+    "rotor": "rotor.Rotor",
+    "coupled-rotors": "rotor.CoupledRotors",
+    "joint-forces": "joint_forces.JointForces",
+    "joint-accelerations": "joint_forces.JointAccelerations",
+    "independent": "joint_forces.IndependentAccelerations",
+    "joint-friction": "joint_forces.JointFriction",
+    "periodic-joint-forces": "joint_forces.PeriodicJointForces",
+    "tool-forces": "tool_forces.ToolForces",
+    "contact-friction": "contact_friction.ContactFriction",
+    "base-wrench": "base_wrench.BaseWrench",
+    "aerodynamic": "base_wrench.AerodynamicForce",
+}
+"""Name -> class, or where in this package it is, so that only what is used is imported. Add yours."""
+
+UNKNOWN = "gp:"
+SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
+    "bodies": ("rigid-bodies", {"learn": "all"}),
+    "joint": ("joint-forces", {}),
+    "joint-ripple": ("periodic-joint-forces", {}),
+    "tool-friction": ("tool-forces", {}),
+    "tool-forces": ("tool-forces", {"inputs": ("velocity", "position"), "kernel": "squared-exponential"}),
+    "load-friction": ("contact-friction", {"load": True}),
+    "friction-map": ("contact-friction", {"viscous": True, "inputs": ("position",)}),
+    "foot-friction": ("contact_friction.foot_friction", {}),
+}
+"""Names that `parse_forces` takes besides, with fields that differ from their defaults."""
+
+
+USUAL_DRY = "stribeck"
+"""The law of dry friction that most joints need."""
+
+
+def usual_friction() -> tuple[Law, ...]:
+    """The laws of joint friction that most gears need, with all numbers to be estimated."""
+    return tuple(force_class(name)() for name in ("viscous", USUAL_DRY, "offset"))
+
+
+def dry_laws() -> tuple[str, ...]:
+    """Names of the laws with a `level`: dry friction."""
+    return tuple(name for name in FORCES if "level" in getattr(force_class(name), "coefficients", ()))
+
+
+def force_class(name: str) -> Any:
+    """The class of this name, or the function that makes several. Raises InvalidInput."""
+    found = FORCES.get(name, name)
+    if not isinstance(found, str):
+        return found
+    module, dot, attribute = found.partition(".")
+    if not dot:
+        require_known("force", name, "the registry", [*FORCES, *SHORT])
+    return getattr(import_module(f"forcegp.forces.{module}"), attribute)
+
+
+def force_name(force: Force) -> str:
+    """The name of a force in `FORCES`. Raises InvalidInput for one that has none, which no file can carry."""
+    kind = type(force)
+    for name, entry in FORCES.items():
+        own = entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}"
+        if own:
+            return name
+    raise InvalidInput(
+        f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}; registered: "
+        f"{', '.join(FORCES)}"
+    )
+
+
+def force_to_dict(force: Force) -> dict[str, Any]:
+    """Plain values that `force_from_dict` turns back. Raises InvalidInput for a force that is not in `FORCES`."""
+    return {"type": force_name(force), **force.to_dict()}
+
+
+def described_force(force: Force) -> dict[str, Any]:
+    """`force_to_dict`, or the class alone of a force that is not in `FORCES`: only storing a model needs more."""
+    try:
+        return force_to_dict(force)
+    except InvalidInput:
+        return {"type": type(force).__name__}
+
+
+def force_from_dict(stored: object) -> Force:
+    """The force that `force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
+    if not isinstance(stored, Mapping):
+        raise FileFormatError(f"a stored force is {stored!r}; expected an object with a type")
+    values = {key: _read(value) for key, value in stored.items()}
+    name = values.pop("type", None)
+    if not isinstance(name, str) or name not in FORCES:
+        raise FileFormatError(f"unknown force {name!r}; known: {', '.join(FORCES)}")
+    try:
+        return force_class(name)(**values)
+    except TypeError as error:
+        raise FileFormatError(f"force {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
+
+
+PRIORS = {kind.__name__: kind for kind in (Normal, LogNormal, Body)}
+
+
+def _read(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        if len(value) == 1 and (name := next(iter(value))) in PRIORS and isinstance(value[name], Mapping):
+            return PRIORS[name](**{key: _read(entry) for key, entry in value[name].items()})
+        return {key: _read(entry) for key, entry in value.items()}
+    return tuple(value) if isinstance(value, list) else value
+
+
+@usable_arguments("parse_forces")
+def parse_forces(expression: str | Sequence[str]) -> tuple[Force, ...]:
+    """The forces of a text, or of its parts: `NAME[:VALUE][:FIELD=VALUE...]` with commas between them.
+
+    Lists are written with "/", for example "gp:joint:inputs=q/v", and so are points. Raises InvalidInput for unknown
+    names, fields and values.
+    """
+    words = _split(expression, ",") if isinstance(expression, str) else list(expression)
+    joined: list[str] = []
+    for word in (word.strip() for word in words):
+        # a comma may stand between options as well: gp:tool-forces:frame=link_7,axes=world
+        if joined and "=" in word.partition(":")[0]:
+            joined[-1] += f":{word}"
+        else:
+            joined.append(word)
+    made = [_one(word, expression) for word in joined]
+    return tuple(force for several in made for force in (several if isinstance(several, tuple) else (several,)))
+
+
+def is_unknown(name: str) -> bool:
+    """Whether a name without "gp:" is that of an unknown force."""
+    kind = force_class(SHORT.get(name, (name, {}))[0])
+    return not (isinstance(kind, type) and issubclass(kind, Law))
+
+
+def _one(text: str, expression: Any) -> Any:
+    unknown = text.startswith(UNKNOWN)
+    name, *options = _split(text.removeprefix(UNKNOWN), ":")
+    name = name.strip()
+    if name not in (*SHORT, *FORCES) or is_unknown(name) != unknown:
+        _refuse(name, unknown, expression)
+    kind, given = SHORT.get(name, (name, {}))
+    make = force_class(kind)
+    given = dict(given)
+    allowed = {key: field for key, field in signature(make).parameters.items()}
+    for option in options:
+        key, equals, value = (part.strip() for part in option.partition("="))
+        if not equals and option is options[0]:
+            key, value = next(iter(allowed), ""), option.strip()
+        if key not in allowed or not value:
+            close = difflib.get_close_matches(key, allowed, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close and close[0] != key else ""
+            what = f"write FIELD=VALUE with one of: {', '.join(allowed)}" if allowed else "it has no options"
+            raise InvalidInput(f"force {name!r} cannot take {option.strip()!r}{hint}; {what}")
+        given[key] = _value(name, key, value, make, allowed[key].default)
+    missing = [key for key, field in allowed.items() if field.default is Parameter.empty and key not in given]
+    if missing:
+        raise InvalidInput(f"force {name!r} needs {', '.join(missing)}: write {name}:{missing[0]}=...")
+    return make(**given)
+
+
+def _refuse(name: str, unknown: bool, expression: Any) -> None:
+    from forcegp.forces.kernels import KERNELS  # gpytorch, which only a mistake needs
+
+    whole = repr(expression if isinstance(expression, str) else ",".join(expression))
+    if name in KERNELS and name not in FORCES:
+        raise InvalidInput(
+            f"{name!r} in {whole} is a kernel, not a force; write it as an option, gp:tool-friction:kernel={name}"
+        )
+    if name in FORCES or name in SHORT:
+        other = name if unknown else f"{UNKNOWN}{name}"
+        kind = "a law with coefficients" if unknown else "an unknown force"
+        raise InvalidInput(f"{name!r} in {whole} is {kind}; write {other}")
+    names = [each for each in (*SHORT, *FORCES) if is_unknown(each) == unknown]
+    require_known("force", name, whole, names)
+
+
+def _value(name: str, key: str, text: str, make: Callable[..., Any], default: Any) -> Any:
+    """The text as what the option is by default: truth, number, numbers, names, or text."""
+    if key in getattr(make, "coefficients", {}):
+        default = 0.0
+    if isinstance(default, bool):
+        if text not in ("true", "false"):
+            raise InvalidInput(f"force {name!r} has {key}={text}; give true or false")
+        return text == "true"
+    several = default if isinstance(default, tuple) else ()
+    numbers = bool(several) and all(isinstance(entry, int | float) for entry in several)
+    number = int if all(isinstance(entry, int) for entry in several) else float
+    try:
+        if isinstance(default, int | float) and "/" not in text:
+            return type(default)(text)
+        if numbers or isinstance(default, int | float):
+            return tuple((number if numbers else float)(part) for part in text.split("/"))
+        if key == "mass":
+            return float(text)
+    except ValueError:
+        example = "/".join(map(str, several))
+        whole = "whole " if (number if numbers else type(default)) is int else ""
+        kind = f"{whole}numbers as in {example}" if numbers else f"a {whole}number"
+        raise InvalidInput(f"force {name!r} has {key}={text}; give {kind}") from None
+    if key == "learn":
+        return "all" if text == "all" else tuple(part.strip() for part in text.split("/"))
+    if isinstance(default, tuple) or key == "joints":
+        return tuple(part.strip() for part in text.split("/"))
+    return _without_parentheses(text)
+
+
+def _without_parentheses(text: str) -> str:
+    """Without the one pair that encloses the whole text; "(a) + (b)" stays as it is."""
+    depths = list(accumulate((character == "(") - (character == ")") for character in text))
+    enclosed = text.startswith("(") and 0 in depths and depths.index(0) == len(text) - 1
+    return text[1:-1].strip() if enclosed else text
+
+
+def _split(text: str, separator: str) -> list[str]:
+    """The parts between separators outside of parentheses."""
+    parts, depth = [""], 0
+    for character in text:
+        depth += (character == "(") - (character == ")")
+        if character == separator and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return parts

@@ -1,1 +1,0 @@
-"""Models without physics to compare with: one Gaussian process per joint."""

@@ -1,1 +1,0 @@
-"""Physical parameters as unknowns of a fit, and what was learned of them."""

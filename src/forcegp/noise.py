@@ -1,0 +1,122 @@
+"""`Noise`: of measured accelerations, and of forces."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, require_type, usable_arguments
+
+ACCELERATION = "noise.log_acceleration"
+FORCE = "noise.log_force"
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations: `acceleration` in rad/s^2 or m/s^2, `force` in Nm or N (None: no force-level noise).
+
+    Each is one number or one per joint; None for `acceleration` takes what the dataset states. With `learn` they are
+    start values of the optimisation, else they stay fixed; the hyperprior of a learned one is log-normal around its
+    start value, with a factor of e as one standard deviation. The covariance of one row is
+
+        diag((acceleration factor)^2) + H diag(force^2) H^T,
+
+    where the factor is 1, or, for data that state the noise of every row, that noise over its root mean square: then
+    `acceleration` is the level, and which rows are noisier is as stated.
+
+    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions count that their u
+    is as noisy, and shrink accelerations that only its noise explains (`shrunk`). Leave it False
+    where u is a command, as in model-predictive control.
+
+    `from_data` is set by a fit whose level of noise the dataset stated: rows that state another one are then warned of
+    (`Posterior.update`).
+    """
+
+    acceleration: float | tuple[float, ...] | None = 0.1
+    force: float | tuple[float, ...] | None = None
+    learn: bool = False
+    measured_torque: bool = False
+    from_data: bool = False
+
+    @usable_arguments("Noise")
+    def __post_init__(self) -> None:
+        for name in ("learn", "measured_torque", "from_data"):
+            require_type(name, getattr(self, name), bool)
+        for name in ("acceleration", "force"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _positive(name, getattr(self, name)))
+        if self.measured_torque and self.force is None:
+            raise InvalidInput(
+                "Noise(measured_torque=True) needs the noise of the torque sensor; give force=SIGMA in Nm or N."
+            )
+
+    def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
+        """Logarithms of the standard deviations, one per joint.
+
+        Raises InvalidInput for a wrong number of values, and where only a dataset states the level.
+        """
+        if self.acceleration is None:
+            raise InvalidInput(
+                "Noise(None) takes the noise of the acceleration from the dataset of a fit; give a number here."
+            )
+        named = {ACCELERATION: self.acceleration} | ({} if self.force is None else {FORCE: self.force})
+        out = {}
+        for name, value in named.items():
+            values = torch.as_tensor(value, dtype=torch.float64, device=device)
+            if values.dim() and len(values) != nv:
+                raise InvalidInput(f"Noise has {len(values)} values for {nv} joints; give one number or one per joint.")
+            out[name] = values.expand(nv).log()
+        return out
+
+    @staticmethod
+    def covariance(
+        parameters: Mapping[str, Tensor],
+        H: Float[Tensor, "*batch nv nv"],
+        factors: Float[Tensor, "*batch nv"] | None = None,
+    ) -> Float[Tensor, "#N nv"] | Float[Tensor, "N nv nv"]:
+        """Variances (1 or N, nv) of the rows, or their covariances (N, nv, nv) when there is force-level noise.
+
+        `factors` (N, nv) multiply the standard deviations of the acceleration.
+        """
+        acceleration = (2.0 * parameters[ACCELERATION]).exp()
+        acceleration = acceleration[None] if factors is None else acceleration * factors.square()
+        if FORCE not in parameters:
+            return acceleration
+        force = (2.0 * parameters[FORCE]).exp()
+        return torch.diag_embed(acceleration) + (H * force) @ H.mT
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """Log density (up to a constant) of the noise among `parameters` under its hyperprior; 0 where it is fixed.
+
+        Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint
+        arm with 60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
+        """
+        if ACCELERATION not in parameters:
+            return torch.zeros((), dtype=torch.float64)
+        level = parameters[ACCELERATION]
+        starts = self.parameters(len(level), level.device)
+        return -0.5 * torch.stack([(parameters[name] - start).square().sum() for name, start in starts.items()]).sum()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Noise":
+        """The noise that `to_dict` stored."""
+        given: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items()}
+        return cls(**given)
+
+
+def _positive(name: str, given: object) -> float | tuple[float, ...]:
+    message = f"Noise {name} is {given!r}; give a positive, finite standard deviation, or one per joint."
+    try:
+        values = torch.as_tensor(given, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(message) from None
+    if values.dim() > 1 or not values.numel() or not bool(((values > 0) & torch.isfinite(values)).all()):
+        raise InvalidInput(message)
+    return tuple(values.tolist()) if values.dim() else float(values)

@@ -1,0 +1,223 @@
+"""A posterior as a CasADi function, with all derivatives: for do-mpc, acados, IPOPT, and CasADi's own C.
+
+The graph that programs are written from (`predictor_code`) becomes scalar expressions (SX); sums over centres become
+products of matrices (MX), whose size does not grow with the derivatives. CasADi is an extra (LGPL): it is imported here
+and only here.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.atomic_files import write_text
+from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
+from forcegp.codegen.tracing import trace
+from forcegp.errors import InvalidInput, MissingExtra, NumericalError
+from forcegp.inference.kernel_sums import KernelSum
+from forcegp.inference.one_input_calls import OneInputCall
+from forcegp.posterior.c_export import exported_code
+from forcegp.posterior.c_files import identifier
+from forcegp.posterior.fused_rollouts import require_step
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.predictor_code import PredictorCode
+from forcegp.posterior.predictor_preparation import rows_for, sample_states
+from forcegp.posterior.structured import StructuredPosterior
+
+STATES = 100
+TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
+"""Largest difference from `predict`, relative to the largest value; implicit steps end at 1e-9."""
+
+OPERATORS = {**ARITHMETIC, **COMPARED, "negate": operator.neg}
+NAMES = {"absolute": "fabs"}
+
+
+def casadi_function(
+    posterior: Posterior, *, steps: float | None = None, integrator: str = "symplectic-euler", name: str | None = None
+) -> Any:
+    """The mean acceleration as a `casadi.Function` (q, v, u) -> a, (nq,), (nv,), (nu,) -> (nv,) in units of `predict`.
+
+    With `steps` instead (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`:
+    "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method. Where a base moves
+    steps are explicit, a second result of the acceleration is q_dot (nq,), and quaternions count as their directions.
+
+    Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed. In
+    `name`, that of the function, what CasADi does not take is replaced.
+    Raises MissingExtra without CasADi, InvalidInput for other models than structured ones, for operations that no
+    graph holds, steps that are no positive number, and other integrators.
+    """
+    try:
+        import casadi
+    except ImportError:
+        raise MissingExtra(
+            "casadi_function needs CasADi, which is not installed; pip install 'forcegp[casadi]'."
+        ) from None
+    if not isinstance(posterior, StructuredPosterior):
+        raise InvalidInput(f"no program can be written of a {posterior.description}; export a structured model.")
+    code = exported_code(posterior)
+    name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
+    x = [casadi.MX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
+    f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
+    given = *code.sizes, sum(len(part.latents) for part in code.sums)
+    results, names, space = [_function(casadi, "physics", code.physics, code.a, given)(*x, f)], ["a"], code.space
+    acceleration = casadi.Function(name, x, results, ["q", "v", "u"], names)
+    if steps is None:
+        if space.is_vector_space:
+            return acceleration
+        moved = _of_space(casadi, lambda q, v: (space.tangent(q) @ v[..., None])[..., 0], code.sizes[:2])
+        return casadi.Function(name, x, [*results, moved(*x[:2])], ["q", "v", "u"], [*names, "q_dot"])
+    require_step(steps, integrator, posterior.model)
+    there = _stepped(casadi, code, acceleration, x, float(steps), integrator)
+    return casadi.Function(name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
+
+
+def export_casadi(
+    posterior: StructuredPosterior,
+    folder: str | Path,
+    *,
+    steps: float | None = None,
+    integrator: str = "symplectic-euler",
+    name: str | None = None,
+) -> dict[str, float]:
+    """Write NAME.casadi, and with `steps` NAME_step.casadi, to a folder, for `casadi.Function.load`.
+
+    Returns the largest difference from `predict` (a predictor's `step`) at states around the training data, relative to
+    the largest value, by file. Raises as `casadi_function`, and NumericalError where they differ.
+    """
+    called = identifier(name or posterior.model.robot.name)
+    functions = {called: casadi_function(posterior, name=called)}
+    import casadi  # it is there, or the line above has raised
+
+    rows = rows_for(posterior.training, posterior.trained, posterior.model)
+    q, v, u = sample_states(rows, posterior.model.robot.space, STATES, 2, STATES // 3)
+    expected = {called: posterior.predict(q, v, u, covariance=False).mean}
+    if steps is not None:
+        step = f"{called}_step"
+        functions[step] = casadi_function(posterior, steps=steps, integrator=integrator, name=step)
+        predictor = posterior.predictor(covariance="none", compile=False)
+        expected[step] = torch.cat(predictor.step(q, v, u, steps, integrator), dim=-1)
+    rounding, found = posterior.predictor(covariance="none", compile=False).rounding(q, v, u), {}
+    for file, function in functions.items():
+        try:
+            made = _evaluated(function, [x.numpy().T for x in (q, v, u)])[:, : expected[file].shape[1]]
+        except RuntimeError:  # many lines
+            raise NumericalError(
+                f"CasADi finds no step of {steps:g} s by {integrator} somewhere near the training data, so nothing is "
+                "written; give shorter steps, or export to C, whose Newton method shortens what overshoots."
+            ) from None
+        worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
+        if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, rounding):
+            raise NumericalError(
+                f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
+                "to C, or fit with fewer points, which cancel less."
+            )
+        found[f"{file}.casadi"] = worst
+    for file, function in functions.items():
+        text = casadi.StringSerializer()
+        text.pack(function)
+        write_text(Path(folder) / f"{file}.casadi", text.encode())  # `save` is silent where the disk is full
+    return found
+
+
+def _evaluated(function: Any, given: Sequence[np.ndarray]) -> np.ndarray:
+    """All outputs (n, size) side by side at columns of states."""
+    found = function.map(given[0].shape[1])(*given)
+    return np.concatenate([np.array(part) for part in (found if isinstance(found, tuple) else (found,))]).T
+
+
+def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: Sequence[int]) -> Any:
+    """A function of two vectors that torch computes, such as positions and a step, as one of scalars."""
+    examples = [torch.zeros(size, dtype=torch.float64) for size in sizes]
+    graph, (found,) = trace(lambda x, y: [function(x, y)], examples)
+    return _function(casadi, "moved", graph, found.tolist(), sizes)
+
+
+def _stepped(
+    casadi: Any, code: PredictorCode, acceleration: Any, x: Sequence[Any], dt: float, integrator: str
+) -> list[Any]:
+    """The formulas of `integration.integrators`."""
+    (q, v, u), space, (nq, nv, _) = x, code.space, code.sizes
+    if space.is_vector_space:
+        moved, rate = operator.add, lambda step, at: at
+    else:
+        moved, rate = _of_space(casadi, space.integrate, (nq, nv)), _of_space(casadi, space.chart_velocity, (nv, nv))
+    if integrator == "symplectic-euler":
+        v = v + dt * acceleration(q, v, u)
+        return [moved(q, dt * v), v]
+    if integrator == "rk4":
+        k = [(v, acceleration(q, v, u))]
+        for share in (0.5 * dt, 0.5 * dt, dt):
+            at, step = v + share * k[-1][1], share * k[-1][0]
+            k.append((rate(step, at), acceleration(moved(q, step), at, u)))
+        step, change = (dt / 6.0 * (a + 2.0 * b + 2.0 * c + d) for a, b, c, d in zip(*k, strict=True))
+        return [moved(q, step), v + change]
+    middle, half = casadi.MX.sym("middle", v.numel()), 0.5 * dt
+    rest = middle - v - half * acceleration(q + half * middle, middle, u)
+    solve = casadi.rootfinder("solve", "newton", {"x": middle, "p": casadi.vertcat(q, v, u), "g": rest})
+    middle = solve(v, casadi.vertcat(q, v, u))
+    return [q + dt * middle, 2.0 * middle - v]
+
+
+def _function(casadi: Any, name: str, graph: Graph, nodes: Sequence[int], sizes: Sequence[int]) -> Any:
+    """Nodes of a graph as a function, by scalars, of vectors of these sizes, which together are its inputs."""
+    vectors = [casadi.SX.sym(f"x{number}", size) for number, size in enumerate(sizes)]
+    scalars = [entry for vector in vectors for entry in casadi.vertsplit(vector)]
+    return casadi.Function(name, vectors, [casadi.vertcat(*expressed(casadi, graph, nodes, scalars))])
+
+
+def _latents(casadi: Any, code: PredictorCode, x: Sequence[Any]) -> list[Any]:
+    """E f of every process in the order of their numbers."""
+    graph, found = Graph(sum(code.sizes)), {}
+    copied = Copier(graph, code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
+    for part in code.sums:
+        summed = part.summed if isinstance(part, OneInputCall) else part
+        given = summed.given(graph, copied(code.features[summed.latents[0]]))
+        z = _function(casadi, "operands", graph, given, code.sizes)(*x)
+        found |= dict(zip(summed.latents, _sum(casadi, summed, casadi.vertsplit(z)), strict=True))
+    return [found[c] for c in sorted(found)]
+
+
+def _sum(casadi: Any, part: KernelSum, z: Sequence[Any]) -> list[Any]:
+    """sum_j w_cj k_c(z, z_j), all centres in one row."""
+    known: dict[int, Any] = dict(zip(part.operands, z, strict=True))
+    known |= {node: casadi.DM(row).T for node, row in zip(part.rows, part.row_values(), strict=True)}
+    kernels = expressed(casadi, part.pair, list(part.kernels), [], known)
+    rows = [casadi.MX(k) for k in kernels]  # one number where a kernel is the same for all centres
+    return [
+        (k * math.fsum(weights.tolist()) if k.is_scalar() else casadi.mtimes(k, casadi.DM(weights.tolist()))) + constant
+        for k, weights, constant in zip(rows, part.weights, part.constants, strict=True)
+    ]
+
+
+def expressed(
+    casadi: Any, graph: Graph, nodes: Sequence[int], inputs: Sequence[Any], known: dict[int, Any] | None = None
+) -> list[Any]:
+    """Nodes of a graph without calls as CasADi expressions; `known` are those that are there already."""
+    found = dict(known or {})
+    for node in graph.needed(nodes, found):
+        if node in found:
+            continue
+        operation, *rest = graph.nodes[node]
+        given = [found[x] for x in graph.operands(node)]
+        match operation:
+            case "constant":
+                found[node] = rest[0]
+            case "input":
+                found[node] = inputs[rest[0]]
+            case str() if operation in OPERATORS:
+                found[node] = OPERATORS[operation](*given)
+            case "choose":
+                found[node] = casadi.if_else(*given)
+            case "look up":
+                value = rest[0][0]
+                for place, entry in enumerate(rest[0][1:], 1):
+                    value = casadi.if_else(given[0] >= place, entry, value)
+                found[node] = value
+            case _:
+                found[node] = getattr(casadi, NAMES.get(str(operation), str(operation)))(*given)
+    return [found[node] for node in nodes]

@@ -1,0 +1,179 @@
+"""Forces of a fitted model, each by itself, and those of the actuators that make a wanted acceleration."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.forces import Actuation, UnknownForces
+from forcegp.integration.integrators import find_roots, rows_jacobian
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.posterior.prediction import Gaussian
+from forcegp.robots.arguments import real_tensor, require_finite
+
+
+@dataclass(frozen=True, eq=False)
+class ForceComponent:
+    """One of the forces that add up to the unknown force, at a batch of states.
+
+    `joint_force` (..., nv) in Nm or N; `latents` (..., C) are the values of its processes, in `latent_units`;
+    `point_force` (..., 3) in N along the axes of the world, for forces that act at a point of the robot, else None;
+    `acceleration` (..., nv) in rad/s^2 or m/s^2 is what it adds to the acceleration under the constraint.
+    """
+
+    name: str
+    latent_names: tuple[str, ...]
+    latent_units: tuple[str, ...]
+    latents: Gaussian
+    joint_force: Gaussian
+    acceleration: Gaussian
+    point_force: Gaussian | None
+
+
+@dataclass(frozen=True, eq=False)
+class Components(Mapping[str, ForceComponent]):
+    """The components by name, what they add up to, and the constraint's answer.
+
+    `total` (..., nv) in Nm or N is the whole unknown force, with the covariances between components; `multiplier` is
+    lambda (..., m) and `contact_force` the world force of every contact on the robot (..., 3 m), in N, both with the
+    known forces in them.
+    """
+
+    total: Gaussian
+    multiplier: Gaussian
+    contact_force: Gaussian
+    parts: Mapping[str, ForceComponent] = field(default_factory=dict)
+
+    @override
+    def __getitem__(self, name: str) -> ForceComponent:
+        require_known("component", name, "this model", self.parts)
+        return self.parts[name]
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.parts)
+
+    @override
+    def __len__(self) -> int:
+        return len(self.parts)
+
+
+def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: Gaussian) -> Components:
+    """All components of Q_U = B f at the states of `dynamics`."""
+    robot = dynamics.state.robot
+    B = prior.direction(dynamics)
+    parts = {}
+    for name, term, which in prior.named(robot):
+        own, mixing = latents.entries(which), B[..., which]
+        point = term.point_force(dynamics)
+        parts[name] = ForceComponent(
+            name,
+            term.latent_names(robot),
+            term.latent_units(robot),
+            own,
+            joint_force=own.through(mixing),
+            acceleration=own.through(dynamics.H @ mixing),
+            point_force=None if point is None else own.through(point),
+        )
+
+    def constraint(affine: tuple[Tensor, Tensor]) -> Gaussian:
+        return latents.through(affine[1] @ B, affine[0])
+
+    multiplier, contact_force = dynamics.multiplier_map(), dynamics.contact_force_map()
+    return Components(latents.through(B), constraint(multiplier), constraint(contact_force), parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One process over some of its features, for example a friction curve: force over velocity.
+
+    `features` (n, d) and their names with units; `mean` and `std` (n,) in `unit`; `visited` (2, d) is the range of the
+    features in the training data.
+    """
+
+    name: str
+    unit: str
+    feature_names: tuple[str, ...]
+    features: Float[Tensor, "n d"]
+    mean: Float[Tensor, " n"]
+    std: Float[Tensor, " n"]
+    visited: Float[Tensor, "2 d"]
+
+    def interval(self, probability: float = 0.95) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Lower and upper end of the central interval of this probability."""
+        if not 0.0 < probability < 1.0:
+            raise InvalidInput(f"probability is {probability}; give a number between 0 and 1")
+        quantile = torch.special.ndtri(torch.tensor(0.5 * (1.0 + probability), dtype=torch.float64))
+        return self.mean - quantile * self.std, self.mean + quantile * self.std
+
+
+def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:
+    """Q_K + Q_U, the mean of what acts on the joints of a StructuredPosterior beside the contacts."""
+    Q_U = posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
+    return dynamics.Q_K + Q_U
+
+
+def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Q_K + Q_U (n, nv) at states (n, nv), and the entries (n, k) of dQ/du, M, A and b one after the other."""
+    Q, slope = rows_jacobian(lambda u: joint_force(posterior, posterior.dynamics(q, v, u)), u)
+    at = posterior.dynamics(q, v, u)
+    return Q, torch.cat([slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b], dim=-1).detach()
+
+
+def require_actuated(posterior: Any) -> None:
+    """Raises InvalidInput for a StructuredPosterior of which no u can be solved for."""
+    actuated = any(isinstance(force, Actuation) and force.known for force in posterior.model.laws)
+    nv, nu = posterior.model.sizes[1:]
+    if nv != nu:
+        raise InvalidInput(
+            f"no u makes every acceleration: {posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} "
+            "entries; search for u with `predictor.linearize` or `predictor.rollouts`."
+        )
+    if posterior.carries_known_forces or not actuated:
+        lacks = "RigidBodies()" if posterior.carries_known_forces else "Actuation()"
+        raise InvalidInput(
+            f"this model has no {lacks} among its laws, so no u can be solved for; call `predict`, or fit one that has."
+        )
+
+
+def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool) -> Gaussian:
+    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a StructuredPosterior at rows of q, v and a.
+
+    u stands on both sides: friction in proportion to the load changes with what presses the robot onto the surface,
+    and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
+    J = d(Q_K + Q_U)/du and the covariance S of the processes, that of u is to first order J^-1 B S B^T J^-T.
+    """
+    require_actuated(posterior)
+    q, v, a = (x.detach() for x in states)
+    shape = (len(q), len(posterior.model.contacts))
+    wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
+    if wanted.shape not in (shape, shape[1:]):
+        raise InvalidInput(
+            f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, one per contact."
+        )
+    require_finite("normal_force", wanted)
+
+    def surplus(u: Tensor, learned: bool = True) -> Tensor:
+        """What is left over of Q_K + Q_U + A^T lambda - M a."""
+        at = posterior.dynamics(q, v, u)
+        Q = joint_force(posterior, at) if learned else at.Q_K
+        return Q + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
+
+    with torch.no_grad():
+        # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
+        u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))
+        if not bool(found.all()):
+            raise NumericalError(
+                f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration: friction takes as much "
+                "as u adds, or a number is too large; check q, v, a and normal_force of that row."
+            )
+        if not covariance:
+            return Gaussian(u, None)
+        at = posterior.dynamics(q, v, u)
+        response = torch.linalg.solve(rows_jacobian(surplus, u)[1], posterior.trained.unknown.direction(at))
+        return Gaussian(u, posterior.latents(at, True).through(response).covariance)

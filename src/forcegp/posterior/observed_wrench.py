@@ -1,0 +1,245 @@
+"""Wind, and a slow force that no feature explains: observed from the past rows of a recording, then known."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from forcegp.data import AirLaw, Dataset, find_wind, with_wind
+from forcegp.data.filtering import episodes_in_order, sums_before
+from forcegp.data.wind import steady_forces
+from forcegp.errors import InvalidInput
+from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
+from forcegp.forces.thrusters import FADES
+from forcegp.model import Model
+from forcegp.posterior.posterior import ROWS_PER_BLOCK, AnyPosterior, Posterior
+
+NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+LASTING = tuple(name.replace("observed", "lasting") for name in NAMES)
+TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
+MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
+SLOW, AHEAD, LEARNING = 4.0, 0.5, 10.0  # s: of the mean that stays, of what is foreseen, of how well it was
+
+
+def observing(
+    posterior: AnyPosterior, dataset: Dataset, *, seconds: float | None = None, whole: bool = False
+) -> tuple[AnyPosterior, Dataset]:
+    """The posterior and the recording with an `ObservedWrench`, in six or twelve more columns of u.
+
+    Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
+    that the rows before show (`AirLaw.wind_before`).
+
+    Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
+    episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
+    et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
+    what follows, and rows with a past shorter than that time are left out unless `whole`. By default the prior's
+    `AerodynamicForce` gives link and time. Where it leaves the time open, each component takes that of .02 to 1 s
+    which missed least in the second before; and where no wind is observed, six more columns hold what will last of it,
+    to which predicted motions fade. Otherwise they hold it: what is left of gusts beside an observed wind stays longer.
+    Without such a prior, or where its time is 0, both come back as they are.
+
+    Calibrated intervals of motions go along unless `seconds` is given.
+
+    Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
+    for a recording that is too short or whose rows are not in order of time.
+    """
+    own = next((term for term in posterior.trained.unknown_forces if isinstance(term, AerodynamicForce)), None)
+    times = TRIED if seconds is None else (seconds,)
+    # calibrated widths are of what is observed by default
+    widths = posterior.settings.get("motion_intervals") if seconds is None else None
+    if seconds is None:
+        seconds = 0.0 if own is None else LEAST if own.observe is None else own.observe
+        times = times if own is None or own.observe is None else (seconds,)
+        if seconds == 0.0 or ObservedWrench in map(type, posterior.model.laws):
+            return posterior, dataset
+    if not 0.0 < seconds < 1e6:
+        raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
+    frame = (own or AerodynamicForce()).link(posterior.model.robot)
+    posterior, dataset = _in_observed_wind(posterior, dataset)
+    unexplained, effect = _unexplained(posterior, dataset, frame)
+    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
+    held = len(times) == 1 or _observes(posterior.model)
+    observed = _observed(wrench, dataset, times, held)
+    model = _with_wrench(posterior.model, frame, NAMES if held else NAMES + LASTING)
+    truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
+    seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), model=model, truth=truth)
+    posterior = posterior.with_model(model)
+    if widths is not None:
+        posterior = posterior.with_settings(motion_intervals=widths)
+    return posterior, seen if whole else seen.rows(_with_past(dataset, seconds))
+
+
+def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] | None:
+    """What air did in the rows, for the settings of a fit, and the rows with columns that hold it and a model for them.
+
+    Where the rows show their wind (`forcegp.data.find_wind`), these are its law and velocity; else, for several
+    episodes, an `ObservedWrench` with the force that each has of its own (`steady_forces`), so that no function has to
+    explain it. None where the model has no `AerodynamicForce` or observes nothing (`observe=0`), where it
+    observes already, and where the rows show neither.
+    """
+    of_air = [term for term in model.unknown_forces if isinstance(term, AerodynamicForce) and term.observe != 0.0]
+    if not of_air or _observes(model) or dataset.u.shape[1] != model.sizes[2]:
+        return None
+    rows = replace(dataset, model=model, truth={})
+    if (found := find_wind(rows)) is not None:
+        law, wind = found
+        windy = (replace(x, wind=law.wind) if isinstance(x, AerodynamicForce) else x for x in model.forces)
+        return {"air": law.to_dict()}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
+    frame = of_air[0].link(model.robot)
+    if (forces := steady_forces(rows)) is None or frame != AerodynamicForce().link(model.robot):
+        return None
+    columns = np.concatenate([rows.u, forces, np.zeros_like(forces)], axis=1)
+    each = {str(number): forces[rows.episode == number][0].tolist() for number in rows.episodes}
+    seen = replace(rows, u=columns, model=_with_wrench(model, frame))
+    return {"steady_forces": each}, seen
+
+
+def _with_wrench(model: Model, frame: str, names: tuple[str, ...] = NAMES) -> Model:
+    return replace(model, forces=(*model.forces, ObservedWrench(frame, names)))
+
+
+def _observes(model: Model) -> bool:
+    return any(isinstance(force, ObservedWind | ObservedWrench) for force in model.forces)
+
+
+def unobserved(model: Model) -> Model:
+    """The system without the columns of u that :func:`in_air` gives it."""
+    own = ObservedWind.names, NAMES, NAMES + LASTING
+    return replace(model, forces=tuple(x for x in model.forces if getattr(x, "names", ()) not in own))
+
+
+def require_unobserved(posterior: Posterior, what: str) -> None:
+    """Raise InvalidInput for what `observing` gave, where `what` observes by itself."""
+    if len(posterior.model.inputs) > len(posterior.trained.inputs):
+        raise InvalidInput(
+            f"{what} include the observers of the model: give the posterior and the recording as they were before "
+            "`observing`."
+        )
+
+
+def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
+    """Rows to `update` with as the system has them that the model was trained on: with the wind, where that has it.
+
+    Raises InvalidInput for a posterior that was carried to another system, and for rows with less than .1 s of their
+    own past, which show no wind.
+    """
+    target, own = posterior.target, posterior.trained
+    if target is None:
+        return rows
+    in_air = {"air", "steady_forces"} & set(posterior.settings)
+    if not in_air or target.known.to_dict() != unobserved(own).known.to_dict():
+        raise InvalidInput(
+            "the posterior was carried to another system than the one that its rows were measured on; update it "
+            "before it is carried there: posterior.update(rows).with_system(system)."
+        )
+    if "steady_forces" in posterior.settings:  # what is new in their flight is to be learned
+        return _with_forces(posterior, rows, {})
+    return in_own_air(posterior, rows)
+
+
+def in_own_air(posterior: Posterior, rows: Dataset) -> Dataset:
+    """Rows of the recording of a fit with the columns that the model's own rows have: wind, or the force that stays.
+
+    Rows that show no wind are left out. Raises InvalidInput where all have less than .1 s of their own past.
+    """
+    if (steady := posterior.settings.get("steady_forces")) is not None:
+        return _with_forces(posterior, rows, steady)
+    if "air" not in posterior.settings:
+        return rows
+    _, seen = _in_observed_wind(posterior, rows)
+    return seen.rows(_with_past(rows, LEAST))
+
+
+def _with_forces(posterior: Posterior, rows: Dataset, each: Mapping[str, Sequence[float]]) -> Dataset:
+    """Rows with the force of each episode, none where it is not named, in the columns of the fit's `ObservedWrench`."""
+    frame = next(x.frame for x in posterior.trained.laws if isinstance(x, ObservedWrench))
+    wrench = np.array([[*each.get(str(number), (0.0,) * 3), 0.0, 0.0, 0.0] for number in rows.episode])
+    columns = np.concatenate([rows.u, wrench], axis=1)
+    return replace(rows, u=columns, model=_with_wrench(posterior.model, frame), truth={})
+
+
+def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
+    """Which rows have a past of that time in their episode. Raises InvalidInput for none."""
+    first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
+    late = np.flatnonzero(dataset.time - np.array([first[number] for number in dataset.episode]) >= seconds)
+    if not len(late):
+        raise InvalidInput(
+            f"the rows hold less than {seconds:g} s of flight, which does not show their wind; give longer pieces."
+        )
+    return late
+
+
+def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
+    """Both with the wind that the rows before each one show, where the fit found a law of air."""
+    stored = posterior.settings.get("air")
+    if stored is None or _observes(posterior.model):
+        return posterior, dataset
+    rows = replace(dataset, model=posterior.model)
+    seen = with_wind(rows, AirLaw.from_dict(stored).wind_before(rows))
+    assert seen.model is not None, "it was given one"
+    return posterior.with_model(seen.model), seen
+
+
+def _unexplained(
+    posterior: Posterior, dataset: Dataset, frame: str
+) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv 6"]]:
+    """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
+    device, parts = posterior.model.robot.device, []
+    rows = (torch.tensor(x, device=device).split(ROWS_PER_BLOCK) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
+    for q, v, u, a in zip(*rows, strict=True):
+        with torch.no_grad():
+            dynamics = posterior.dynamics(q, v, u)
+            effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
+            parts.append((a - posterior.predict(q, v, u, covariance=False).mean, effect))
+    unexplained, effects = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
+    return unexplained, effects
+
+
+def _observed(
+    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float], held: bool
+) -> Float[np.ndarray, "rows columns"]:
+    """The wrench that the rows before each show, none at the first of an episode, and what lasts unless it is held.
+
+    Of several times each component takes the one whose observer missed least in the rows before.
+    """
+    observed = np.zeros((len(wrench), 6 if held else 12))
+    for number, rows, _ in episodes_in_order(dataset):
+        own = np.flatnonzero(dataset.episode == number)
+        means = np.stack([_past_mean(wrench[own], rows.time, time) for time in times])  # (times, rows, 6)
+        missed = np.stack([_past_mean(np.square(wrench[own] - mean), rows.time, MEMORY) for mean in means])
+        now = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
+        observed[own] = now if held else np.hstack([now, _lasting(wrench[own], now, rows.time)])
+    return observed
+
+
+def _lasting(
+    wrench: Float[np.ndarray, "rows 6"], now: Float[np.ndarray, "rows 6"], time: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows 6"]:
+    """What stays of the wrench `now`: the mean of the last 4 s, and a share of how far it is from that.
+
+    The share is the one with which the mean of the coming .5 s would have been predicted best in the rows before (least
+    squares, drawn to one half), where the rest fades (`ObservedWrench`).
+    """
+    slow = _past_mean(wrench, time, SLOW)
+    count = max(1, round(AHEAD / float(np.median(np.diff(time))))) if len(time) > 1 else 1
+    fading = float(np.exp(-np.linspace(0.0, AHEAD, count, endpoint=False) / FADES).mean())
+    away = now - slow
+    explained = (1.0 - fading) * away
+    products = np.zeros((len(time), 12))
+    if (known := len(time) - count + 1) > 0:
+        total = np.cumsum(np.vstack([np.zeros(6), wrench]), axis=0)
+        coming = (total[count:] - total[:-count]) / count
+        missing = coming - (slow + fading * away)[:known]
+        products[count - 1 :] = np.hstack([missing * explained[:known], np.square(explained[:known])])
+    sums = sums_before(products, time, LEARNING)
+    drawn = count * _past_mean(np.square(explained), time, LEARNING) + 1e-300
+    return slow + np.clip((sums[:, :6] + 0.5 * drawn) / (sums[:, 6:] + drawn), 0.0, 1.0) * away
+
+
+def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:
+    """Means of the rows before each, with weights exp(-age / seconds); zero for the first."""
+    sums = sums_before(np.concatenate([values, np.ones((len(values), 1))], axis=1), time, seconds)
+    return sums[:, :-1] / np.where(sums[:, -1:] > 0.0, sums[:, -1:], 1.0)

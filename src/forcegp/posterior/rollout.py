@@ -1,0 +1,387 @@
+"""Where a robot goes according to a fitted model: `Rollout`, and one step x+ = f(x, u) with its derivatives."""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
+from forcegp.inference.threads import blas_threads
+from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
+from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
+from forcegp.mechanics import Baumgarte
+from forcegp.model import Model
+from forcegp.posterior.fused_rollouts import FusedLoop, fused, steps_of
+from forcegp.posterior.motion_intervals import MotionIntervals
+from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite, whole_number
+from forcegp.robots.manifold import ConfigurationSpace
+
+STEPS_TO_COMPILE = 2000
+"""Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
+ROWS_PER_BLOCK = 4096
+"""States whose constraint is evaluated at once."""
+
+Quantity = Literal["q", "v", "a", "constraint", "velocity_constraint"]
+
+AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""(q, v, u) -> a, all of one shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class AccelerationModel:
+    """What a rollout integrates: accelerations of a fitted model in `system`, under the stabilisation of that rollout.
+
+    `mean()` is the mean acceleration at states (n, nv). `sampled(samples, seed)` are the accelerations of so many
+    functions drawn from the model, each at states of its own (samples, n, nv); it raises InvalidInput for models from
+    which none can be drawn.
+    """
+
+    model: Model
+    baumgarte: Baumgarte | None
+    mean: Callable[[], AccelerationFunction]
+    sampled: Callable[[int, int], AccelerationFunction]
+    compiled: Callable[[str, int, int], list[FusedLoop] | None] | None = None
+    """(integrator, samples, seed) -> loops over the functions that `sampled` draws, or with 0 samples over the mean, as
+    machine code; None where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Motions of T steps from one or more initial states; batch dimensions are those of q0.
+
+    Fields
+    ------
+    time: (T+1,) in s, from 0.
+    q, v: (..., T+1, nv) in rad and rad/s (m and m/s), q of a base that moves (..., T+1, nq); row 0 is the initial
+        state, which `integrator="projected"` moves onto the constraint first. Angles are not wrapped.
+    a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
+    constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
+        signed distances).
+    velocity_constraint: A(q) v (..., T+1, m) in m/s.
+    initial_correction: (..., 2) largest change of any joint's position and velocity that the projection of the initial
+        state made; 0 for integrators that do not project.
+    diverged_at: (...) the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    integrator, baumgarte: how the motion was computed.
+    samples: with samples=S, the same for S functions drawn from the model's posterior, shapes (S, ..., T+1, nv);
+        None without. Each sample is one function: it answers the same state always with the same force.
+    intervals: calibrated widths of intervals, of the model; None without.
+    space: of the positions. Where a base moves they do not add up, so deviations of q are steps (nv,) from the q here,
+        in the axes of the base: `robot.difference(rollout.q, other)`.
+    """
+
+    time: Float[Tensor, " rows"]
+    q: Float[Tensor, "*batch rows nq"]
+    v: Float[Tensor, "*batch rows nv"]
+    a: Float[Tensor, "*batch steps nv"]
+    constraint: Float[Tensor, "*batch rows m"]
+    velocity_constraint: Float[Tensor, "*batch rows m"]
+    initial_correction: Float[Tensor, "*batch 2"]
+    diverged_at: Int[Tensor, "*batch"]
+    integrator: str
+    baumgarte: Baumgarte | None
+    samples: "Rollout | None" = None
+    intervals: MotionIntervals | None = None
+    space: ConfigurationSpace = VECTORS
+
+    def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
+        """Lower and upper ends (..., T+1, nv) of the 95 % interval.
+
+        Of a model with calibrated intervals (`Posterior.calibrated_on_motions`) those, centred on the mean; else the
+        quantiles of the samples. Where a base moves, ends of q are steps from q: another motion lies within where
+        `low <= robot.difference(rollout.q, other) <= high`. Raises InvalidInput where there is neither.
+        """
+        if self.intervals is None:
+            low, high = self.quantiles((0.025, 0.975), quantity)
+            return low, high
+        center, enough = getattr(self, quantity), self.samples is not None and len(self.samples.q) > 1
+        if quantity == "q" and not self.space.is_vector_space:
+            center = torch.where(center.isnan().any(-1, keepdim=True), torch.nan, 0.0)
+        half = self.intervals.half_width(quantity, self.time, self.std(quantity) if enough else None)
+        return center - half, center + half
+
+    def std(self, quantity: Quantity = "q") -> Tensor:
+        """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.
+
+        Of q where a base moves, that of steps (..., T+1, nv).
+        Raises InvalidInput for a rollout with fewer than two samples.
+        """
+        return self._sampled(quantity, least=2).std(0)
+
+    def quantiles(self, levels: Sequence[float] = (0.025, 0.5, 0.975), quantity: Quantity = "q") -> Tensor:
+        """Quantiles (levels, ...) over the samples; NaN from where one sample diverged. Where a base moves, of steps.
+
+        Raises InvalidInput for a rollout without samples, or levels outside 0 to 1.
+        """
+        if not all(0.0 <= level <= 1.0 for level in levels):
+            raise InvalidInput(f"quantile levels are {tuple(levels)}; each must be from 0 to 1.")
+        values = self._sampled(quantity, least=1)
+        return torch.quantile(values, torch.tensor(levels, dtype=values.dtype, device=values.device), dim=0)
+
+    def _sampled(self, quantity: Quantity, least: int) -> Tensor:
+        count = 0 if self.samples is None else self.samples.q.shape[0]
+        if count < least:
+            raise InvalidInput(
+                f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
+            )
+        values: Tensor = getattr(self.samples, quantity)
+        on_manifold = quantity == "q" and not self.space.is_vector_space
+        return self.space.difference(self.q, values) if on_manifold else values
+
+
+def roll_out(
+    model: AccelerationModel,
+    q0: Any,
+    v0: Any,
+    u: Any,
+    dt: float,
+    *,
+    integrator: str = "symplectic-euler",
+    feedback: Feedback | None = None,
+    samples: int = 0,
+    seed: int = 0,
+    grad: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Rollout:
+    """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
+    samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
+    method = integrator_named(integrator, model.model)
+    require_type("grad", grad, bool)
+    robot = model.model.robot
+    q, v, forces, batch = checked_start(model.model.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
+    steps = forces.shape[0]
+    total = steps * (1 + bool(samples))
+
+    counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
+
+    def run(function: AccelerationFunction, copies: tuple[int, ...], what: str, before: int) -> Rollout:
+        shape, count = (*copies, *batch), math.prod(copies)
+        start = q.repeat(count, 1), v.repeat(count, 1)
+        control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
+        report = None if counted is None else counted(before)
+        given = (method, function, *start, forces.repeat(1, count, 1), dt)
+        loops = None
+        if feedback is None and not grad:
+            loops = _loops(model, integrator, steps, math.prod(copies) if copies else 0, seed)
+        if loops is None:
+            motion = integrate(*given, feedback=control, what=what, progress=report)
+        else:
+            motion = fused(loops, *given, torch.get_num_threads(), what)
+            if report is not None:
+                report(steps, steps)
+        q_rows, v_rows, a_rows = (
+            x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
+        )
+        blocks = zip(*(x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q_rows, v_rows)), strict=True)
+        parts = zip(*(ConstraintManifold(model.model).violation(*block) for block in blocks), strict=True)
+        c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
+        change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
+        correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
+        time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
+        moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
+        return Rollout(time, *moved, integrator, model.baumgarte, space=robot.space)
+
+    with torch.set_grad_enabled(grad), blas_threads(0):
+        mean = run(model.mean(), (), "rollouts", 0)
+        if samples:
+            sampled = by_sample(model.sampled(samples, seed), samples)
+            mean = replace(mean, samples=run(sampled, (samples,), "sampled rollouts", steps))
+        return mean
+
+
+def remembering(
+    model: Model, u: Tensor, dt: float, feedback: Feedback | None
+) -> tuple[Float[Tensor, "*batch T nu"], Feedback]:
+    """u without memory but in its first row, and feedback that adds what laws remember of the motion since then."""
+    memory = model.memory
+    first = model.inputs.index(memory.names[0])
+    columns = slice(first, first + len(memory.names))
+    begin, u = u[..., 0, columns].clone(), u.clone()
+    u[..., columns] = 0.0
+    last: list[tuple[Tensor, Tensor]] = []
+
+    def added(k: int, q: Tensor, v: Tensor) -> Tensor:
+        now = begin.expand(*v.shape[:-1], -1)
+        if k == 0:
+            last.clear()
+        else:
+            before, was = last.pop()
+            now = memory.after(was, model.robot.difference(before, q), dt)
+        last.append((q, now))
+        other = v.new_zeros(*v.shape[:-1], u.shape[-1]) if feedback is None else feedback(k, q, v).clone()
+        return torch.cat([other[..., : columns.start], now, other[..., columns.stop :]], dim=-1)
+
+    return u, added
+
+
+def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, seed: int) -> list[FusedLoop] | None:
+    """Compiled loops, where motions are long enough to be worth compiling them."""
+    space = model.model.robot.space
+    work = steps * max(1, samples) * (1 + len(model.model.contacts))
+    if model.compiled is None or integrator not in steps_of(space) or work < STEPS_TO_COMPILE:
+        return None
+    try:
+        return model.compiled(integrator, samples, seed)
+    except CompilerError as error:
+        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=5)
+    except InvalidInput:  # an operation that no program holds, another device
+        pass
+    return None
+
+
+def _flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedback:
+    """Feedback that sees the caller's batch dimensions as one of (n, nv). Raises InvalidInput for other shapes."""
+
+    def flat(k: int, q: Tensor, v: Tensor) -> Tensor:
+        shape = (*batch, size)
+        added = feedback(k, q.reshape(*batch, -1), v.reshape(*batch, -1))
+        if not isinstance(added, Tensor) or added.shape != shape:
+            given = tuple(added.shape) if isinstance(added, Tensor) else type(added).__name__
+            raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as u.")
+        return added.reshape(-1, size)
+
+    return flat
+
+
+def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
+    """A function of (samples, n, nv) as one of (samples * n, nv)."""
+
+    def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        rows = v.shape[:-1].numel() // samples  # not -1: u may have no columns
+        return function(*(x.reshape(samples, rows, x.shape[-1]) for x in (q, v, u))).reshape(v.shape)
+
+    return flat
+
+
+def checked_start(
+    sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
+) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
+    """q0, v0 (n, size), u (T, n, size) as float64 tensors on the robot's device, and the batch dimensions.
+
+    Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
+    """
+    given = {name: real_tensor(name, values, device).to(device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
+    for size, (name, values) in zip(sizes, given.items(), strict=True):
+        if values.requires_grad and torch.is_grad_enabled() and remedy is not None:
+            raise InvalidInput(
+                f"{name} requires a gradient, which a rollout drops unless asked to keep it; {remedy}, or "
+                f"{name}.detach()."
+            )
+        least = 2 if name == "u" else 1
+        if values.dim() < least or values.shape[-1] != size:
+            wanted = f"(..., T, {size})" if name == "u" else f"(..., {size})"
+            raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
+        require_finite(name, values)
+    q, v, forces = given.values()
+    steps = forces.shape[-2]
+    if not steps:
+        raise InvalidInput("u has no rows; a rollout has at least one step.")
+    batch = broadcast_batch({"q0": q.shape[:-1], "v0": v.shape[:-1], "u": forces.shape[:-2]})
+    if not batch.numel():
+        raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
+    q, v = (x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in (q, v))
+    forces = forces.expand(*batch, -1, -1).reshape(batch.numel(), steps, forces.shape[-1]).movedim(1, 0).contiguous()
+    return q, v, forces, batch
+
+
+class StepLinearization(NamedTuple):
+    """The state (q, v) after a step from x = (q, v) under u, and the affine model of the step: x+ = A x + B u + c.
+
+    `q`, `v` (nv,); `A` (2 nv, 2 nv) and `B` (2 nv, nu) are the derivatives in x and u, and `c` (2 nv,) = x+ - A x - B u
+    makes the model exact at this x and u. All with the leading dimension of states. Where a base moves, q in x and x+
+    is a step (nv,) from the given q and from the `q` (nq,) here, at which both are 0.
+    """
+
+    q: Tensor
+    v: Tensor
+    A: Tensor
+    B: Tensor
+    c: Tensor
+
+
+def stepped(
+    mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
+) -> Float[Tensor, "n state"]:
+    """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
+    method = _method(model, dt, integrator)
+    q, v, u = x.split(model.sizes, dim=-1)
+    step = method.step(lambda q, v: mean(q, v, u), q, v, dt)
+    if not bool(step.found.all()):
+        row = int((~step.found).nonzero()[0])
+        raise NumericalError(f"{method.failure} from state {row}; give a dt below {dt:g} s, or check that state.")
+    return torch.cat([step.q, step.v], dim=-1)
+
+
+def linearized_step(
+    step: Callable[[Tensor, float, str], Tensor],
+    linearize: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
+    model: Model,
+    x: Float[Tensor, "n rows"],
+    dt: Any,
+    integrator: Any,
+) -> StepLinearization:
+    """The same with its derivatives, by the chain rule; of an implicit step by the implicit function theorem.
+
+    `step` gives [q, v] after it from the rows x, `linearize` gives a (n, nv), da/dq, da/dv and da/du (n, nv, nv).
+    """
+    method, (q, v, u) = _method(model, dt, integrator), x.detach().split(model.sizes, dim=-1)
+    nv, unit = q.shape[-1], torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+
+    def joined(value: Tensor, slopes: Tensor) -> Tensor:
+        """A value and its derivatives in q, v, u as one row, for explicit steps are linear in these."""
+        return torch.cat([value[..., None], slopes.expand(*value.shape, -1)], dim=-1).flatten(1)
+
+    def acceleration(at_q: Tensor, at_v: Tensor) -> Tensor:
+        at_q, at_v = (part.unflatten(1, (nv, -1)) for part in (at_q, at_v))
+        a, da_dq, da_dv, da_du = linearize(at_q[..., 0], at_v[..., 0], u)
+        return joined(a, da_dq @ at_q[..., 1:] + da_dv @ at_v[..., 1:] + da_du @ unit[2 * nv :])
+
+    start_q, start_v = joined(q, unit[:nv]), joined(v, unit[nv : 2 * nv])
+    if isinstance(method, ImplicitMidpoint):
+        middle = 0.5 * (v + step(x.detach(), dt, integrator)[:, nv:])
+        _, da_dq, da_dv, da_du = linearize(q + 0.5 * dt * middle, middle, u)
+        J = unit[:nv, :nv] - 0.5 * dt * (da_dv + 0.5 * dt * da_dq)
+        right = torch.cat([0.5 * dt * da_dq, unit[:nv, :nv].expand_as(J), 0.5 * dt * da_du], dim=-1)
+        at_middle = joined(middle, torch.linalg.solve(J, right))
+        end = start_q + dt * at_middle, 2.0 * at_middle - start_v
+    else:
+        found = method.step(acceleration, start_q, start_v, dt)
+        end = found.q, found.v
+    there, slopes = torch.cat([part.unflatten(1, (nv, -1)) for part in end], dim=1).split([1, len(unit)], dim=-1)
+    c = there[..., 0] - (slopes @ x.detach()[..., None])[..., 0]
+    (q, v), (A, B) = there[..., 0].split(nv, dim=-1), slopes.split([2 * nv, u.shape[-1]], dim=-1)
+    return StepLinearization(q, v, A, B, c)
+
+
+def linearized_on_manifold(
+    mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
+) -> StepLinearization:
+    """The same where positions do not add up, in steps from q and from the q after it; by backward passes of `mean`."""
+    space, (nq, nv, _) = model.robot.space, model.sizes
+    q, rest = x.detach().split([nq, x.shape[-1] - nq], dim=-1)
+    there = stepped(mean, model, x.detach(), dt, integrator)[:, :nq]
+
+    def moved(z: Tensor) -> Tensor:
+        start = torch.cat([space.integrate(q, z[:, :nv]), z[:, nv:]], dim=-1)
+        end = stepped(mean, model, start, dt, integrator)
+        return torch.cat([space.difference(there, end[:, :nq]), end[:, nq:]], dim=-1)
+
+    end, slopes = rows_jacobian(moved, torch.cat([torch.zeros_like(rest[:, :nv]), rest], dim=-1))
+    A, B = slopes.split([2 * nv, slopes.shape[-1] - 2 * nv], dim=-1)
+    c = end - (A[..., nv:] @ rest[:, :nv, None] + B @ rest[:, nv:, None])[..., 0]
+    return StepLinearization(there, end[:, nv:], A, B, c)
+
+
+def _method(model: Model, dt: Any, integrator: Any) -> Integrator:
+    check_time_step(dt)
+    method = integrator_named(integrator, model)
+    if integrator == "projected":
+        raise InvalidInput(
+            "a step is not 'projected': it would move the given state onto the contacts first; give "
+            f"{', '.join(map(repr, INTEGRATORS.keys() - {integrator}))}, or roll out with integrator='projected'."
+        )
+    return method
