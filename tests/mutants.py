@@ -41,7 +41,7 @@ from tests.mutant_sample import REPOSITORY, Mutant, digest, mutants, python_file
 FOLDER = REPOSITORY / ".mutants"
 COPY = FOLDER / "src"
 EXPLAINED = Path(__file__).with_name("equivalent_mutants.toml")
-PACKAGES = ("inference", "mechanics", "robots", "priors", "data", "models")
+PACKAGES = ("inference", "mechanics", "robots", "forces", "data", "evidence", "posterior", "fit")
 ENOUGH = 0.9
 """Share of killed mutants that is asked for."""
 IMPORTED_ONCE = ("torch", "torch.func", "gpytorch", "scipy.optimize", "scipy.signal", "scipy.stats", "scipy.spatial")

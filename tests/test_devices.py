@@ -1,32 +1,33 @@
 """Everything computes on the device of its robot: on a pretended one here, on real ones where they are."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from tests.devices import DEVICES, PRETEND, MixedDevices, PretendTensor, pretend_device
 from tests.inference.dense import dense_covariance
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import evaluate
+from forcegp.evidence import MarginalLikelihood, TrainingData
+from forcegp.fit import fit
+from forcegp.forces import Coulomb, JointForces, RigidBodies, Viscous, parse_forces
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import CoulombJointFriction, ViscousJointFriction
-from forcegp.models import (
-    IndependentGP,
-    MarginalLikelihood,
-    StructuredGP,
-    TrainingData,
-    load_posterior,
-    save_posterior,
-)
-from forcegp.models.training_data import Noise
-from forcegp.priors.named import named_prior
+from forcegp.noise import Noise
+from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots.arguments import usable_device
 
 QUICK = OptimizerOptions(iterations=2)
-PRIORS = ("joint", "load-friction + joint-friction", "tool-friction", "joint-ripple", "joint:kernel=deep")
+PRIORS = (
+    "gp:joint",
+    "gp:load-friction,gp:joint-friction",
+    "gp:tool-friction",
+    "gp:joint-ripple",
+    "gp:joint:kernel=deep",
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::forcegp.errors.NumericalWarning", "ignore::forcegp.errors.DataWarning")
 
@@ -90,12 +91,12 @@ def test_numbers_of_the_cpu_may_join_and_trips_to_the_host_are_counted():
 
 
 def test_robots_and_constrained_dynamics_never_wait_for_the_host():
-    system = arm_system()
-    forces = (*system.known_forces, ViscousJointFriction(0.1), CoulombJointFriction([0.1, 0.2, 0.3]))
-    system = type(system)(system.robot, system.contacts, forces, system.baumgarte)
-    expected = system.dynamics(*states("cpu"))
+    model = arm_model()
+    forces = (*model.forces, Viscous(0.1), Coulomb([0.1, 0.2, 0.3]))
+    model = replace(model, forces=forces)
+    expected = model.dynamics(*states("cpu"))
     with pretend_device() as trips:
-        there = system.to(PRETEND)
+        there = model.to(PRETEND)
         q, v, u = states(PRETEND)
         trips.clear()  # of the checks of friction coefficients
         robot = there.robot
@@ -113,11 +114,11 @@ def test_the_likelihood_waits_for_a_few_flags_whatever_the_number_of_rows(prior)
     counts, values, conditions = [], [], []
     for rows in (6, 12):
         data = arm_data(rows, seed=1)
-        model = StructuredGP(data.system, named_prior(prior))
+        model = data.model.with_forces(parse_forces(prior))
         plain = likelihood_and_gradients(model, data, torch.device("cpu"))[1:]
         conditions.append(condition_number(model, data))
         with pretend_device() as trips:
-            model = StructuredGP(data.system.to(PRETEND), named_prior(prior))
+            model = data.model.to(PRETEND).with_forces(parse_forces(prior))
             before, value, slopes = likelihood_and_gradients(model, data, PRETEND, trips)
         assert not (trips - before).keys() & {"copy", "tolist"}
         counts.append((trips - before)["number"])
@@ -134,8 +135,8 @@ def test_the_likelihood_waits_for_a_few_flags_whatever_the_number_of_rows(prior)
 
 def condition_number(model, data) -> float:
     """Of the dense covariance of all accelerations, at the start."""
-    likelihood = MarginalLikelihood(model.system, model.prior, model.mean, TrainingData.of(data, torch.device("cpu")))
-    kernels = likelihood.kernels()
+    likelihood = MarginalLikelihood(model, TrainingData.of(data, torch.device("cpu")))
+    kernels = likelihood.kernels
     parameters = kernels.initial_parameters() | Noise(0.05).parameters(3, torch.device("cpu"))
     terms = likelihood.terms(parameters)
     matrices = kernels.matrices(parameters, terms.features)
@@ -144,8 +145,8 @@ def condition_number(model, data) -> float:
 
 
 def likelihood_and_gradients(model, data, device, trips=None):
-    likelihood = MarginalLikelihood(model.system, model.prior, model.mean, TrainingData.of(data, device))
-    kernels = likelihood.kernels()
+    likelihood = MarginalLikelihood(model, TrainingData.of(data, device))
+    kernels = likelihood.kernels
     parameters = kernels.initial_parameters() | Noise(0.05).parameters(3, device)
     parameters = {name: value.clone().requires_grad_() for name, value in parameters.items()}
     likelihood.terms(parameters)  # what does not depend on parameters is computed once
@@ -158,13 +159,13 @@ def likelihood_and_gradients(model, data, device, trips=None):
 @pytest.mark.parametrize(
     ("prior", "integrators"),
     [
-        ("load-friction:expected=0.1 + joint-friction", ["symplectic-euler"]),
-        ("joint:kernel=deep", ["rk4", "projected"]),
+        ("gp:load-friction:expected=0.1,gp:joint-friction", ["symplectic-euler"]),
+        ("gp:joint:kernel=deep", ["rk4", "projected"]),
     ],
 )
 def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path):
     data, test = arm_data(14, seed=1), arm_data(3, seed=2)
-    posterior = StructuredGP(data.system, named_prior(prior)).fit(data.rows(slice(0, 10)), restarts=1, options=QUICK)
+    posterior = fit(data.model.with_forces(parse_forces(prior)), data.rows(slice(0, 10)), restarts=1, options=QUICK)
     expected = posterior.predict(test.q, test.v, test.u)
     with pretend_device():
         there = posterior.to(PRETEND)
@@ -189,26 +190,27 @@ def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path)
 def test_fits_with_several_starts_on_the_pretended_device():
     data, test = arm_data(12, seed=3), arm_data(3, seed=4)
     how = {"restarts": 2, "options": QUICK}
-    expected = StructuredGP(data.system, noise=Noise(0.05, learn=True)).fit(data, **how)
+    expected = fit(data.model.with_forces(JointForces(), noise=Noise(0.05, learn=True)), data, **how)
     with pretend_device():
-        system = data.system.to(PRETEND)
-        posterior = StructuredGP(system, noise=Noise(0.05, learn=True)).fit(data, **how)
-        assert all(isinstance(value, PretendTensor) for value in posterior.parameters.values())
+        model = data.model.to(PRETEND)
+        posterior = fit(model.with_forces(JointForces(), noise=Noise(0.05, learn=True)), data, **how)
+        assert all(isinstance(value, PretendTensor) for value in posterior.hyperparameters.values())
         assert posterior.result.value == pytest.approx(expected.result.value, rel=1e-8)
         assert evaluate(posterior, test).mae == pytest.approx(evaluate(expected, test).mae, rel=1e-6)
-        learned = StructuredGP(system).identify(
-            data, system.robot.link("hand").inertial("mass"), restarts=1, options=QUICK
-        )
+        learned = fit(model.with_forces(RigidBodies(learn=("hand",)), JointForces()), data, restarts=1, options=QUICK)
         assert math.isfinite(learned.result.value)
-        forces = StructuredGP(system, mean="zero", noise=Noise(0.05, 0.02, learn=True)).fit(
-            data, restarts=1, options=QUICK
+        forces = fit(
+            model.with_forces(JointForces(), noise=Noise(0.05, 0.02, learn=True)).without_mean(),
+            data,
+            restarts=1,
+            options=QUICK,
         )
         assert math.isfinite(forces.result.value)
 
 
 def test_inducing_points_on_the_pretended_device():
     data, test = arm_data(16, seed=10), arm_data(2, seed=11)
-    posterior = StructuredGP(data.system).fit(data, restarts=1, options=QUICK, engine="inducing")
+    posterior = fit(data.model.with_forces(JointForces()), data, restarts=1, options=QUICK, engine="inducing")
     expected = posterior.predict(test.q, test.v, test.u)
     with pretend_device():
         found = posterior.to(PRETEND).predict(test.q, test.v, test.u)
@@ -218,9 +220,9 @@ def test_inducing_points_on_the_pretended_device():
 
 def test_independent_processes_on_the_pretended_device():
     data, how = arm_data(24, seed=5), {"restarts": 1, "options": QUICK}
-    expected = IndependentGP(data.system).fit(data, **how)
+    expected = fit(data.model.black_box(), data, **how)
     with pretend_device():
-        fitted = IndependentGP(data.system.to(PRETEND)).fit(data, **how)
+        fitted = fit(data.model.to(PRETEND).black_box(), data, **how)
         for posterior in (fitted, expected.to(PRETEND)):
             mean = posterior.predict(data.q[:3], data.v[:3], data.u[:3]).mean
             torch.testing.assert_close(
@@ -235,8 +237,8 @@ def test_independent_processes_on_the_pretended_device():
 def test_a_fit_on_a_real_device_is_that_on_the_cpu(device):
     data, test = arm_data(40, seed=6), arm_data(5, seed=7)
     how = {"restarts": 1, "options": OptimizerOptions(iterations=10)}
-    expected = StructuredGP(data.system).fit(data, **how)
-    found = StructuredGP(data.system.to(device)).fit(data, **how)
+    expected = fit(data.model.with_forces(JointForces()), data, **how)
+    found = fit(data.model.to(device).with_forces(JointForces()), data, **how)
     assert found.predict(test.q, test.v, test.u).mean.device.type == device
     assert found.result.value == pytest.approx(expected.result.value, rel=1e-4)
     there, states_ = expected.to(device), (test.q, test.v, test.u)
@@ -254,12 +256,12 @@ def test_devices_that_are_not_there_are_refused_with_those_that_are(device):
     with pytest.raises(InvalidInput, match=r"cannot be used here; there is cpu"):
         usable_device(device)
     with pytest.raises(InvalidInput, match="there is cpu"):
-        arm_system().to(device)
+        arm_model().to(device)
 
 
 def test_moving_keeps_where_a_posterior_was_carried_and_what_standardises_it():
     data = arm_data(14, seed=9)
-    posterior = StructuredGP(data.system).fit(data.rows(slice(0, 10)), restarts=1, options=QUICK)
+    posterior = fit(data.model.with_forces(JointForces()), data.rows(slice(0, 10)), restarts=1, options=QUICK)
     posterior = posterior.update(data.rows(slice(10, 14))).with_contacts([])
     again = posterior.to("cpu")
     assert again.target is not None

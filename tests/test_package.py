@@ -101,7 +101,7 @@ def test_every_python_that_is_promised_is_tested_and_classified(repository):
     (matrix,) = (job["strategy"]["matrix"] for job in jobs.values() if "strategy" in job)
     assert matrix["python"] == classified
     assert table["requires-python"] == f">={classified[0]}"
-    assert {system.partition("-")[0] for system in matrix["system"]} == {"ubuntu", "macos"}
+    assert {model.partition("-")[0] for model in matrix["system"]} == {"ubuntu", "macos"}
 
 
 def workflow(repository, name):

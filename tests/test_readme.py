@@ -13,7 +13,8 @@ from tests.prose import sentences, words
 
 from forcegp import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.cli.main import parse_arguments
-from forcegp.priors import KERNELS, NAMED_PRIORS, named_prior
+from forcegp.forces import KERNELS, parse_forces
+from forcegp.forces.registry import is_unknown
 
 
 def test_the_python_example_runs(repository: Path, tmp_path: Path):
@@ -108,7 +109,7 @@ def test_the_times_of_the_features_are_those_of_the_benchmarks(repository: Path)
 
 def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
-    example, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # the other has tests of its own
+    example, *_ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # others have own tests
     printed = run_example(example, tmp_path)
     tool, total, curve, error, free = printed.splitlines()
     assert tool == "torch.Size([2400, 1]) torch.Size([2400, 7, 7]) torch.Size([2400, 3])"
@@ -119,25 +120,26 @@ def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
     assert {"friction.png", "normal-force.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_the_commands_and_priors_of_the_page_on_forces_exist(repository: Path):
+def test_the_commands_and_forces_of_the_page_on_forces_exist(repository: Path):
     page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
-    rows = page.partition("## Which prior?")[2].partition("\n## ")[0]
+    rows = page.partition("## Which force?")[2].partition("\n## ")[0]
     told = {name.partition(":")[0] for name in re.findall(r"^\| `([^`]+)` \|", rows, re.MULTILINE)}
-    assert told == set(NAMED_PRIORS) - {"air-drag"}
+    assert all(is_unknown(name) for name in told)
+    assert len(told) == 12
     rows = page.partition("## Kernels")[2].partition("\n## ")[0]
     told = {
         name for cell in re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
     }
     assert told == set(KERNELS)
-    system = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).system
+    model = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).model
     count = 0
     for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
         for line in re.findall(r"^forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
             command = parse_arguments(shlex.split(line))
-            for prior in getattr(command, "prior", ()):
-                named_prior(prior, system)
+            for force in parse_forces([x for x in getattr(command, "forces", None) or () if x not in ("only", "none")]):
                 count += 1
-    assert count > 10
+                model.with_forces(force)
+    assert count > 8
 
 
 def test_the_pictures_and_pages_that_the_page_on_forces_names_exist(repository: Path):

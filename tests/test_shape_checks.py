@@ -16,39 +16,40 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
-from tests.models.arm import arm_data
-from tests.models.test_predictor_of_moving_bases import hopper
+from tests.posterior.arm import arm_data
+from tests.posterior.test_predictor_of_moving_bases import hopper
 from tests.shapes import MisfitError, checked, unchecked
 from torch import Tensor
 
 from forcegp import (
     Dataset,
-    IndependentGP,
     JointForces,
     JointFriction,
-    NoForces,
     Noise,
-    StructuredGP,
+    Viscous,
     check,
     compare_priors,
     evaluate,
-    identify_analytical,
+    fit,
     load_posterior,
     save_posterior,
 )
 from forcegp.errors import InvalidInput
+from forcegp.inference import OptimizerOptions
 from forcegp.mechanics.surfaces import surface_axes
+
+QUICK = OptimizerOptions(iterations=2)
 
 
 def hopper_data(rows: int) -> Dataset:
     """Of a floating base with two propellers and a foot that is held in every second row: each size is another."""
-    system, generator = hopper("floating"), torch.Generator().manual_seed(0)
-    q = system.robot.random(generator, rows)
-    v, u = (torch.randn(rows, size, generator=generator).double() for size in system.sizes[1:])
+    model, generator = hopper("floating"), torch.Generator().manual_seed(0)
+    q = model.robot.random(generator, rows)
+    v, u = (torch.randn(rows, size, generator=generator).double() for size in model.sizes[1:])
     u[:, -1] = torch.arange(rows) % 2
-    a = system.dynamics(q, v, u).acceleration(-0.3 * v)
+    a = model.dynamics(q, v, u).acceleration(-0.3 * v)
     given = {name: x.numpy() for name, x in zip("qvua", (q, v, u, a), strict=True)}
-    return Dataset(**given, time=0.01 * np.arange(rows), system=system)
+    return Dataset(**given, time=0.01 * np.arange(rows), model=model)
 
 
 def whole_way() -> None:
@@ -57,13 +58,13 @@ def whole_way() -> None:
         surface_axes(torch.ones(4, dtype=torch.float64))
     warnings.simplefilter("ignore")
     for data, prior, compiled in ((arm_data(64, 0), JointForces(), True), (hopper_data(64), JointFriction(), False)):
-        print(data.system.sizes)
+        print(data.model.sizes)
         check(data)
-        free = replace(data, system=data.system.with_contacts(()), truth={}) if compiled else data
-        identify_analytical(free, friction=("viscous",)).scores(free)
-        compare_priors(data, {"one": prior, "none": NoForces()}, points=20, restarts=1)
-        evaluate(IndependentGP(data.system).fit(data, points=20, restarts=1), data)
-        posterior = StructuredGP(data.system, prior, noise=Noise(0.05)).fit(data, points=64, restarts=1)
+        free = replace(data, model=data.model.with_contacts(()), truth={}) if compiled else data
+        fit(free.model.with_forces(Viscous()), free).predict(free.q, free.v, free.u)
+        compare_priors(data, {"one": prior, "none": ()}, points=20, restarts=1, options=QUICK)
+        evaluate(fit(data.model.black_box(), data, points=20, restarts=1, options=QUICK), data)
+        posterior = fit(data.model.with_forces(prior, noise=Noise(0.05)), data, points=40, restarts=1, options=QUICK)
         evaluate(posterior, data)
         with tempfile.TemporaryDirectory() as folder:
             data.save(f"{folder}/data.h5")
@@ -126,7 +127,13 @@ def test_what_does_not_fit_must_be_refused_by_the_function_itself():
 
 
 SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
-ARMS = {"control/informative_motions", "simulation/bullet", "simulation/joint_friction", "simulation/kuka_motion"}
+ARMS = {
+    "control/informative_motions",
+    "forces/columns",
+    "simulation/bullet",
+    "simulation/joint_friction",
+    "simulation/kuka_motion",
+}
 """Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""
 
 

@@ -4,21 +4,13 @@ from xml.etree import ElementTree
 
 import pytest
 import torch
-from tests.checks.corruptions import clean, two_links
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.raw_log import motion
 
-from forcegp import (
-    Coefficients,
-    IndependentGP,
-    StructuredGP,
-    ViscousJointFriction,
-    check,
-    evaluate,
-    identify_analytical,
-)
+from forcegp import Viscous, check, evaluate, fit
 from forcegp.errors import ForceGPError
+from forcegp.forces import Actuation, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Actuation, RigidBodyBias
 from forcegp.summary import Summary
 
 
@@ -31,29 +23,26 @@ def data():
 def shown(data):
     """One value of every kind, by name."""
     quick = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-    posterior = StructuredGP(data.system).fit(data, **quick)
-    friction = arm_system(known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(0.1)))
-    learned = StructuredGP(friction).identify(data, Coefficients("viscous-joint-friction"), **quick)
+    posterior = fit(data.model.with_forces(JointForces()), data, **quick)
+    in_air = arm_model(0, forces=(Actuation(), RigidBodies(), Viscous()), baumgarte=None)
+    learned = fit(in_air, arm_data(20, 0, arm_model(0)))
     prediction = posterior.predict(data.q, data.v, data.u)
-    in_air = clean(two_links(), 0, seconds=5.0)
     return {
         "Dataset": data,
         "StructuredPosterior": posterior,
-        "IndependentPosterior": IndependentGP(data.system).fit(data, **quick),
+        "IndependentPosterior": fit(data.model.black_box(), data, **quick),
         "Prediction": prediction,
         "Gaussian": prediction.unknown_force,
         "Evaluation": evaluate(posterior, arm_data(10, 1)),
-        "Robot": data.system.robot,
-        "MechanicalSystem": data.system,
-        "Identification": learned.identification,
-        "AnalyticalIdentification": identify_analytical(in_air),
-        "CheckReport": check(in_air),
+        "Robot": data.model.robot,
+        "Model": data.model,
+        "Estimates": learned.estimates,
+        "CheckReport": check(motion(1.0)),
         "Predictor": posterior.predictor(compile=False),
     }
 
 
 FACTS = {
-    "AnalyticalIdentification": ("torque", "rows", "consistent"),
     "CheckReport": ("wrong: none", "sampling"),
     "Predictor": ("joints: 3", "covariance"),
     "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
@@ -63,8 +52,8 @@ FACTS = {
     "Gaussian": ["batch: (20,)", "largest std"],
     "Evaluation": ["rows: 10", "mae: ", "noise floor 0.0399", "coverage 95: ", "warnings: "],
     "Robot": ["name: 'arm'", "nv: 3", "pan (revolute), lift (revolute), bend (revolute)"],
-    "MechanicalSystem": ["contacts: hand on Plane", "known forces: Actuation, RigidBodyBias", "omega=5.0"],
-    "Identification": ["values: viscous-joint-friction.pan", "(from 0.1)", "iterations: "],
+    "Model": ["contacts: hand on Plane", "forces: Actuation, RigidBodies", "omega=5.0"],
+    "Estimates": ["estimated: viscous.pan", "from: 20 rows, "],
 }
 
 
@@ -147,7 +136,7 @@ def test_models_without_forces_state_that_they_have_no_components(shown, data):
         lambda model: model.components(*state),
         lambda model: model.curve("friction"),
         lambda model: model.with_contacts([]),
-        lambda model: model.with_robot(data.system.robot),
+        lambda model: model.with_robot(data.model.robot),
     ):
         with pytest.raises(ForceGPError, match=r"^a .*; (use|fit) "):
             call(shown["IndependentPosterior"])

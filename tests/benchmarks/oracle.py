@@ -8,9 +8,9 @@ from tests.robots.pinocchio_oracle import Oracle
 class Tool:
     """Position of the contact point in the world (3,), for one posture."""
 
-    def __init__(self, system):
-        self.oracle = Oracle(system.robot.to_urdf(), system.robot)
-        self.contact = system.contacts[0]
+    def __init__(self, model):
+        self.oracle = Oracle(model.robot.to_urdf(), model.robot)
+        self.contact = model.contacts[0]
 
     def position(self, q: np.ndarray) -> np.ndarray:
         model, data = self.oracle.model, self.oracle.data

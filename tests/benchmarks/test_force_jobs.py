@@ -10,10 +10,11 @@ from tests.benchmarks.stored_jobs import keep
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
-from forcegp.models import IndependentGP, StructuredGP, load_posterior
-from forcegp.priors import ContactFriction, JointForces, JointFriction
+from forcegp.posterior import load_posterior
 
 OPTIONS = OptimizerOptions(iterations=5)
 TRAIN, TEST = "force-data/train", "force-data/test"
@@ -26,8 +27,8 @@ def rubbing():
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=2, seed=3, friction="stribeck", joint_friction="stribeck"))
-    prior = JointFriction() + ContactFriction(load=True, expected=0.3)
-    posterior = StructuredGP(data.system, prior).fit(data.rows(slice(0, None, 20)), restarts=1, options=OPTIONS)
+    prior = JointFriction(), ContactFriction(load=True, expected=0.3)
+    posterior = fit(data.model.with_forces(prior), data.rows(slice(0, None, 20)), restarts=1, options=OPTIONS)
     return posterior, data.rows(slice(7, None, 16))
 
 
@@ -42,7 +43,7 @@ def stored(results, **data):
 
 
 def fit_spec(**changes):
-    spec = {"train": TRAIN, "tests": {"there": TEST}, "prior": "tool-friction", "mean": "analytical", "points": 12}
+    spec = {"train": TRAIN, "tests": {"there": TEST}, "prior": "gp:tool-friction", "mean": "analytical", "points": 12}
     return spec | {"region": False, "seed": 0, "restarts": 1, "iterations": 2, "tolerance": 1e-6} | changes
 
 
@@ -85,7 +86,7 @@ def test_scores_are_what_they_say(rubbing):
 def test_a_force_of_everything_is_not_compared_with_a_part(rubbing):
     """`JointForces` holds friction of tool and joints together, and the truth has them one by one."""
     _, test = rubbing
-    posterior = StructuredGP(test.system, JointForces()).fit(test, restarts=1, options=OptimizerOptions(iterations=0))
+    posterior = fit(test.model.with_forces(JointForces()), test, restarts=1, options=OptimizerOptions(iterations=0))
     assert not [name for name in force_jobs.scores(posterior, test) if name.startswith("force_mae")]
 
 
@@ -104,7 +105,7 @@ def test_rows_in_the_air_are_scored_by_themselves(rubbing):
 def test_forces_are_scored_under_the_contacts_of_the_test(rubbing):
     posterior, test = rubbing
     accelerations = {"a": test.truth["a"]}
-    free = replace(test, system=test.system.with_contacts([]), truth=accelerations)
+    free = replace(test, model=test.model.with_contacts([]), truth=accelerations)
     found = force_jobs.scores(posterior, free)
     carried = posterior.with_contacts([]).predict(test.q, test.v, test.u).mean.numpy()
     assert found["mae"] == pytest.approx(np.abs(carried - test.a).mean(), rel=1e-9)
@@ -114,7 +115,7 @@ def test_forces_are_scored_under_the_contacts_of_the_test(rubbing):
 
 def test_black_boxes_are_scored_on_accelerations_alone(rubbing):
     _, test = rubbing
-    black_box = IndependentGP(test.system).fit(test, options=OptimizerOptions(iterations=0))
+    black_box = fit(test.model.black_box(), test, options=OptimizerOptions(iterations=0))
     found = force_jobs.scores(black_box, test)
     assert set(found) == {"mae", "mae_of_truth", "mae_noise_free", "nlpd", "coverage_95", "known_physics_mae"} | {
         "coverage_95_noise_free"
@@ -161,7 +162,7 @@ def test_regions_do_not_overlap(results, motion, tmp_path):
     q[:, 0] += np.where(np.arange(len(q)) % 2 == 0, 1.2, -0.8)
     turned = replace(motion, q=q, truth={}).rows(slice(0, None, 7))
     stored(results, train=turned, test=turned)
-    tool = Tool(motion.system)
+    tool = Tool(motion.model)
     x = np.array([tool.position(row)[0] for row in turned.q])
     assert min((x < 0.0).sum(), (x > 0.1).sum()) > 12
     found = force_jobs.fit(results, fit_spec(region=True), tmp_path)

@@ -41,14 +41,15 @@ def test_trials_are_told_apart_by_their_names(preset):
 
 
 @pytest.mark.parametrize(
-    "change", [{"points": 3}, {"prior": "joint:inputs=q"}, {"mean": "zero"}, {"region": True}, {"scenario": "tilted"}]
+    "change",
+    [{"points": 3}, {"prior": "gp:joint:inputs=q"}, {"mean": "zero"}, {"region": True}, {"scenario": "tilted"}],
 )
 def test_what_differs_between_trials_shows_in_their_names(change):
-    trial = Trial("one", "viscous", "joint", 10, {"there": "sphere"})
+    trial = Trial("one", "viscous", "gp:joint", 10, {"there": "sphere"})
     assert replace(trial, **change).name != trial.name
     assert replace(trial, label="other").name == trial.name
     assert replace(trial, tests={"there": "tilted"}).name != trial.name
-    assert "/" not in replace(trial, prior="joint:inputs=q/v").name.split("/")[1]
+    assert "/" not in replace(trial, prior="gp:joint:inputs=q/v").name.split("/")[1]
 
 
 def test_the_committed_page_is_made_of_the_committed_numbers(repository):

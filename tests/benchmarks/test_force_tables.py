@@ -30,7 +30,7 @@ def experiment(kind):
 
 class OneTrial(ForceExperiment):
     name, title = "one", "One"
-    trial = Trial("mine", "tilted", "tool-friction", 10, {"plane": "viscous", "ball": "sphere"}, region=True)
+    trial = Trial("mine", "tilted", "gp:tool-friction", 10, {"plane": "viscous", "ball": "sphere"}, region=True)
 
     def trials(self):
         return [self.trial]
@@ -56,7 +56,7 @@ def test_a_job_is_told_all_that_its_trial_says():
     assert fit.spec == {
         "train": "force-data/tilted/train/seed8",
         "tests": {"plane": "force-data/viscous/test/seed8", "ball": "force-data/sphere/test/seed8"},
-        "prior": "tool-friction",
+        "prior": "gp:tool-friction",
         "mean": "analytical",
         "points": 10,
         "region": True,
@@ -85,7 +85,7 @@ def test_summaries_are_medians_and_ranges_over_seeds(results):
     assert trial["curve_coverage_of_seeds"]["values"] == pytest.approx([0.7, 1.0, 0.7])
     assert (trial["leave_one_out"]["median"], trial["search_seconds"]["median"]) == (1.0, 2.0)
     plane, ball = one.rows(summary)
-    told = {"label": "mine", "scenario": "tilted", "prior": "tool-friction", "points": 10, "extrapolation": 1}
+    told = {"label": "mine", "scenario": "tilted", "prior": "gp:tool-friction", "points": 10, "extrapolation": 1}
     scores = {"mae_median": 0.2, "mae_min": 0.1, "mae_max": 0.3}
     assert plane == {**told, "tested_on": "plane", **scores}
     assert ball["nlpd_median"] is None

@@ -43,9 +43,9 @@ def test_the_true_dynamics_reproduce_the_recording(run, tmp_path):
 
 def test_displaced_starts_are_exactly_off_the_surface_and_as_near_as_can_be(motion, recorded):
     q = recorded.q[:, 0]
-    displaced = fig4_jobs._displaced(motion.system, q)
-    tool = Tool(motion.system)
-    height = motion.system.contacts[0].surface.offset
+    displaced = fig4_jobs._displaced(motion.model, q)
+    tool = Tool(motion.model)
+    height = motion.model.contacts[0].surface.offset
     for before, after in zip(q.numpy(), displaced.numpy(), strict=True):
         assert tool.position(after)[2] - height == pytest.approx(OFFSET, abs=1e-12)
         gap = tool.position(before)[2] - height
@@ -57,7 +57,7 @@ def test_displaced_starts_are_exactly_off_the_surface_and_as_near_as_can_be(moti
 
 
 def test_the_feedback_is_that_of_its_formula_and_nothing_on_the_recording(recorded, motion):
-    feedback, oracle = recorded.feedback(), Tool(motion.system).oracle
+    feedback, oracle = recorded.feedback(), Tool(motion.model).oracle
     generator = torch.Generator().manual_seed(0)
     dq, dv = torch.randn(2, STARTS, 7, generator=generator, dtype=torch.float64)
     for k in (0, 17):
@@ -71,15 +71,15 @@ def test_the_feedback_is_that_of_its_formula_and_nothing_on_the_recording(record
 
 def test_the_feedback_pulls_a_displaced_motion_back(motion):
     recorded = fig4_jobs._Recorded(motion, 2, 0.5)
-    system, friction = replace(motion.system, baumgarte=BAUMGARTE), motion.metadata["config"]["viscous_coefficient"]
-    contact = system.contacts[0]
+    model, friction = replace(motion.model, baumgarte=BAUMGARTE), motion.metadata["config"]["viscous_coefficient"]
+    contact = model.contacts[0]
 
     def truth(q, v, u):
-        dynamics = system.dynamics(q, v, u)
+        dynamics = model.dynamics(q, v, u)
         J = dynamics.state.kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
         return dynamics.acceleration(-friction * (J.mT @ (J @ v[..., None]))[..., 0])
 
-    start = fig4_jobs._displaced(motion.system, recorded.q[:, 0])
+    start = fig4_jobs._displaced(motion.model, recorded.q[:, 0])
     begin = (start - recorded.q[:, 0]).abs().mean(-1)
 
     def error(feedback):

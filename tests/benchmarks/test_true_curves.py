@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointFriction, ToolForces
 from forcegp.inference import OptimizerOptions
-from forcegp.models import IndependentGP, StructuredGP
-from forcegp.priors import ContactFriction, JointFriction, ToolForces
 from forcegp.simulation import KukaSurfaceConfig
 
 V = np.linspace(-1.5, 1.5, 40)  # rad/s, without 0
@@ -24,8 +24,8 @@ def curves(motion):
         config = dataclasses.asdict(KukaSurfaceConfig(seconds=2, seed=1, **changes))
         stated = {name: list(value) if isinstance(value, tuple) else value for name, value in config.items()}
         data = replace(motion.rows(slice(0, None, 60)), metadata={"config": stated})
-        model = StructuredGP(data.system, prior)
-        return true_curves(model.fit(data, restarts=1, options=OptimizerOptions(iterations=0)))
+        model = data.model.with_forces(prior)
+        return true_curves(fit(model, data, restarts=1, options=OptimizerOptions(iterations=0)))
 
     return of
 
@@ -36,7 +36,7 @@ def test_friction_that_grows_with_the_load_is_a_coefficient(curves):
     given = {"friction_smoothing": 0.04, "coulomb_coefficient": 0.25}
     law = curves(prior, friction="coulomb", **given)["sliding"]
     np.testing.assert_allclose(law(SPEED), 0.25 * smooth, rtol=1e-12)
-    law = curves(prior, friction="stribeck", static_coefficient=0.6, stribeck_velocity=0.2, **given)["sliding"]
+    law = curves(prior, friction="stribeck", static_coefficient=0.6, breakaway_velocity=0.2, **given)["sliding"]
     np.testing.assert_allclose(law(SPEED), (0.25 + 0.35 * np.exp(-((SPEED / 0.2) ** 2))) * smooth, rtol=1e-12)
 
 
@@ -48,8 +48,8 @@ def test_viscous_friction_is_a_force_and_per_speed_a_constant(curves):
 
 
 def test_joints_resist_by_the_law_of_each(curves):
-    changes = {"joint_friction": "stribeck", "joint_smoothing": 0.08, "joint_stribeck_velocity": 0.3}
-    found = curves(JointFriction() + ContactFriction(), **changes)
+    changes = {"joint_friction": "stribeck", "joint_smoothing": 0.08, "joint_breakaway_velocity": 0.3}
+    found = curves((JointFriction(), ContactFriction()), **changes)
     assert len(found) == 8
     config = KukaSurfaceConfig()
     for k in range(7):
@@ -92,4 +92,4 @@ def test_models_without_forces_have_no_law(motion):
     from benchmarks.force_priors.jobs import true_curves
 
     data = motion.rows(slice(0, None, 60))
-    assert true_curves(IndependentGP(data.system).fit(data, options=OptimizerOptions(iterations=0))) == {}
+    assert true_curves(fit(data.model.black_box(), data, options=OptimizerOptions(iterations=0))) == {}

@@ -13,8 +13,8 @@ import pytest
 from benchmarks.without_accelerations import Source, Targets, coarse, fitted, multiarm
 
 from forcegp.cli.main import parse_arguments
-from forcegp.data import WeakForm
 from forcegp.errors import NumericalWarning
+from forcegp.evidence import Windows
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_raw_positions_of_a_real_pendulum_teach_its_dynamics(real_logs):
     few = replace(rig, test=rig.test.select_episodes(rig.test.episodes[:3]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
-        scores = Targets.of(few).scores(fitted(few, Source(WeakForm(0.08)), 80, seed=0))
+        scores = Targets.of(few).scores(fitted(few, Source(Windows(0.08)), 80, seed=0))
     assert max(scores[:2]) < 0.05  # of the standard deviation of the acceleration
     assert scores[2] < 0.01  # rad after 0.1 s
 

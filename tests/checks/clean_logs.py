@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from tests.checks.corruptions import ROBOTS, clean, on_a_line, two_links
 from tests.checks.logs import clean as filtered_log
-from tests.models.arm import arm_system
+from tests.posterior.arm import arm_model
 
 from forcegp.data import Dataset
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 
@@ -26,7 +26,7 @@ def with_motion(robot: Robot, q: np.ndarray, rate: float, seed: int, noise: floa
     u = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy() + 0.05 * v + 0.1 * np.tanh(v / 0.02)
     noisy = a + noise * generator.normal(size=a.shape)
     stated = np.full(robot.nv, noise) if noise else None
-    return Dataset(q=q, v=v, u=u, a=noisy, time=time, system=MechanicalSystem(robot), noise_std=stated)
+    return Dataset(q=q, v=v, u=u, a=noisy, time=time, model=Model(robot), noise_std=stated)
 
 
 def rests(robot: Robot, seed: int, noise: float = 0.05, jitter: float = 0.0) -> Dataset:
@@ -58,13 +58,13 @@ def odd_friction(robot: Robot, seed: int) -> Dataset:
 
 
 def weightless(seed: int) -> Dataset:
-    """No gravity in the log, and none in the system."""
+    """No gravity in the log, and none in the model."""
     return clean(two_links(gravity=(0.0, 0.0, 0.0)), seed)
 
 
 def free_log(seed: int) -> Dataset:
     """Noise on all signals, three joints, accelerations by differences."""
-    return filtered_log(seed, arm_system(contacts=0))
+    return filtered_log(seed, arm_model(contacts=0))
 
 
 def clean_logs(seed: int) -> Iterator[tuple[str, Dataset]]:

@@ -15,10 +15,11 @@ import torch
 from tests.checks.logs import column, exchanged
 
 from forcegp.checks import check, quick_check
-from forcegp.cli.learning_options import findings_in_one_line
+from forcegp.cli.fit import findings_in_one_line
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
-from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.mechanics import Contact, Plane
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 DEGREES = 180.0 / np.pi
@@ -80,7 +81,7 @@ def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0,
         q, v = q + 2e-5 * generator.normal(size=q.shape), v + 3e-4 * generator.normal(size=v.shape)
         u = u + 0.01 * np.std(u, axis=0) * generator.normal(size=u.shape)
         a = np.gradient(v, time, axis=0, edge_order=2)
-    return Dataset(q=q, v=v, u=u, a=a, time=time, system=MechanicalSystem(robot), noise_std=noise_std)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=Model(robot), noise_std=noise_std)
 
 
 LINE = Plane((1.0, 0.0, 0.0), 0.35)
@@ -115,9 +116,9 @@ def on_a_line(
     u = robot.inverse_dynamics(tensors, torch.tensor(v), torch.tensor(a)).numpy()
     u = u + force[:, None] * J[:, 0] + 3.0 * dz[:, None] * J[:, 1]
     noisy = a + noise * generator.normal(size=a.shape)
-    system = MechanicalSystem(robot, (Contact("link2", POINT, LINE),))
+    model = Model(robot, (Contact("link2", POINT, LINE),))
     stated = np.full(2, noise) if noise else None
-    return Dataset(q=q, v=v, u=u, a=noisy, time=time, system=system, noise_std=stated)
+    return Dataset(q=q, v=v, u=u, a=noisy, time=time, model=model, noise_std=stated)
 
 
 def at(data: Dataset, names: str, sign: list[float]) -> Dataset:
@@ -127,8 +128,8 @@ def at(data: Dataset, names: str, sign: list[float]) -> Dataset:
 
 def degrees(data: Dataset) -> list[float]:
     """Factors that turn radians into degrees, and leave metres."""
-    assert data.system is not None
-    return [1.0 if joint.type == "prismatic" else DEGREES for joint in data.system.robot.joints]
+    assert data.model is not None
+    return [1.0 if joint.type == "prismatic" else DEGREES for joint in data.model.robot.joints]
 
 
 def late(data: Dataset, names: str, seconds: float) -> Dataset:
@@ -141,24 +142,24 @@ def late(data: Dataset, names: str, seconds: float) -> Dataset:
 
 
 def other_robot(data: Dataset, **changes: object) -> Dataset:
-    """The system states another robot than the one that was recorded: attributes of the URDF times factors."""
-    assert data.system is not None
-    robot = data.system.robot
+    """The model states another robot than the one that was recorded: attributes of the URDF times factors."""
+    assert data.model is not None
+    robot = data.model.robot
     text = robot.urdf_text
     gravity = changes.pop("gravity", robot.gravity.tolist())
     for find, by in changes.pop("text", ()):  # type: ignore[attr-defined]
         assert find in text, find
         text = text.replace(find, by)
     made = Robot.from_urdf_text(text, gravity=gravity, armature=robot.armature)  # type: ignore[arg-type]
-    return replace(data, system=data.system.with_robot(made))
+    return replace(data, model=data.model.with_robot(made))
 
 
 def scaled(data: Dataset, masses: tuple[float, float] = (1.0, 1.0), length: float = 1.0) -> Dataset:
     """With masses (and inertias) of the links, and the distance between the joints, times a factor in the URDF."""
     import xml.etree.ElementTree as ElementTree
 
-    assert data.system is not None
-    robot = data.system.robot
+    assert data.model is not None
+    robot = data.model.robot
     root = ElementTree.fromstring(robot.urdf_text)
     for name, factor in zip(("link1", "link2"), masses, strict=True):
         inertial = root.find(f"link[@name='{name}']/inertial")
@@ -173,13 +174,13 @@ def scaled(data: Dataset, masses: tuple[float, float] = (1.0, 1.0), length: floa
     origin.set("xyz", " ".join(str(float(x) * length) for x in origin.get("xyz", "").split()))
     text = ElementTree.tostring(root, encoding="unicode")
     made = Robot.from_urdf_text(text, gravity=robot.gravity.tolist(), armature=robot.armature)
-    return replace(data, system=data.system.with_robot(made))
+    return replace(data, model=data.model.with_robot(made))
 
 
 def recorded_under(data: Dataset, gravity: tuple[float, float, float]) -> Dataset:
-    """The same motion under another gravity than the system states."""
-    assert data.system is not None
-    robot = data.system.robot
+    """The same motion under another gravity than the model states."""
+    assert data.model is not None
+    robot = data.model.robot
     there = Robot.from_urdf_text(robot.urdf_text, gravity=gravity, armature=robot.armature)
     tensors = [torch.tensor(x) for x in (data.q, data.v, data.a)]
     change = there.inverse_dynamics(*tensors) - robot.inverse_dynamics(*tensors)
@@ -204,24 +205,24 @@ def held(x: np.ndarray) -> np.ndarray:
 
 def moved(data: Dataset, by: tuple[float, float, float]) -> Dataset:
     """With every contact point elsewhere on its link."""
-    assert data.system is not None
-    contacts = [replace(each, point=tuple(np.add(each.point, by))) for each in data.system.contacts]
-    return replace(data, system=data.system.with_contacts(contacts), truth={})
+    assert data.model is not None
+    contacts = [replace(each, point=tuple(np.add(each.point, by))) for each in data.model.contacts]
+    return replace(data, model=data.model.with_contacts(contacts), truth={})
 
 
 def without_contacts(data: Dataset) -> Dataset:
-    assert data.system is not None
-    return replace(data, system=data.system.with_contacts(()), truth={})
+    assert data.model is not None
+    return replace(data, model=data.model.with_contacts(()), truth={})
 
 
 def invented(data: Dataset) -> Dataset:
     """A contact through which the middle of the motion passes."""
-    assert data.system is not None
-    robot = data.system.robot
+    assert data.model is not None
+    robot = data.model.robot
     q = torch.tensor(data.q)
     pose = robot.kinematics(q, 0 * q).frame_pose("link2").numpy()
     offset = float(np.median((pose[:, :3, :3] @ np.array(POINT) + pose[:, :3, 3])[:, 0]))
-    return replace(data, system=data.system.with_contacts([Contact("link2", POINT, Plane((1.0, 0.0, 0.0), offset))]))
+    return replace(data, model=data.model.with_contacts([Contact("link2", POINT, Plane((1.0, 0.0, 0.0), offset))]))
 
 
 Corruption = Callable[[Dataset], Dataset]
@@ -308,10 +309,10 @@ def said_by_check(data: Dataset) -> str:
 
 def said_by_fit(data: Dataset) -> str:
     """The line that `forcegp fit` prints, or why it refuses these rows."""
-    assert data.system is not None
+    assert data.model is not None
     try:
         q, v, u = (torch.tensor(getattr(data.rows([*range(0, len(data), 50)]), name)) for name in "qvu")
-        data.system.check_states(q, v, u)
+        data.model.check_states(q, v, u)
     except ForceGPError as error:
         return str(error)
     return findings_in_one_line(quick_check(data), Path("log.h5")) or ""

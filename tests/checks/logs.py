@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from tests.models.arm import arm_system
+from tests.posterior.arm import arm_model
 
 from forcegp.data import Dataset
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 RATE = 200.0
@@ -22,21 +22,21 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 <origin xyz="0 0 -0.4"/></joint></robot>"""
 
 
-def arm() -> MechanicalSystem:
+def arm() -> Model:
     """Three joints: the first vertical, the others horizontal and parallel."""
-    return arm_system(contacts=0)
+    return arm_model(contacts=0)
 
 
-def pendulum() -> MechanicalSystem:
+def pendulum() -> Model:
     """Two parallel horizontal joints without limits."""
-    return MechanicalSystem(Robot.from_urdf_text(PENDULUM))
+    return Model(Robot.from_urdf_text(PENDULUM))
 
 
-def clean(seed: int, system: MechanicalSystem | None = None, *, seconds: float = 7.0, noise: float = 1.0) -> Dataset:
+def clean(seed: int, model: Model | None = None, *, seconds: float = 7.0, noise: float = 1.0) -> Dataset:
     """Sums of sines; torques of inverse dynamics, viscous and dry friction; white noise on q, v and u."""
-    system = system or arm()
+    model = model or arm()
     generator = np.random.default_rng(seed)
-    nv = system.robot.nv
+    nv = model.robot.nv
     time = np.arange(round(seconds * RATE)) / RATE
     omega = 2 * np.pi * generator.uniform(0.1, 1.2, (6, 1, nv))
     size, phase = generator.uniform(0.05, 0.2, (6, 1, nv)), generator.uniform(0, 2 * np.pi, (6, 1, nv))
@@ -44,12 +44,12 @@ def clean(seed: int, system: MechanicalSystem | None = None, *, seconds: float =
     q = (size * np.sin(angle)).sum(0)
     v = (size * omega * np.cos(angle)).sum(0)
     a = (-size * omega**2 * np.sin(angle)).sum(0)
-    u = system.robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
+    u = model.robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
     u = u + 0.1 * v + 0.2 * np.tanh(v / 0.05)
     q, v, u = (x + noise * level * generator.normal(size=x.shape) for x, level in ((q, 2e-5), (v, 3e-4), (u, 0.03)))
     if noise:
         a = np.gradient(v, time, axis=0, edge_order=2)
-    return Dataset(q=q, v=v, u=u, a=a, time=time, system=system)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=model)
 
 
 def column(data: Dataset, name: str, joint: int, change: Callable[[np.ndarray], np.ndarray]) -> Dataset:

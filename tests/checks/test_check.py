@@ -11,7 +11,7 @@ from tests.checks.logs import arm, clean, column, exchanged, late, pendulum
 from forcegp.checks import CheckReport, check
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 DEGREES = 180.0 / np.pi
@@ -23,10 +23,10 @@ def told(report: CheckReport) -> str:
     return "\n".join(seen)
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("model", SYSTEMS)
 @pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (1, 1.0), (2, 1.0), (3, 1.0)])
-def test_a_clean_log_raises_no_alarm(system, seed, noise):
-    report = check(clean(seed, SYSTEMS[system](), noise=noise))
+def test_a_clean_log_raises_no_alarm(model, seed, noise):
+    report = check(clean(seed, SYSTEMS[model](), noise=noise))
     assert report.severity == "ok", told(report)
     assert {item.subject for item in report.findings} >= {"sampling", "velocity", "torque", "excitation", "noise"}
 
@@ -163,7 +163,7 @@ def test_repeated_rows_are_told():
 def test_gravity_of_a_base_that_hangs_is_named():
     data = clean(8, pendulum())
     wall = Robot.from_urdf_text(pendulum().robot.urdf_text, gravity=(0.0, 0.0, 9.81))
-    report = check(replace(data, system=None), MechanicalSystem(wall))
+    report = check(replace(data, model=None), Model(wall))
     (found,) = report.of("gravity")
     np.testing.assert_allclose(found.numbers["gravity"], [0, 0, -9.81], atol=0.5)
     assert "`gravity`=0,0,-9.81" in found.remedy or found.numbers["degrees"] > 170
@@ -196,8 +196,8 @@ def test_positions_that_jump_otherwise_end_the_check_of_motion():
 
 
 def test_without_a_robot_it_says_what_was_not_compared():
-    report = check(replace(clean(1), system=None))
-    assert [item.remedy for item in report.of("torque")] == ["Give the robot: `system`."]
+    report = check(replace(clean(1), model=None))
+    assert [item.remedy for item in report.of("torque")] == ["Give the robot: `model`."]
 
 
 def test_the_report_is_json_and_sorted_by_severity():

@@ -25,7 +25,7 @@ from tests.checks.corruptions import (
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.parameters import parameter_findings
-from forcegp.cli.learning_options import findings_in_one_line
+from forcegp.cli.fit import findings_in_one_line
 
 ONLY_CHECK = ("coarse positions",)
 """What a fit does not mention: real encoders are coarse."""
@@ -61,6 +61,7 @@ def test_an_invented_contact_is_named_by_check_and_before_a_fit():
     assert named(said_by_fit(data), "contact")
 
 
+@pytest.mark.nightly
 def test_clean_logs_raise_no_alarm():
     for name, data in clean_logs(1):
         assert not [each for each in check_if_long(data) if each.severity == "wrong"], name
@@ -88,8 +89,8 @@ def test_noise_of_the_acceleration_does_not_make_masses_smaller():
     data = clean(two_links(), 0, noise="none")
     noise = np.array([8.0, 8.0])
     noisy = replace(data, a=data.a + noise * np.random.default_rng(0).normal(size=data.a.shape))
-    assert data.system is not None
-    robot = data.system.robot
+    assert data.model is not None
+    robot = data.model.robot
     without = parameter_findings(robot, noisy, np.zeros(2))
     assert [each.subject for each in without] == ["masses"]  # regression on noisy regressors is too small
     assert parameter_findings(robot, noisy, noise) == []

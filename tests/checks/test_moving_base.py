@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from forcegp import ColumnMapping, Dataset, MechanicalSystem, Robot, check, excitation, import_recordings
+from forcegp import ColumnMapping, Dataset, Model, Robot, check, excitation, import_recordings
 from forcegp.checks import quick_check
 from forcegp.data.configurations import rates
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters
+from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 BODY = """<robot name="drone"><link name="body"><inertial><mass value="2"/>
@@ -39,9 +39,9 @@ def test_a_quaternion_that_begins_with_w_is_named(log):
 def test_velocities_in_the_axes_of_the_world_are_named(log):
     turn = 1.2  # far from upright, where body and world differ
     spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn, *[0.0] * 12], dtype=torch.float64)
-    q, v = log.system.robot.integrate(torch.tensor(log.q), spin).numpy(), log.v.copy()
+    q, v = log.model.robot.integrate(torch.tensor(log.q), spin).numpy(), log.v.copy()
     position = torch.tensor(log.q[:, :3])
-    rotation = log.system.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
+    rotation = log.model.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
     q[:, :3] = position
     c, s = np.cos(turn), np.sin(turn)
     yaw = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # the base turned about its own z axis
@@ -64,7 +64,7 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
 
 def swaying(speed: float, noise: float) -> Dataset:
     """A body tilted by 40 degrees that sways about its axes at `speed` [rad/s], as noisy sensors see it at 50 Hz."""
-    system, time = MechanicalSystem(Robot.from_urdf_text(BODY, base="floating")), 0.02 * np.arange(400)
+    model, time = Model(Robot.from_urdf_text(BODY, base="floating")), 0.02 * np.arange(400)
     draw = np.random.default_rng(3).normal
     angles = np.stack([np.sin(1.1 * time), np.sin(1.7 * time), np.sin(2.3 * time)], axis=1) * speed / 2.0
     turned = Rotation.from_rotvec([0.0, 0.7, 0.0]) * Rotation.from_rotvec(angles)
@@ -74,7 +74,7 @@ def swaying(speed: float, noise: float) -> Dataset:
     v[1:-1, 3:] = turned[1:-1].apply(rate)
     v[:, 3:] += noise * draw(size=(400, 3))
     a = np.gradient(v, time, axis=0)
-    return Dataset(q=q, v=v, u=np.zeros((400, 6)), a=a, time=time, system=system).rows(slice(1, -1))
+    return Dataset(q=q, v=v, u=np.zeros((400, 6)), a=a, time=time, model=model).rows(slice(1, -1))
 
 
 def test_rates_in_the_axes_of_the_world_are_named_in_noise_as_well():
@@ -96,7 +96,7 @@ def test_noise_alone_is_not_taken_for_other_axes():
 
 def test_an_accelerometer_is_no_acceleration(log):
     a = log.a.copy()
-    rotation = log.system.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
+    rotation = log.model.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
     a[:, :3] += np.cross(log.v[:, 3:6], log.v[:, :3]) + 9.81 * rotation[:, 2, :]
     (finding,) = quick_check(replace(log, a=a))
     assert (finding.subject, finding.severity) == ("base acceleration", "wrong")
@@ -138,7 +138,7 @@ def test_velocities_of_the_joints_are_compared_beside_a_base(log, what, tmp_path
     np.savetxt(tmp_path / "log.csv", table, "%.12g", ",", header=",".join(columns), comments="")
     signals = {name: (f"{name}{{0..{getattr(log, name).shape[1] - 1}}}",) for name in "qvu"}
     mapping = ColumnMapping(time="t", **signals)
-    import_recordings([tmp_path / "log.csv"], tmp_path / "log.h5", mapping, system=log.system)
+    import_recordings([tmp_path / "log.csv"], tmp_path / "log.h5", mapping, model=log.model)
     wrong = Dataset.load(tmp_path / "log.h5")
     (finding,) = quick_check(wrong)
     assert (finding.severity, finding.subject) == ("wrong", "velocity")
@@ -146,20 +146,20 @@ def test_velocities_of_the_joints_are_compared_beside_a_base(log, what, tmp_path
     units = ["m/s"] * 3 + ["rad/s"] * 3 + ["deg/s"] * 12
     assert (f"--unit v={','.join(units)};" if what == "deg/s" else "--sign v=1,1,1,1,1,1,1,1,-1,1,") in finding.remedy
     corrected = mapping.corrected_by(finding.correction, log.joint_names, {})
-    import_recordings([tmp_path / "log.csv"], tmp_path / "right.h5", corrected, system=log.system)
+    import_recordings([tmp_path / "log.csv"], tmp_path / "right.h5", corrected, model=log.model)
     right = Dataset.load(tmp_path / "right.h5")
     np.testing.assert_allclose(right.v, log.v, atol=1e-9)
     assert not [each for each in quick_check(right) if each.severity == "wrong"]
 
 
 def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
-    names = [name for name in log.system.inputs if not name.endswith("_stands")]
-    bare = replace(log, u=log.u[:, : len(names)], system=log.system.with_contacts([]), truth={})
+    names = [name for name in log.model.inputs if not name.endswith("_stands")]
+    bare = replace(log, u=log.u[:, : len(names)], model=log.model.with_contacts([]), truth={})
     (finding,) = [each for each in check(bare).findings if each.severity == "wrong"]
     assert finding.subject == "base force"
     assert finding.numbers["force"] == pytest.approx(17.2 * 9.81, rel=0.05)  # the robot without its load
     q, v, u = (torch.tensor(x) for x in (bare.q, bare.v, bare.u))
-    falls = bare.system.dynamics(q, v, 0.0 * u).acceleration_map().offset.numpy()
+    falls = bare.model.dynamics(q, v, 0.0 * u).acceleration_map().offset.numpy()
     assert not [each for each in check(replace(bare, a=falls)).findings if each.subject == "base force"]
     lifted = replace(log, u=np.hstack([bare.u, np.zeros((len(log), 4))]), truth={})
     (carried,) = [each for each in check(lifted).findings if each.subject == "base force"]
@@ -182,9 +182,9 @@ def test_a_base_that_drives_although_nothing_drives_it(push):
     a = np.gradient(v, time, axis=0)
     force = robot.mass * (a[:, :2] + v[:, 2:] * np.stack([-v[:, 1], v[:, 0]], axis=1))
     driven = push == "logged"
-    known = (*[Actuation(np.eye(3, 2), ("x", "y"))] * driven, RigidBodyBias())
+    known = (*[Actuation(np.eye(3, 2), ("x", "y"))] * driven, RigidBodies())
     log = Dataset(q=torch.stack(q).numpy(), v=v, u=force if driven else np.zeros((1000, 0)), a=a, time=time,
-                  system=MechanicalSystem(robot, (), known))  # fmt: skip
+                  model=Model(robot, (), known))  # fmt: skip
     found = [each for each in quick_check(log) if each.subject == "base force"]
     assert len(found) == (push == "unknown")
     if found:
@@ -205,7 +205,7 @@ def test_the_order_of_quaternions_of_a_robot_that_stays_upright(order, shift):
     q = torch.stack(q).numpy()
     actual = "xyzw" if order == "wxyz" else "wxyz"
     true = Dataset(q=q, v=v, u=np.zeros((2000, 0)), a=np.gradient(v, time, axis=0), time=time,
-                   system=MechanicalSystem(robot, (), (RigidBodyBias(),)))  # fmt: skip
+                   model=Model(robot, (), (RigidBodies(),)))  # fmt: skip
     assert not [each for each in quick_check(true) if each.subject == "base"]
     turn = Rotation.from_quat(q[:, 3:])
     q[:, 3:] = np.roll(q[:, 3:], shift, axis=1)  # as read in the wrong order, with linear velocities in world axes
@@ -219,7 +219,7 @@ def test_a_base_in_millimetres(log):
     q, v, a = log.q.copy(), log.v.copy(), log.a.copy()
     for values in (q, v, a):
         values[:, :3] *= 1000.0
-    bare = replace(log, q=q, v=v, a=a, u=log.u[:, :12], system=log.system.with_contacts([]), truth={})
+    bare = replace(log, q=q, v=v, a=a, u=log.u[:, :12], model=log.model.with_contacts([]), truth={})
     (finding,) = [each for each in check(bare).findings if each.subject == "base force"]
     assert finding.severity == "wrong"
     assert "--unit q=mm" in finding.remedy
@@ -227,7 +227,7 @@ def test_a_base_in_millimetres(log):
 
 def test_what_needs_a_fixed_base_says_so(log):
     with pytest.raises(InvalidInput, match="need a base that is fixed; quadruped has the floating joint 'base'"):
-        excitation(log.system)
+        excitation(log.model)
 
 
 FLYING = 400.0  # Hz
@@ -249,13 +249,13 @@ def flight(seed: int = 0, noise: bool = True) -> tuple[Dataset, np.ndarray]:
     speeds = np.sqrt(2.0 * length / 4.0 / 1e-5) * np.ones(4)  # of rotors whose thrusts are equal, rad/s
     rotors = Thrusters("body", [(0.1, 0.1, 0), (-0.1, 0.1, 0), (0.1, -0.1, 0), (-0.1, -0.1, 0)], thrust=1e-5, power=2)
     robot = Robot.from_urdf_text(BODY, base="floating")
-    system = MechanicalSystem(robot, (), (Actuation(), rotors, RigidBodyBias()))
+    model = Model(robot, (), (Actuation(), rotors, RigidBodies()))
     jitter = Rotation.from_rotvec(np.deg2rad(0.2) * noise * draw(size=(2400, 3)))
     q = np.hstack([position + 0.001 * noise * draw(size=(2400, 3)), (turned * jitter).as_quat()])
     world = velocity + 0.02 * noise * draw(size=(2400, 3))
     v = np.hstack([(turned * jitter).inv().apply(world), turning])
     log = {"q": q, "v": v, "u": speeds, "a": np.gradient(v, time, axis=0), "time": time}
-    return Dataset(**log, system=system).rows(slice(2, -2)), world[2:-2]
+    return Dataset(**log, model=model).rows(slice(2, -2)), world[2:-2]
 
 
 def with_w_first(log: Dataset, world: np.ndarray) -> Dataset:
@@ -292,7 +292,7 @@ def test_a_log_that_begins_at_rest_is_compared_where_it_moves():
     rest = {name: np.repeat(getattr(wrong, name)[:1] * (name != "a") * (name != "v"), 2500, 0) for name in "qvua"}
     time = np.arange(2500 + len(log)) / FLYING
     rows = {name: np.vstack([rest[name], getattr(wrong, name)]) for name in "qvua"}
-    findings = quick_check(Dataset(**rows, time=time, system=log.system, metadata=wrong.metadata))
+    findings = quick_check(Dataset(**rows, time=time, model=log.model, metadata=wrong.metadata))
     assert [each.correction for each in findings if each.severity == "wrong"] == [{"orientation": {"q": ("wxyz",)}}]
 
 
@@ -307,7 +307,7 @@ def test_thrust_shows_the_unit_of_rotors_and_the_order_of_quaternions(w_first, s
         stated["orientation"] = {"q": ("wxyz",)}
     if speeds != 1.0:
         stated["unit"] = {"u": ("rpm",)}
-    v = rates(log.system.robot.space, q, log.time)
+    v = rates(log.model.robot.space, q, log.time)
     read = replace(log, q=q, v=v, u=speeds * log.u, a=np.gradient(v, log.time, axis=0)).rows(slice(3, -3))
     assert [each.correction for each in quick_check(read)] == ([stated] if stated else [])
 

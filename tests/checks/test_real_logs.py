@@ -9,7 +9,7 @@ from tests.checks.logs import column, exchanged
 
 from forcegp.checks import check
 from forcegp.data import Dataset
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.recordings import ColumnMapping, import_recordings
 from forcegp.robots import Robot
 
@@ -26,9 +26,9 @@ def panda(shared, tmp_path_factory) -> Dataset:
         headerless=(1, 7, 7, 7),
         side_by_side=True,
     )
-    system = MechanicalSystem(Robot.from_urdf(folder / "model" / "panda_gaz2019_nomesh.urdf"))
+    model = Model(Robot.from_urdf(folder / "model" / "panda_gaz2019_nomesh.urdf"))
     out = tmp_path_factory.mktemp("panda") / "log.h5"
-    import_recordings([folder / "raw" / f"exciting_traj_{name}.txt.gz" for name in names], out, mapping, system=system)
+    import_recordings([folder / "raw" / f"exciting_traj_{name}.txt.gz" for name in names], out, mapping, model=model)
     return Dataset.load(out)
 
 
@@ -44,6 +44,7 @@ def test_a_panda_is_well_but_its_velocities_are_late(panda):
     assert excitation.numbers["seen"] == 43  # base parameters of seven joints with general axes
 
 
+@pytest.mark.nightly
 def test_defects_planted_in_a_real_log_are_found(panda):
     order = [0, 3, 2, 1, 4, 5, 6]
     for planted, subject, joints in (
@@ -58,9 +59,9 @@ def test_defects_planted_in_a_real_log_are_found(panda):
 def test_a_double_pendulum_whose_elbow_sticks_in_one_run(shared, tmp_path):
     folder: Path = shared("realdata/dfki_double_pendulum")
     mapping = ColumnMapping(time="time", q=("pos_meas{1..2}",), v=("vel_meas{1..2}",), u=("tau_meas{1..2}",))
-    system = MechanicalSystem(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
+    model = Model(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
     runs = [folder / "raw" / f"20230629-{name}.csv.gz" for name in ("143339", "143601", "143906")]
-    import_recordings(runs, tmp_path / "log.h5", mapping, system=system)
+    import_recordings(runs, tmp_path / "log.h5", mapping, model=model)
     report = check(Dataset.load(tmp_path / "log.h5"))
     assert report.severity == "look"
     (held,) = report.of("held joint")

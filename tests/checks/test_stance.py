@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forcegp import Dataset, MechanicalSystem, Preparation, Robot, check
+from forcegp import Dataset, Model, Preparation, Robot, check
 from forcegp.checks import quick_check
 from forcegp.data import estimate_stance
 from forcegp.errors import DatasetError, DataWarning
@@ -24,7 +24,7 @@ def of(dataset, subject="contact flag"):
 
 def flagged(log, foot, change):
     u = log.u.copy()
-    place = log.system.inputs.index(foot)
+    place = log.model.inputs.index(foot)
     u[:, place] = change(u[:, place])
     return replace(log, u=u, truth={})
 
@@ -35,13 +35,13 @@ def test_flags_that_the_motion_supports_are_in_order(log):
 
 
 def test_a_foot_that_moves_while_it_stands_is_named(log):
-    feet = log.system.inputs[12:]
-    lifted = next(foot for foot in feet if (log.u[:, log.system.inputs.index(foot)] == 0.0).any())
+    feet = log.model.inputs[12:]
+    lifted = next(foot for foot in feet if (log.u[:, log.model.inputs.index(foot)] == 0.0).any())
     (finding,) = of(flagged(log, lifted, np.ones_like))
     assert finding.severity == "wrong"
     assert repr(lifted) in finding.seen
     assert repr(lifted.replace("_stands", "_foot")) in finding.seen
-    rows = np.flatnonzero(log.u[:, log.system.inputs.index(lifted)] == 0.0)
+    rows = np.flatnonzero(log.u[:, log.model.inputs.index(lifted)] == 0.0)
     assert int(finding.seen.split("row ")[1].split(" ")[0]) in rows
     assert "Set the flag to 0" in finding.remedy
 
@@ -56,21 +56,21 @@ def test_flags_that_are_a_little_late_are_a_suspicion(log):
 
 
 def test_a_wrong_foot_point_moves_while_it_bears(log):
-    moved = replace(log.system.contacts[0], point=(0.0, 0.0, 0.3))
-    wrong = [replace(each, point=moved.point) if each.frame == moved.frame else each for each in log.system.contacts]
-    findings = of(replace(log, system=log.system.with_contacts(wrong), truth={}))
+    moved = replace(log.model.contacts[0], point=(0.0, 0.0, 0.3))
+    wrong = [replace(each, point=moved.point) if each.frame == moved.frame else each for each in log.model.contacts]
+    findings = of(replace(log, model=log.model.with_contacts(wrong), truth={}))
     assert repr(moved.frame) in findings[0].seen
     assert findings[0].severity == "wrong"
 
 
 def test_a_foot_that_rests_while_it_is_free_is_a_suspicion(log):
-    (finding,) = of(flagged(log, log.system.inputs[12], np.zeros_like))
+    (finding,) = of(flagged(log, log.model.inputs[12], np.zeros_like))
     assert finding.severity == "look"
     assert "at rest" in finding.seen
 
 
 def test_flags_that_are_no_flags_are_named(log):
-    (finding,) = of(flagged(log, log.system.inputs[13], lambda flags: 0.9 * flags))
+    (finding,) = of(flagged(log, log.model.inputs[13], lambda flags: 0.9 * flags))
     assert "neither 0 nor 1" in finding.seen
     assert finding.numbers["rows"] == int((log.u[:, 13] != 0.0).sum())
 
@@ -87,14 +87,14 @@ def test_a_base_that_nobody_measured_is_named(log):
 
 def test_two_feet_of_one_flag_of_which_one_stands_are_named(log):
     """Whether the flag is 1 where both stand or where one does; feet that stand together may share it."""
-    first, second = log.system.inputs[12:14]
+    first, second = log.model.inputs[12:14]
     flags = log.u[:, 12:14]
     assert (flags.min(axis=1) < flags.max(axis=1)).mean() > 0.05
-    contacts = [replace(each, switch=first) if each.switch == second else each for each in log.system.contacts]
-    system = log.system.with_contacts(contacts)
+    contacts = [replace(each, switch=first) if each.switch == second else each for each in log.model.contacts]
+    model = log.model.with_contacts(contacts)
     for one in (flags.min(axis=1), flags.max(axis=1)):
         u = np.column_stack([log.u[:, :12], one, log.u[:, 14:]])
-        (finding,) = of(replace(log, system=system, u=u, truth={}))
+        (finding,) = of(replace(log, model=model, u=u, truth={}))
         assert finding.severity == "wrong"
         assert f"{first!r} is the flag of 'front_left_foot' and 'front_right_foot'" in finding.seen
         row = int(finding.seen.split("row ")[1].split(" ")[0])
@@ -105,7 +105,7 @@ def test_two_feet_of_one_flag_of_which_one_stands_are_named(log):
         assert "--feet front_left_foot,front_right_foot" in finding.remedy
     together = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=5, noise=0.05, lift=False))
     u = np.delete(together.u, 13, axis=1)
-    assert not of(replace(together, system=system, u=u, truth={}))
+    assert not of(replace(together, model=model, u=u, truth={}))
 
 
 def rocking(lean: float):
@@ -122,8 +122,8 @@ def rocking(lean: float):
     q[:, 0], q[:, 2] = heel[0] - np.cos(angle) * heel[0], np.sin(angle) * heel[0]
     q[:, 4], q[:, 6] = np.sin(0.5 * angle), np.cos(0.5 * angle)
     v[:, 2], v[:, 4], a[:, 2], a[:, 4] = rate * heel[0], rate, spin * heel[0], spin
-    system = MechanicalSystem(robot, fixed_frame("foot", switch="stands"))
-    return Dataset(q=q, v=v, u=np.ones((1000, 1)), a=a, time=time, system=system), angle
+    model = Model(robot, fixed_frame("foot", switch="stands"))
+    return Dataset(q=q, v=v, u=np.ones((1000, 1)), a=a, time=time, model=model), angle
 
 
 def test_a_heel_that_turns_under_a_flat_foot_is_named_and_left_out():
@@ -155,8 +155,8 @@ def test_a_robot_in_a_vertical_plane_without_gravity_is_named(turn):
     v[:, :2] = np.cumsum(a[:, :2], axis=0) / 200
 
     def rows(**gravity):
-        system = MechanicalSystem(Robot.from_urdf_text(text, base="planar", **gravity), fixed_point("foot", switch="s"))
-        return Dataset(q=q, v=v, u=1.0 - flies[:, None], a=a, time=time, system=system)
+        model = Model(Robot.from_urdf_text(text, base="planar", **gravity), fixed_point("foot", switch="s"))
+        return Dataset(q=q, v=v, u=1.0 - flies[:, None], a=a, time=time, model=model)
 
     (finding,) = of(rows(), "gravity")
     assert finding.severity == "wrong"

@@ -3,12 +3,12 @@
 import json
 
 import pytest
-from tests.models.arm import arm_data
+from tests.posterior.arm import arm_data
 
 from forcegp.cli.main import main
-from forcegp.models import load_posterior
+from forcegp.posterior import load_posterior
 
-FIT = ("fit", "arm.h5", "--prior", "joint", "--points", 10, "--iterations", 3, "--restarts", 2)
+FIT = ("fit", "arm.h5", "--forces", "gp:joint", "--points", 10, "--iterations", 3, "--restarts", 2)
 
 
 @pytest.fixture
@@ -33,7 +33,6 @@ def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
         (("--backend", "dask"), "no backend 'dask'; choose serial, joblib"),
         (("--jobs", 0), "jobs is 0; give"),
         (("--backend", "serial", "--jobs", 2), "choose joblib"),
-        (("--model", "analytical", "--backend", "joblib"), "--backend means nothing to --model analytical"),
     ],
 )
 def test_options_that_cannot_be_meant_are_one_line(folder, words, message, monkeypatch, capsys):

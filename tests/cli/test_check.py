@@ -18,7 +18,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("check")
     data = clean(1)
     data.save(place / "clean.h5")
-    replace(data, system=None).save(place / "bare.h5")
+    replace(data, model=None).save(place / "bare.h5")
     column(late(data, 0.02), "u", 1, np.negative).save(place / "defects.h5")
     noisy = replace(data, q=data.q + 1e-4 * np.random.default_rng(0).normal(size=data.q.shape))
     noisy.save(place / "noisy.h5")

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.models.arm import URDF, arm_data, arm_system
+from tests.posterior.arm import URDF, arm_data, arm_model
 
 from forcegp import Dataset
 
@@ -17,8 +17,8 @@ def folder(forcegp, tmp_path_factory):
     """A robot, a log, and a model of friction."""
     place = tmp_path_factory.mktemp("excite")
     (place / "arm.urdf").write_text(URDF)
-    arm_data(40, 0, arm_system(0)).save(place / "arm.h5")
-    done = forcegp("fit", "arm.h5", "--prior", "joint-friction", *QUICK, "--out", "run", folder=place)
+    arm_data(40, 0, arm_model(0)).save(place / "arm.h5")
+    done = forcegp("fit", "arm.h5", "--forces", "gp:joint-friction", *QUICK, "--out", "run", folder=place)
     assert done.returncode == 0, done.stderr
     return place
 

@@ -1,4 +1,4 @@
-"""Every command once through the installed executable on real files, and what belongs to a process: exit codes, pipes.
+"""Every command once on real files, some through the installed executable: exit codes, pipes.
 
 Whatever else the commands do is tested in this process by the fixture `forcegp`, which does not import torch anew.
 """
@@ -9,11 +9,10 @@ import re
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from tests.cli.test_import import FLAGS
 from tests.control import test_monitor as monitored
-from tests.models.arm import arm_data
+from tests.posterior.arm import URDF, arm_data
 from tests.recordings.log_files import motion, table, write_text
 from tests.validation.moving_arm import moving_arm
 
@@ -22,14 +21,6 @@ from forcegp.cli.main import COMMANDS
 QUICK = ("--points", 8, "--iterations", 2, "--restarts", 1)
 
 RUNS: dict[str, tuple[tuple[object, ...], str]] = {
-    "auto": (
-        (
-            *("moving.csv", "--time", "t", "--q", "q{1..3}", "--v", "v{1..3}", "--u", "u{1..3}", "--robot", "arm.urdf"),
-            *("--cutoff", "none", "--delay", 0, "--models", "analytical", "--accept", "--out", "answer"),
-        ),
-        "answer/validation/report.md",
-    ),
-    "demo": (("--seconds", 0.5, "--points", 8, "--iterations", 2, "--out", "story"), "story/prediction.png"),
     "simulate": (("kuka-surface", "--seconds", 0.1, "--out", "simulated.h5"), "simulated.h5"),
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
     "robot": (("arm.urdf", "--out", "arm.png"), "arm.png"),
@@ -37,14 +28,12 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
     "payload": (("log.h5", "--cutoff", "none", "--delay", 0, "--out", "held"), "held/payload.json"),
-    "compare": (("arm.h5", "--priors", "joint,joint-friction", *QUICK, "--out", "c"), "c/comparison.json"),
-    "identify": (("arm.h5", "--learn", "hand:mass", *QUICK, "--out", "found"), "found/identified.urdf"),
     "evaluate": (("run", "test.h5", "--plots", "figures"), "figures/evaluation.json"),
     "validate": (
         (
             "log.h5",
             "--models",
-            "analytical",
+            "given",
             *QUICK,
             "--seeds",
             1,
@@ -69,6 +58,11 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
 }
 
 
+ELSEWHERE = {"auto": "test_auto", "demo": "test_commands"}
+"""Those that take long, and where they are run."""
+IN_A_PROCESS = ("robot", "fit", "evaluate")
+
+
 @pytest.fixture(scope="module")
 def folder(forcegp, tmp_path_factory):
     """Logs of the small arm, one as CSV, and a model."""
@@ -77,28 +71,28 @@ def folder(forcegp, tmp_path_factory):
         arm_data(rows, seed).save(place / f"{name}.h5")
     moving_arm(1.0, 2).save(place / "log.h5")
     write_text(place / "log.csv", table(motion()))
-    moving = moving_arm(6.0, 1)
-    (place / "arm.urdf").write_text(moving.system.robot.urdf_text)
-    header = "t," + ",".join(f"{name}{k}" for name in "qvu" for k in (1, 2, 3))
-    columns = np.column_stack([moving.time, moving.q, moving.v, moving.u])
-    np.savetxt(place / "moving.csv", columns, delimiter=",", header=header, comments="")
+    (place / "arm.urdf").write_text(URDF)
     for name, seconds, seed in (("free", 55.0, 1), ("pushed", 3.0, 7)):
         monitored.saved(place / f"{name}.h5", monitored.motion(seconds, seed))
-    for words in (("arm.h5", "--out", "run"), ("free.h5", "--prior", "joint-friction", "--out", "free-run")):
+    for words in (
+        ("arm.h5", "--forces", "gp:joint", "--out", "run"),
+        ("free.h5", "--forces", "gp:joint-friction", "--out", "free-run"),
+    ):
         assert forcegp("fit", *words, *QUICK, folder=place).returncode == 0
     return place
 
 
 def test_every_command_is_run_here():
-    assert RUNS.keys() == COMMANDS.keys()
+    assert {*RUNS, *ELSEWHERE} == COMMANDS.keys()
 
 
 @pytest.mark.parametrize("command", RUNS)
-def test_every_command_writes_its_files_and_prints_one_json_object(installed, folder, command):
-    if command in ("demo", "simulate", "reproduce"):
+def test_every_command_writes_its_files_and_prints_one_json_object(installed, forcegp, folder, command):
+    if command in ("simulate", "reproduce"):
         pytest.importorskip("pybullet")
     words, written = RUNS[command]
-    done = installed(command, *words, "--json", folder=folder)
+    run = installed if command in IN_A_PROCESS else forcegp
+    done = run(command, *words, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     assert isinstance(json.loads(done.stdout), dict)
     assert (folder / written).stat().st_size > 0

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from tests.models.arm import arm_data
+from tests.posterior.arm import arm_data
 
 QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1, "--no-checks")
 FILES = {"arm.c", "arm.h", "arm_external.c", "arm_acados.c", "CMakeLists.txt", "example.c", "self_test.c", "README.txt"}
@@ -19,7 +19,7 @@ def folder(forcegp, tmp_path_factory):
     """A model of the small arm, and one of another kind."""
     place = tmp_path_factory.mktemp("export")
     arm_data(40, 0).save(place / "arm.h5")
-    for name, more in (("run", ()), ("black", ("--model", "independent-gp"))):
+    for name, more in (("run", ()), ("black", ("--forces", "gp:independent"))):
         done = forcegp("fit", "arm.h5", *QUICK, *more, "--out", name, folder=place)
         assert done.returncode == 0, done.stderr
     return place

@@ -8,7 +8,6 @@ import pytest
 
 from forcegp.cli.command import FIELDS, NUMBERS, split_list
 from forcegp.cli.help_pages import command_page
-from forcegp.cli.learning_options import MODEL_PARTS, PARTS
 from forcegp.cli.main import ARGUMENTS, COMMANDS, command_class, parse_arguments
 from forcegp.errors import InvalidInput
 
@@ -24,29 +23,22 @@ def refused(words):
 @pytest.mark.parametrize(
     ("words", "field", "entries"),
     [
-        ("validate x.h5 --out r --models analytical,joint", "models", ("analytical", "joint")),
         (
-            "validate x.h5 --out r --models a@identified:viscous,load,joint:inputs=q/v,kernel=k,b/motions",
+            "validate x.h5 --out r --models a+gp:joint:inputs=q/v,kernel=k,identified@motions:1",
             "models",
-            ("a@identified:viscous,load", "joint:inputs=q/v,kernel=k", "b/motions"),
+            ("a+gp:joint:inputs=q/v,kernel=k", "identified@motions:1"),
         ),
-        (f"{FIT} --prior tool-friction,joint-friction", "prior", ("tool-friction", "joint-friction")),
-        (f"{FIT} --prior payload:frame=tool,x=1,joint", "prior", ("payload:frame=tool,x=1", "joint")),
-        (f"{FIT} --prior 'a:kernel=(k + deep(x, y)),b'", "prior", ("a:kernel=(k + deep(x, y))", "b")),
-        ("compare x.h5 --priors 'a,a + b'", "priors", ("a", "a + b")),
+        (f"{FIT} --forces viscous,gp:joint-friction", "forces", ("viscous", "gp:joint-friction")),
+        (f"{FIT} --forces gp:tool:frame=tool,x=1,viscous", "forces", ("gp:tool:frame=tool,x=1", "viscous")),
+        (f"{FIT} --forces 'gp:a:kernel=(k + deep(x, y)),b'", "forces", ("gp:a:kernel=(k + deep(x, y))", "b")),
+        (f"{FIT} --evidence torques:mean=.4,motions:1", "evidence", ("torques:mean=.4", "motions:1")),
         (
             f"{FIT} --contact tool@0,-1e-3,0.1:plane:0,0,1,.055,link_2:sphere:0,0,0,1",
             "contact",
             ("tool@0,-1e-3,0.1:plane:0,0,1,.055", "link_2:sphere:0,0,0,1"),
         ),
         ("excite run --out f --limits velocity=1,1,2,torque=5", "limits", ("velocity=1,1,2", "torque=5")),
-        (
-            "identify x.h5 --out r --learn hand:mass,com,armature:pan,lift=0.1,coulomb-joint-friction",
-            "learn",
-            ("hand:mass,com", "armature:pan,lift=0.1", "coulomb-joint-friction"),
-        ),
         (f"{FIT} --lock a=1,b=-0.5", "lock", ("a=1", "b=-0.5")),
-        ("identify x.h5 --out r --friction none", "friction", ("none",)),
         ("reproduce fig3 --points 10,20 --seed-list 7", "points", (10, 20)),
         ("rollout run x.h5 --out r --start-rows 0,240", "start_rows", (0, 240)),
         ("validate x.h5 --out r --horizon 0.1,1", "horizon", (0.1, 1.0)),
@@ -58,37 +50,18 @@ def test_lists_are_written_with_commas(words, field, entries):
 
 
 def test_what_a_list_prints_is_read_again():
-    command = parse_arguments(shlex.split(f"{FIT} --prior payload:frame=a,b=1,joint --lock a=1,b=2 --gravity=-1,0,0"))
-    words = command.words("prior", "lock", "gravity")
-    assert words == ["--prior", "payload:frame=a,b=1,joint", "--lock", "a=1,b=2", "--gravity=-1,0,0"]
+    command = parse_arguments(shlex.split(f"{FIT} --forces gp:tool:a=b,b=1,joint --lock a=1,b=2 --gravity=-1,0,0"))
+    words = command.words("forces", "lock", "gravity")
+    assert words == ["--forces", "gp:tool:a=b,b=1,joint", "--lock", "a=1,b=2", "--gravity=-1,0,0"]
     again = parse_arguments([*shlex.split(FIT), *words])
     assert again == command
 
 
 def test_what_continues_an_entry():
-    continues = {
-        NUMBERS: ("0", "-1.5", ".5", "1e-3", "0.1:plane:0"),
-        FIELDS: ("inputs=q/v", "kernel = x"),
-        PARTS: ("mass", "com", "pan", "lift=0.1", "armature_1"),
-        MODEL_PARTS: ("load", "load/motions", "inputs=v"),
-    }
-    begins = {
-        NUMBERS: ("tool", "0_link:plane:0", "velocity=1"),
-        FIELDS: ("joint", "payload:frame=x", "a + b"),
-        PARTS: ("hand:mass", "armature", "viscous-joint-friction=0.1"),
-        MODEL_PARTS: ("analytical", "joint-friction@identified", "payload:frame=x"),
-    }
+    continues = {NUMBERS: ("0", "-1.5", ".5", "1e-3", "0.1:plane:0"), FIELDS: ("inputs=q/v", "kernel = x")}
+    begins = {NUMBERS: ("tool", "0_link:plane:0", "velocity=1"), FIELDS: ("joint", "gp:tool:frame=x", "a + b")}
     assert [(p, each) for p, found in continues.items() for each in found if not re.fullmatch(p, each)] == []
     assert [(p, each) for p, found in begins.items() for each in found if re.fullmatch(p, each)] == []
-
-
-def test_forces_and_laws_of_lists_are_those_of_the_library():
-    from forcegp.analytical import LAWS
-    from forcegp.mechanics import KNOWN_FORCES
-
-    learned = {name for name, kind in KNOWN_FORCES.items() if kind.learned is not None}
-    assert all(not re.fullmatch(PARTS, name) for name in learned)
-    assert all(re.fullmatch(MODEL_PARTS, law) for law in LAWS)
 
 
 @pytest.mark.parametrize("text", ["", "a,", ",a", "a,,b", " , "])
@@ -103,9 +76,9 @@ def test_empty_entries_are_refused(text):
         ("validate x.h5 --out r --models a b c", "--models takes one list, written with commas: --models a,b,c"),
         ("validate --models a b x.h5 --out r", "--models takes one list, written with commas: --models a,b"),
         ("reproduce fig3 --points 50 100", "--points takes one list, written with commas: --points 50,100"),
-        (f"{FIT} --prior a --prior b", "--prior is given twice; write one list: --prior a,b"),
-        (f"{FIT} --prior=a --seed 1 --prior 'b + c'", "--prior is given twice; write one list: --prior 'a,b + c'"),
-        (f"{FIT} --known_force a --known-force b", "--known-force is given twice; write one list"),
+        (f"{FIT} --forces a --forces b", "--forces is given twice; write one list: --forces a,b"),
+        (f"{FIT} --forces=a --seed 1 --forces 'b + c'", "--forces is given twice; write one list: --forces 'a,b + c'"),
+        (f"{FIT} --force_noise 1 --force-noise 2", "--force-noise is given twice; give it once"),
         (f"{FIT} --seed 1 --seed 2", "--seed is given twice; give it once"),
         ("reproduce fig3 --points 10,x", "'10,x' is no list of whole numbers, as 1,2 is."),
         ("validate x.h5 --out r --horizon 1,,2", "'1,,2' holds an empty entry"),

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from tests.evaluation.friction import friction_data
-from tests.models.arm import URDF, arm_system
+from tests.posterior.arm import URDF, arm_model
 
 from forcegp import Dataset, evaluate, load_posterior
 from forcegp.cli.main import main
@@ -22,7 +22,7 @@ QUICK = ("--points", "30", "--iterations", "25", "--restarts", "1")
 def other_system():
     """The same arm with a heavier hand, on a lower, level plane."""
     robot = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.2"'))
-    return arm_system().with_robot(robot).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 0.3))])
+    return arm_model().with_robot(robot).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 0.3))])
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +31,10 @@ def arm(forcegp, tmp_path_factory):
     folder = tmp_path_factory.mktemp("arm")
     friction_data(60, seed=0).save(folder / "train.h5")
     friction_data(50, seed=1).save(folder / "test.h5")
-    other = friction_data(50, seed=2, system=other_system())
+    other = friction_data(50, seed=2, model=other_system())
     # friction_data knows the tool's friction on its own plane only
     dataclasses.replace(other, truth={"a": other.truth["a"], "lambda": other.truth["lambda"]}).save(folder / "other.h5")
-    words = ("--prior", "joint-friction,contact-friction:kernel=linear", *QUICK)
+    words = ("--forces", "gp:joint-friction,gp:contact-friction:kernel=linear", *QUICK)
     fitted = forcegp("fit", "train.h5", *words, "--out", "run", folder=folder)
     assert fitted.returncode == 0, fitted.stderr
     return folder
@@ -68,7 +68,7 @@ def test_the_table_tells_errors_of_forces_and_what_the_normal_force_rests_on(arm
     assert re.search(r"multiplier\) MAE \S+ N, RMS error \S+ %, \S+ % in the 95 % band; this prior leaves no", told)
     assert "rest on the prior alone" not in told
 
-    words = ("fit", arm / "train.h5", "--prior", "joint-friction + joint", *QUICK, "--out", tmp_path / "joint")
+    words = ("fit", arm / "train.h5", "--forces", "gp:joint-friction,gp:joint", *QUICK, "--out", tmp_path / "joint")
     assert forcegp(*words).returncode == 0
     done = forcegp("evaluate", tmp_path / "joint", "test.h5", folder=arm)
     assert "forces along the contact normal rest on the prior alone" in " ".join(done.stdout.split())
@@ -90,7 +90,7 @@ def test_another_robot_and_contact_are_named_with_the_remedy_and_the_remedy_help
     assert scores["mae_noise_free"] < 0.2 * before["mae_noise_free"]
     assert scores["constraint_error"] < 1e-9 < before["constraint_error"]
     data = Dataset.load(arm / "other.h5")
-    expected = evaluate(load_posterior(arm / "run").with_system(data.system), data)
+    expected = evaluate(load_posterior(arm / "run").with_model(data.model), data)
     np.testing.assert_allclose(scores["mae_per_joint"], expected.mae_per_joint, rtol=1e-6)
     shown = forcegp("evaluate", "run", "other.h5", "--system", "data", folder=arm)
     assert "carried to another robot or contacts" in " ".join(shown.stdout.split())
@@ -120,19 +120,19 @@ def refused(words, capfd) -> str:
 
 
 def test_what_cannot_move_is_refused_in_one_line(arm, forcegp, tmp_path, capfd):
-    fitted = forcegp("fit", "train.h5", "--model", "independent-gp", *QUICK, "--out", tmp_path / "gp", folder=arm)
+    fitted = forcegp("fit", "train.h5", "--forces", "gp:independent", *QUICK, "--out", tmp_path / "gp", folder=arm)
     assert fitted.returncode == 0, fitted.stderr
     told = refused(("evaluate", tmp_path / "gp", arm / "other.h5", "--system", "data"), capfd)
     assert "cannot move to another" in told
-    dataclasses.replace(Dataset.load(arm / "test.h5"), system=None).save(tmp_path / "bare.h5")
+    dataclasses.replace(Dataset.load(arm / "test.h5"), model=None).save(tmp_path / "bare.h5")
     told = refused(("evaluate", arm / "run", tmp_path / "bare.h5", "--system", "data"), capfd)
     assert "the data carry no robot" in told
     assert "--system" in refused(("evaluate", arm / "run", arm / "test.h5", "--system", "moon"), capfd)
 
 
 def test_a_robot_that_was_identified_stays_and_takes_the_contacts_of_the_data(arm, forcegp, tmp_path):
-    words = ("identify", "train.h5", "--learn", "hand:mass", *QUICK, "--out", tmp_path / "found", "--json")
-    done = forcegp(*words, folder=arm)
+    words = ("fit", "train.h5", "--forces", "rigid-bodies:learn=hand,gp:joint-friction", *QUICK)
+    done = forcegp(*words, "--out", tmp_path / "found", "--json", folder=arm)
     assert done.returncode == 0, done.stderr
     same = forcegp("evaluate", tmp_path / "found", "test.h5", "--json", folder=arm)
     # another mass is what was asked for
@@ -141,5 +141,5 @@ def test_a_robot_that_was_identified_stays_and_takes_the_contacts_of_the_data(ar
     assert moved.returncode == 0, moved.stderr
     assert "the robot stays the identified one" in moved.stderr
     data, found = Dataset.load(arm / "other.h5"), load_posterior(tmp_path / "found")
-    expected = evaluate(found.with_contacts(data.system.contacts), data)
+    expected = evaluate(found.with_contacts(data.model.contacts), data)
     np.testing.assert_allclose(json.loads(moved.stdout)["mae_per_joint"], expected.mae_per_joint, rtol=1e-6)

@@ -37,8 +37,8 @@ def test_a_robot_orders_the_joints_and_the_dataset_carries_it(forcegp, tmp_path)
     assert done.returncode == 0, done.stderr
     data = Dataset.load(tmp_path / "log.h5")
     assert data.joint_names == ("elbow", "shoulder")
-    assert data.system is not None
-    assert data.system.robot.joint_names == data.joint_names
+    assert data.model is not None
+    assert data.model.robot.joint_names == data.joint_names
     np.testing.assert_array_equal(data.q, motion()["q"][:, ::-1])
     np.testing.assert_array_equal(data.u, motion()["u"][:, ::-1])
     assert "found by name: q = q_elbow, q_shoulder" in done.stderr

@@ -9,8 +9,21 @@ from tests.checks.logs import column
 
 import forcegp as package
 from forcegp.errors import ContactWarning
+from forcegp.fit import fit
 
-FIT = ("--points", 12, "--iterations", 2, "--restarts", 1, "--prior", "joint-friction", "--overwrite", "--out", "run")
+FIT = (
+    "--points",
+    12,
+    "--iterations",
+    2,
+    "--restarts",
+    1,
+    "--forces",
+    "gp:joint-friction",
+    "--overwrite",
+    "--out",
+    "run",
+)
 
 
 def looked(stderr: str) -> list[str]:
@@ -56,24 +69,14 @@ def test_a_missing_contact_is_said_once_by_fit_and_by_evaluate(forcegp, folder):
     assert "no contact is stated" in scored.stderr
 
 
-def test_compare_looks_too(forcegp, folder):
-    done = forcegp(
-        *("compare", "sign.h5", "--priors", "joint,joint-friction", "--points", 12, "--iterations", 2),
-        *("--restarts", 1),
-        folder=folder,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "warning: torque sign" in done.stderr
-
-
 def test_in_python_a_fit_warns_of_contacts_that_the_rows_contradict(folder):
     data = package.Dataset.load(folder / "line.h5")
     wrong = without_contacts(data)
-    assert wrong.system is not None
-    model = package.StructuredGP(wrong.system, package.JointFriction())
+    assert wrong.model is not None
+    model = wrong.model.with_forces(package.JointFriction())
     few = package.inference.OptimizerOptions(iterations=1)
     with pytest.warns(ContactWarning, match="no contact is stated"):
-        model.fit(replace(wrong, metadata={}), points=12, restarts=1, options=few)
+        fit(model, replace(wrong, metadata={}), points=12, restarts=1, options=few)
 
 
 @pytest.mark.parametrize("columns", ["40", "80"])

@@ -5,13 +5,14 @@ import re
 from pathlib import Path
 
 import pytest
-from tests.models.arm import arm_data
+from tests.posterior.arm import arm_data
 
 from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 from forcegp.cli.terminal import OTHERWISE, with_option_names
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
-from forcegp.models import StructuredGP
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|xcode-select|start one with)[^;)`]* --[a-z]")
@@ -22,10 +23,10 @@ OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|xcode-select|start one with)[^;)`]* 
     [
         ("`points=61` must be an integer", "--points 61 must be an integer"),
         ("`seed=-1` must", "--seed=-1 must"),
-        ("give `mean='analytical'`, or fewer `points`", "give --mean analytical, or fewer --points"),
+        ("give `engine='exact'`, or fewer `points`", "give --engine exact, or fewer --points"),
         ("use `learning_points=600`", "use --learning-points 600"),
         ("add `overwrite=True` or another `folder`", "add --overwrite or another --out"),
-        ("another `system` or its `contacts`", "another --robot or its --contact"),
+        ("another `model` or its `contacts`", "another --robot or its --contact"),
         ("a `tolerance` that only Python has, `forcegp fit`", "a `tolerance` that only Python has, `forcegp fit`"),
         ("`unit` q=deg", "`unit` q=deg"),  # of another command
     ],
@@ -42,7 +43,7 @@ def test_every_other_name_is_an_option_of_some_command():
 def test_the_same_error_in_both_worlds(forcegp, tmp_path):
     data = arm_data(20, 0)
     with pytest.raises(ForceGPError, match=r"^`points=99` must be an integer from 2 to 20"):
-        StructuredGP(data.system).fit(data, points=99)
+        fit(data.model.with_forces(JointForces()), data, points=99)
     data.save(tmp_path / "arm.h5")
     for words, message in [
         ("fit arm.h5 --points 1 --out run", "forcegp: --points 1 must be an integer from 2 to 20, the rows of the"),

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from tests.cli.one_line import assert_refused
-from tests.models.arm import URDF, arm_data
+from tests.posterior.arm import URDF, arm_data
 
 import forcegp
+import forcegp.evaluation
 from forcegp import Dataset, load_posterior
 from forcegp.atomic_files import atomic_folder, write_digests
 from forcegp.cli.main import main
@@ -28,9 +29,7 @@ FILES = {
 FOLDERS = {
     "spectra": "prepare arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
     "fit": "fit arm.h5 --overwrite --out OUT",
-    "identify": "identify arm.h5 --learn hand:mass --overwrite --out OUT",
-    "regression": "identify arm.h5 --model consistent --overwrite --out OUT",
-    "compare": "compare arm.h5 --priors joint,joint-friction --overwrite --out OUT",
+    "payload": "payload arm.h5 --overwrite --out OUT",
     "evaluate": "evaluate run arm.h5 --overwrite --plots OUT",
     "rollout": "rollout run arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
@@ -42,7 +41,7 @@ STORES = {
     "reproduce": "reproduce fig2b --out OUT",
     "docs": "reproduce fig2b --out runs --docs OUT",
 }
-KINDS = {"spectra": "forcegp prepare", "regression": "forcegp identify"}
+KINDS = {"spectra": "forcegp prepare"}
 COMMANDS = FILES | FOLDERS | STORES
 
 
@@ -69,7 +68,7 @@ def no_work(monkeypatch) -> None:
     monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
     monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
     monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)
-    monkeypatch.setattr("forcegp.models.search.farthest_rows", begun, raising=False)
+    monkeypatch.setattr("forcegp.evaluation.learn", begun)
     own = Dataset.load
     monkeypatch.setattr(Dataset, "load", lambda path: own(path) if "validate" in sys.argv else begun())
 
@@ -138,13 +137,13 @@ def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypa
 
 def test_a_file_that_appears_while_the_model_is_fitted_is_not_deleted(folder, capfd, monkeypatch):
     assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
-    own = forcegp.StructuredGP.fit
+    own = forcegp.evaluation.learn
 
     def fit(*given, **more):
         Path("out/notes.txt").write_text("mine")
         return own(*given, **more)
 
-    monkeypatch.setattr(forcegp.StructuredGP, "fit", fit)
+    monkeypatch.setattr("forcegp.evaluation.learn", fit)
     assert "(notes.txt)" in refused(["fit", "arm.h5", *QUICK.split(), "--out", "out", "--overwrite"], capfd)
     assert Path("out/notes.txt").read_text() == "mine"
     load_posterior("out")
@@ -163,9 +162,9 @@ def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, 
         assert Path("out").read_text() == "theirs"
     else:
         change = meanwhile(
-            forcegp.StructuredGP.fit, lambda: (Path("out").mkdir(exist_ok=True), Path("out/a").write_text("theirs"))
+            forcegp.evaluation.learn, lambda: (Path("out").mkdir(exist_ok=True), Path("out/a").write_text("theirs"))
         )
-        monkeypatch.setattr(forcegp.StructuredGP, "fit", change)
+        monkeypatch.setattr("forcegp.evaluation.learn", change)
         told = refused(["fit", "arm.h5", *QUICK.split(), "--out", "out"], capfd)
         assert Path("out/a").read_text() == "theirs"
     assert "out exists" in told
@@ -184,9 +183,8 @@ OVER_INPUTS = [
     "fit arm.h5 --robot arm.urdf --out arm.urdf",
     "fit arm.h5 --identified run --out run",
     "fit run/inner.h5 --out run",
-    "identify arm.h5 --robot run/inner.urdf --learn hand:mass --out run",
-    "identify arm.h5 --test run/inner.h5 --model consistent --out run",
-    "compare arm.h5 --test run/inner.h5 --priors joint,joint-friction --out run",
+    "fit arm.h5 --robot run/inner.urdf --forces bodies --out run",
+    "payload arm.h5 --baseline run/inner.h5 --out run",
     "evaluate run arm.h5 --plots run",
     "rollout run arm.h5 --out run",
     "rollout run run/inner.h5 --out run",
@@ -277,15 +275,15 @@ def test_the_next_run_removes_what_a_killed_one_left(folder):
     assert not hidden(folder)
 
 
-def test_a_changed_system_of_an_identification_is_refused(folder, capfd):
+def test_a_changed_model_of_an_identification_is_refused(folder, capfd):
     Path("found").mkdir()
-    system = arm_data(5, seed=0).system.to_json()
-    Path("found/system.json").write_text(system)
+    model = arm_data(5, seed=0).model.to_json()
+    Path("found/system.json").write_text(model)
     write_digests(Path("found"))
     assert main(["fit", "arm.h5", *QUICK.split(), "--identified", "found", "--out", "one"]) == 0
-    Path("found/system.json").write_text(system.replace("0.6", "0.7"))
+    Path("found/system.json").write_text(model.replace("0.6", "0.7"))
     told = refused(["fit", "arm.h5", "--identified", "found", "--out", "two"], capfd)
-    assert "found is damaged: system.json is not as it was written; identify again" in told
+    assert "found is damaged: system.json is not as it was written; fit again" in told
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="names are UTF-8 there")

@@ -1,11 +1,10 @@
-"""`forcegp payload` and `fit --prior payload` report the payload itself."""
+"""`forcegp payload`, and the fit that it stands for."""
 
 import json
 import re
 
-import numpy as np
 import pytest
-from tests.analytical.test_payload import CENTER, MASS, TEXT, loaded, log
+from tests.fit.test_payload import CENTER, MASS, TEXT, loaded, log
 
 from forcegp import Robot
 
@@ -25,9 +24,9 @@ def test_the_payload_is_printed_and_written(folder, forcegp, baseline):
     done = forcegp(*words, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     content = json.loads(done.stdout)
-    assert content["payload"]["mass"]["value"] == pytest.approx(MASS, rel=0.01)
-    low, high = content["payload"]["mass"]["interval_95"]
-    assert low < content["payload"]["mass"]["value"] < high
+    assert content["parameters"]["payload.mass"]["value"] == pytest.approx(MASS, rel=0.01)
+    low, high = content["parameters"]["payload.mass"]["interval_95"]
+    assert low < content["parameters"]["payload.mass"]["value"] < high
     assert content["baseline"] == bool(baseline)
     written = folder / f"held{len(baseline)}"
     assert json.loads((written / "payload.json").read_text())["link"] == "tool0"
@@ -42,8 +41,8 @@ def test_the_payload_is_printed_and_written(folder, forcegp, baseline):
 def test_people_see_mass_and_millimetres(folder, forcegp):
     shown = forcegp("payload", "loaded.h5", "--cutoff", "none", "--delay", 0, folder=folder)
     assert shown.returncode == 0, shown.stderr
-    mass = re.search(r"mass\s+(\S+)\s+\S+\s+\S+ … \S+\s+kg", shown.stdout)
-    place = re.search(r"centre of mass z\s+(\S+)\s+\S+\s+\S+ … \S+\s+mm", shown.stdout)
+    mass = re.search(r"mass\s+\S+\s+(\S+)\s+\S+ … \S+\s+kg", shown.stdout)
+    place = re.search(r"center_of_mass.z\s+\S+\s+(\S+)\s+\S+ … \S+\s+mm", shown.stdout)
     assert float(mass[1]) == pytest.approx(MASS, rel=0.01)
     assert float(place[1]) == pytest.approx(1e3 * CENTER[2], abs=2.0)
 
@@ -51,7 +50,7 @@ def test_people_see_mass_and_millimetres(folder, forcegp):
 def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
     """Its mass is a positive number with an interval around 0; the warning stands with that alone."""
     nothing = forcegp("payload", "empty.h5", "--cutoff", "none", "--delay", 0, "--json", folder=folder)
-    low, high = json.loads(nothing.stdout)["payload"]["mass"]["interval_95"]
+    low, high = json.loads(nothing.stdout)["parameters"]["payload.mass"]["interval_95"]
     assert low <= 0.0 < high
     assert "centre of mass and inertia mean nothing" in " ".join(nothing.stderr.split())
     held = forcegp("payload", "loaded.h5", "--cutoff", "none", "--delay", 0, "--json", folder=folder)
@@ -65,17 +64,15 @@ def test_the_check_names_it(folder, forcegp):
     assert "forcegp payload" in payload["remedy"]
 
 
-def test_a_payload_prior_reports_mass_and_place(folder, forcegp):
-    forcegp("payload", "empty.h5", "--cutoff", "none", "--delay", 0, "--out", "empty", folder=folder)
-    words = ("--prior", "payload:frame=tool0", "--points", 60, "--restarts", 1, "--noise", "learned", "--no-checks")
-    done = forcegp(
-        *("fit", "loaded.h5", "--identified", "empty", *words, "--iterations", 60, "--out", "run", "--json"),
-        folder=folder,
-    )
+def test_it_is_a_fit_with_a_payload(folder, forcegp):
+    words = ("--forces", "payload:tool0,viscous,stribeck,offset,rotor", "--evidence", "torques:mean=.4", "--no-checks")
+    done = forcegp("fit", "loaded.h5", *words, "--out", "run", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
-    mass, *center = map(float, re.findall(r"(-?[\d.]+) ±", json.loads(done.stdout)["payloads"]["payload"]))
-    assert mass == pytest.approx(MASS, rel=0.1)
-    np.testing.assert_allclose(center, 1e3 * CENTER, atol=15.0)
+    shown = forcegp(
+        "payload", "loaded.h5", "--link", "tool0", "--cutoff", "none", "--delay", 0, "--json", folder=folder
+    )
+    here, there = (json.loads(each.stdout) for each in (done, shown))
+    assert here["estimates"] == there["parameters"]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +81,7 @@ def test_a_payload_prior_reports_mass_and_place(folder, forcegp):
         ("payload nothing.h5", "nothing.h5 is not a file"),
         ("payload loaded.h5 --link tool9", "tool9"),
         ("payload loaded.h5 --baseline nothing.h5", "nothing.h5 is not a file"),
-        ("payload loaded.h5 --friction sticky", "sticky"),
+        ("payload loaded.h5 --forces sticky", "sticky"),
         ("payload loaded.h5 --cutoff high", "--cutoff is 'high'"),
     ],
 )

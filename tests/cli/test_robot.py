@@ -10,7 +10,7 @@ from tests.robots.test_base import LOOSE
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_remedies import MANY
 
-from forcegp import Dataset, MechanicalSystem, Robot
+from forcegp import Dataset, Model, Robot
 from forcegp.cli.main import parse_arguments
 
 
@@ -96,7 +96,7 @@ def test_every_command_with_a_robot_takes_its_base(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::forcegp.errors.RobotFileWarning")
 def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
-    recorded = MechanicalSystem(Robot.from_urdf_text(CHAIN))
+    recorded = Model(Robot.from_urdf_text(CHAIN))
     recorded.robot.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
     words = ["fit", "log.h5", "--out", "run", "--robot", str(tmp_path / "identified.urdf")]
     assert parse_arguments(words).chosen(recorded).robot.armature.tolist() == [0.0, 0.3, 0.0, 0.0]
@@ -129,4 +129,4 @@ def test_mjcf_is_taken_with_its_loops_and_written_by_extension(forcegp, tmp_path
         "import", log, "--time", "t", *columns, "--robot", tmp_path / "loop.xml", "--out", tmp_path / "log.h5"
     )
     assert made.returncode == 0, made.stderr
-    assert len(Dataset.load(tmp_path / "log.h5").system.loops) == 3
+    assert len(Dataset.load(tmp_path / "log.h5").model.loops) == 3

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.models.arm import URDF, arm_data, arm_system
+from tests.posterior.arm import URDF, arm_data, arm_model
 from tests.robots.test_nearest_inertia import BROKEN
 
 from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.main import parse_arguments
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError, NonPhysicalInertia
-from forcegp.mechanics import CoulombJointFriction, MechanicalSystem
+from forcegp.forces import Coulomb
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 
@@ -28,12 +29,12 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robots")
     (folder / "arm.urdf").write_text(URDF)
     (folder / "broken.urdf").write_text(BROKEN)
-    data = arm_data(20, 0, arm_system(0))
+    data = arm_data(20, 0, arm_model(0))
     data.save(folder / "recorded.h5")
-    replace(data, system=None, truth={}).save(folder / "bare.h5")
-    system = arm_system(0)
-    known = (*system.known_forces, CoulombJointFriction([0.1, 0.2, 0.3]))
-    (folder / SYSTEM_FILE).write_text(replace(system, known_forces=known).to_json())
+    replace(data, model=None, truth={}).save(folder / "bare.h5")
+    model = arm_model(0)
+    known = (*model.forces, Coulomb([0.1, 0.2, 0.3]))
+    (folder / SYSTEM_FILE).write_text(replace(model, forces=known).to_json())
     return folder
 
 
@@ -53,7 +54,7 @@ def test_every_option_reaches_the_robot(folder):
 
 
 def test_what_no_urdf_holds_stays_as_recorded(folder):
-    recorded = MechanicalSystem(Robot.from_urdf_text(URDF, gravity=(0.0, 0.0, -1.6), armature=[0.1, 0.2, 0.3]))
+    recorded = Model(Robot.from_urdf_text(URDF, gravity=(0.0, 0.0, -1.6), armature=[0.1, 0.2, 0.3]))
     words = "--robot", str(folder / "arm.urdf")
     same = options(*words).chosen(recorded).robot
     assert same.gravity.tolist() == [0.0, 0.0, -1.6]
@@ -77,12 +78,10 @@ def test_impossible_inertias_are_refused_or_repaired(folder):
 def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_data(folder):
     data = arm_data(5, 1)
     for given in (folder, folder / SYSTEM_FILE):
-        system = options("--identified", str(given)).chosen_system(data, folder / "log.h5")
-        np.testing.assert_array_equal(system.known_forces[-1].coefficients, [0.1, 0.2, 0.3])
-        assert system.contacts == data.system.contacts
-        np.testing.assert_array_equal(
-            options("--identified", str(given)).chosen().known_forces[-1].coefficients, [0.1, 0.2, 0.3]
-        )
+        model = options("--identified", str(given)).chosen_model(data, folder / "log.h5")
+        np.testing.assert_array_equal(model.forces[-1].level, [0.1, 0.2, 0.3])
+        assert model.contacts == data.model.contacts
+        np.testing.assert_array_equal(options("--identified", str(given)).chosen().forces[-1].level, [0.1, 0.2, 0.3])
 
 
 @pytest.mark.parametrize(
@@ -99,14 +98,14 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
         ("--robot arm.urdf --lock elbow=1", "elbow"),
         ("--robot arm.urdf --identified .", "leave --robot out"),
         ("--robot arm.urdf --lock bend=0", "has joints pan, lift; bare.h5 has pan, lift, bend"),
-        ("--identified nowhere", "give a folder that `forcegp identify` wrote"),
+        ("--identified nowhere", "give a folder that `forcegp fit` wrote"),
     ],
 )
 def test_mistakes_are_told(folder, monkeypatch, words, said):
     monkeypatch.chdir(folder)
     data = Dataset.load("bare.h5")
     with pytest.raises(ForceGPError, match=re.escape(said)):
-        options(*words.split()).chosen_system(data, Path("bare.h5"))
+        options(*words.split()).chosen_model(data, Path("bare.h5"))
 
 
 def test_a_mistake_is_one_line_and_nothing_is_written(forcegp, folder):
@@ -119,14 +118,14 @@ def test_a_mistake_is_one_line_and_nothing_is_written(forcegp, folder):
 def test_a_fit_starts_from_an_identified_system(forcegp, folder):
     run = forcegp(
         *("fit", "bare.h5", "--identified", ".", "--points", 8, "--iterations", 2, "--restarts", 1, "--noise", 0.05),
-        *("--prior", "joint-friction", "--out", "fitted"),
+        *("--forces", "gp:joint-friction", "--out", "fitted"),
         folder=folder,
     )
     assert run.returncode == 0, run.stderr
-    from forcegp.models import load_posterior
+    from forcegp.posterior import load_posterior
 
-    forces = load_posterior(folder / "fitted").system.known_forces
-    np.testing.assert_array_equal(forces[-1].coefficients, [0.1, 0.2, 0.3])
+    model = load_posterior(folder / "fitted").model
+    np.testing.assert_array_equal(model.laws[-1].level, [0.1, 0.2, 0.3])
 
 
 def test_a_pipe_is_refused_at_once(tmp_path):

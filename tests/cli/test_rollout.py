@@ -7,12 +7,12 @@ import re
 import h5py
 import numpy as np
 import pytest
-from tests.models.arm import arm_data
+from tests.posterior.arm import arm_data
 
 from forcegp.cli.main import main
 from forcegp.data import Dataset
 from forcegp.mechanics import Baumgarte
-from forcegp.models import load_posterior
+from forcegp.posterior import load_posterior
 
 PNG = b"\x89PNG\r\n\x1a\n"
 QUICK = ("--points", "8", "--iterations", "2", "--restarts", "1")
@@ -72,7 +72,7 @@ def folder(tmp_path, monkeypatch, capfd):
     dataclasses.replace(data, episode=np.repeat([0, 1], 10)).save("two.h5")
     dataclasses.replace(data, time=np.delete(np.arange(21) * 0.01, 7)).save("gap.h5")
     data.rows(np.arange(20)[::-1]).save("backwards.h5")
-    dataclasses.replace(data, system=None, joint_names=("a", "b", "c")).save("other.h5")
+    dataclasses.replace(data, model=None, joint_names=("a", "b", "c")).save("other.h5")
     assert main(["fit", "arm.h5", *QUICK, "--out", "run"]) == 0
     capfd.readouterr()
     return tmp_path

@@ -18,6 +18,7 @@ def examples() -> list[str]:
     return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
+@pytest.mark.nightly
 def test_the_examples_run(examples, tmp_path):
     pytest.importorskip("pybullet")
     pytest.importorskip("gymnasium")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.control.test_mppi import predictor
 
-from forcegp import Dataset, NoForces, Noise, StructuredGP
+from forcegp import Dataset, Noise, fit
 from forcegp.errors import InvalidInput
 
 gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
@@ -104,10 +104,8 @@ def test_settings_that_mean_nothing(settings, changes, message):
 
 def test_models_that_have_no_functions_or_are_none(settings, predictor):
     rows = predictor.posterior.training
-    data = Dataset(
-        q=rows.q, v=rows.v, u=rows.u, a=rows.a, time=np.arange(len(rows.q)), system=predictor.posterior.system
-    )
-    bare = StructuredGP(data.system, NoForces(), noise=Noise(0.01, learn=False)).fit(data, restarts=1)
+    data = Dataset(q=rows.q, v=rows.v, u=rows.u, a=rows.a, time=np.arange(len(rows.q)), model=predictor.posterior.model)
+    bare = fit(data.model.known.with_forces(noise=Noise(0.01, learn=False)), data, restarts=1)
     with pytest.raises(InvalidInput, match="draw=2 functions are asked for, and this model has none"):
         RobotVectorEnv(**settings | {"model": bare, "draw": 2})
     assert RobotVectorEnv(**settings | {"model": bare}).reset(seed=0)[0].shape == (1, 2)

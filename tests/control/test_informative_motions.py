@@ -6,26 +6,26 @@ import numpy as np
 import pinocchio
 import pytest
 import scipy.linalg
-from tests.models.arm import URDF, arm_data, arm_system
+from tests.posterior.arm import URDF, arm_data, arm_model
 
-from forcegp import Contact, Dataset, MechanicalSystem, NoForces, Plane, Robot, StructuredGP, excitation
+from forcegp import Contact, Dataset, Model, Plane, Robot, excitation, fit
 from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import excitation_figure
+from forcegp.forces import ContactFriction, JointFriction, UnknownForces
 from forcegp.inference import OptimizerOptions
-from forcegp.priors import ContactFriction, JointFriction, SumPrior
 
-FREE = arm_system(0)
+FREE = arm_model(0)
 START = [0.3, 0.8, -0.6]
 FEW = {"motions": 9, "start": START, "seconds": 4.0}
 LIMITS = {"position": [0.5, 1.0, 0.7], "velocity": [1.0, 2.0, 1.5], "acceleration": 8.0, "torque": [50.0, 11.0, 3.0]}
 
 
-def fitted(prior, system=FREE, rows=12):
+def fitted(prior, model=FREE, rows=12):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return StructuredGP(system, prior).fit(
-            arm_data(rows, 1, system), restarts=1, options=OptimizerOptions(iterations=8)
+        return fit(
+            model.with_forces(prior), arm_data(rows, 1, model), restarts=1, options=OptimizerOptions(iterations=8)
         )
 
 
@@ -88,7 +88,7 @@ def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior
     motion = chosen.motion
     some = far_apart(motion.q, motion.v, motion.u, 20)
     a = np.random.default_rng(0).normal(0.0, 5.0, (20, 3))
-    rows = Dataset(q=motion.q[some], v=motion.v[some], u=motion.u[some], a=a, time=np.arange(20) * 0.1, system=FREE)
+    rows = Dataset(q=motion.q[some], v=motion.v[some], u=motion.u[some], a=a, time=np.arange(20) * 0.1, model=FREE)
     measured = posterior.update(rows)
     at = arm_data(30, 5, FREE)
     after, before = (x.predict(at.q, at.v, at.u) for x in (chosen.expected, posterior))
@@ -138,13 +138,13 @@ def test_a_point_stays_away_from_surfaces():
 
 
 def test_a_model_in_contact_learns_what_moves_freely():
-    for prior in (JointFriction(), SumPrior([JointFriction(), ContactFriction()])):
-        found = excitation(fitted(prior, arm_system()), **FEW | {"motions": 3}, surfaces=[], rows=10)
+    for prior in (JointFriction(), UnknownForces([JointFriction(), ContactFriction()])):
+        found = excitation(fitted(prior, arm_model()), **FEW | {"motions": 3}, surfaces=[], rows=10)
         assert (found.spread[1] < found.spread[0]).all()
 
 
 def test_models_without_learned_forces_move_for_parameters():
-    found = excitation(fitted(NoForces()), **FEW | {"motions": 3})
+    found = excitation(fitted(()), **FEW | {"motions": 3})
     assert found.spread is None
     assert found.expected is None
     assert found.condition > 1.0
@@ -214,6 +214,6 @@ def test_without_a_start_it_is_inside_of_the_limits(posterior):
 def test_only_robots_and_models_move():
     with pytest.raises(InvalidInput, match=r"model is a int"):
         excitation(3)
-    endless = MechanicalSystem(Robot.from_urdf_text(URDF.replace('velocity="5"', "")))
+    endless = Model(Robot.from_urdf_text(URDF.replace('velocity="5"', "")))
     with pytest.raises(InvalidInput, match=r"joint pan: no motion .* velocity limits of -inf and inf"):
         excitation(endless)

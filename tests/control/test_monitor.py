@@ -9,9 +9,9 @@ import pinocchio
 import pytest
 import torch
 from tests.control.test_tracking import ROBOT, TRUE, URDF, URDF_ALONE, VISCOUS
-from tests.models.arm import arm_system
+from tests.posterior.arm import arm_model
 
-from forcegp import ContactMonitor, Dataset, JointFriction, StructuredGP, save_posterior
+from forcegp import ContactMonitor, Dataset, JointFriction, fit, save_posterior
 from forcegp.cli.main import main
 from forcegp.control.monitor import contact_points
 from forcegp.errors import DatasetError, InvalidInput
@@ -133,10 +133,10 @@ def posterior():
         u=u[:-1],
         a=a,
         time=DT * np.arange(len(a)),
-        system=URDF_ALONE,
+        model=URDF_ALONE,
         noise_std=np.full(2, 0.02),
     )
-    return StructuredGP(URDF_ALONE, JointFriction()).fit(rows, points=40, restarts=1)
+    return fit(URDF_ALONE.with_forces(JointFriction()), rows, points=40, restarts=1)
 
 
 def test_learned_friction_sees_what_the_urdf_does_not(posterior):
@@ -164,7 +164,7 @@ def test_learned_friction_sees_what_the_urdf_does_not(posterior):
         (lambda: ContactMonitor(TRUE, dt=DT).place([0.0, 0.0], [0.0, 0.0]), "not calibrated"),
         (lambda: ContactMonitor(TRUE, dt=0.0), "time step"),
         (lambda: ContactMonitor(TRUE, dt=DT, bandwidth=60.0), "bandwidth is 60.0; give Hz above 0 and below 50"),
-        (lambda: ContactMonitor(arm_system(), dt=DT), r"posterior\.with_contacts\(\[\]\)"),
+        (lambda: ContactMonitor(arm_model(), dt=DT), r"posterior\.with_contacts\(\[\]\)"),
         (lambda: ContactMonitor(TRUE, dt=DT, covariance="noise and posterior"), "with a covariance"),
         (lambda: ContactMonitor(TRUE, dt=DT, covariance=np.ones(3)), "covariance"),
         (lambda: ContactMonitor(TRUE, dt=DT, covariance="none"), "Valid covariances: noise, noise and posterior"),
@@ -186,7 +186,7 @@ def test_what_makes_no_monitor(make, message):
 def saved(path, given):
     q, v, u = given
     a = np.gradient(v, DT, axis=0)
-    Dataset(q=q, v=v, u=u, a=a, time=DT * np.arange(len(q)), system=URDF_ALONE).save(path)
+    Dataset(q=q, v=v, u=u, a=a, time=DT * np.arange(len(q)), model=URDF_ALONE).save(path)
 
 
 @pytest.fixture(scope="module")

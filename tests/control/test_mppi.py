@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 import torch
 
-from forcegp import Dataset, JointFriction, MechanicalSystem, Noise, Robot, StructuredGP
+from forcegp import Dataset, JointFriction, Model, Noise, Robot, fit
 from forcegp.control import MPPI
 from forcegp.errors import InvalidInput, NumericalError
 
@@ -21,11 +21,11 @@ SLIDER = """<robot name="slider"><link name="base"/>
 @pytest.fixture(scope="module")
 def predictor():
     """A cart of 2 kg whose friction is nothing: what was learned is a double integrator."""
-    system = MechanicalSystem(Robot.from_urdf_text(SLIDER))
+    model = Model(Robot.from_urdf_text(SLIDER))
     rng = np.random.default_rng(0)
     q, v, u = rng.uniform(-2.0, 2.0, (3, 20, 1))
-    rows = Dataset(q=q, v=v, u=u, a=u / MASS, time=np.arange(20) * 0.1, system=system)
-    return StructuredGP(system, JointFriction(), noise=Noise(0.01, learn=False)).fit(rows, restarts=1).predictor()
+    rows = Dataset(q=q, v=v, u=u, a=u / MASS, time=np.arange(20) * 0.1, model=model)
+    return fit(model.with_forces(JointFriction(), noise=Noise(0.01, learn=False)), rows, restarts=1).predictor()
 
 
 def cost(q, v, u):

@@ -6,21 +6,13 @@ import numpy as np
 import pytest
 from tests.control.test_monitor import DT, motion, posterior
 from tests.control.test_tracking import ROBOT, URDF, VISCOUS
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import (
-    Dataset,
-    JointForces,
-    JointFriction,
-    MechanicalSystem,
-    NoForces,
-    StructuredGP,
-    ViscousJointFriction,
-)
+from forcegp import Dataset, JointForces, JointFriction, Model, Viscous, fit
 from forcegp.control.mujoco_forces import MujocoForces
 from forcegp.errors import InvalidInput, NumericalError
+from forcegp.forces import Actuation, RigidBodies
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Actuation, RigidBodyBias
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 rollout = pytest.importorskip("mujoco.rollout")
@@ -67,11 +59,11 @@ def test_accelerations_are_those_of_predict(posterior, predictor):
 
 def test_known_friction_and_joints_in_another_order_act_too():
     """A model whose friction is all known, in a model with a free body in front."""
-    laws = (Actuation(), RigidBodyBias(), ViscousJointFriction(VISCOUS))
+    laws = (Actuation(), RigidBodies(), Viscous(VISCOUS))
     q, v, u = motion(3.0, 8, noise=0.0)
-    system = MechanicalSystem(ROBOT, known_forces=laws)
-    rows = Dataset(q=q, v=v, u=u, a=v, time=DT * np.arange(len(q)), system=system, noise_std=np.ones(2))
-    fitted = StructuredGP(system, NoForces()).fit(rows, points=5, restarts=1)
+    model = Model(ROBOT, forces=laws)
+    rows = Dataset(q=q, v=v, u=u, a=v, time=DT * np.arange(len(q)), model=model, noise_std=np.ones(2))
+    fitted = fit(model, rows, points=5, restarts=1)
     spec = mujoco.MjSpec.from_string(
         URDF.replace("</robot>", '<mujoco><compiler balanceinertia="false"/></mujoco></robot>')
     )
@@ -201,11 +193,11 @@ def test_forces_that_mujoco_cannot_have(posterior, predictor):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of two iterations is not the subject
         quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
-        touching = StructuredGP(arm_system(), JointFriction()).fit(arm_data(20, 0), **quick)
-        by_torque = StructuredGP(arm_system(0), JointForces()).fit(arm_data(20, 0, arm_system(0)), **quick)
+        touching = fit(arm_model().with_forces(JointFriction()), arm_data(20, 0), **quick)
+        by_torque = fit(arm_model(0).with_forces(JointForces()), arm_data(20, 0, arm_model(0)), **quick)
     with pytest.raises(InvalidInput, match=r"with_contacts\(\[\]\)"):
         MujocoForces(touching.predictor(covariance="none"), model_of())
-    model = model_of(arm_system(0).robot.urdf_text)
+    model = model_of(arm_model(0).robot.urdf_text)
     model.dof_damping[:] = model.dof_frictionloss[:] = 0.0
     with pytest.raises(InvalidInput, match="forces depend on u, which MuJoCo computes after"):
         MujocoForces(by_torque.predictor(covariance="none"), model)

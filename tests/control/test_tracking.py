@@ -6,13 +6,12 @@ import numpy as np
 import pinocchio
 import pytest
 import torch
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import ComputedTorque, HybridForce, MechanicalSystem, PDGravity, Robot, StructuredGP, ViscousJointFriction
+from forcegp import ComputedTorque, HybridForce, Model, PDGravity, Robot, Viscous, fit
 from forcegp.errors import InvalidInput, NumericalError
+from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, RigidBodies
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Actuation, RigidBodyBias
-from forcegp.priors import ContactFriction, JointForces, JointFriction
 
 LINK = """<link name="{0}"><inertial><origin xyz="0 0.02 -0.2"/><mass value="{1}"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0.001" iyz="0"/></inertial></link>"""
@@ -30,8 +29,8 @@ URDF = "".join(
 )
 ROBOT = Robot.from_urdf_text(URDF)
 VISCOUS = (0.7, 0.3)
-URDF_ALONE = MechanicalSystem(ROBOT)
-TRUE = MechanicalSystem(ROBOT, known_forces=(Actuation(), RigidBodyBias(), ViscousJointFriction(VISCOUS)))
+URDF_ALONE = Model(ROBOT)
+TRUE = Model(ROBOT, forces=(Actuation(), RigidBodies(), Viscous(VISCOUS)))
 GAINS = {"stiffness": 100.0}
 STILL = [0.3, -0.4], [0.0, 0.0]
 
@@ -105,11 +104,11 @@ def test_torques_keep_their_limits_and_the_integral_waits():
 @pytest.fixture(scope="module")
 def touching():
     """What was learned of an arm of three joints on a sphere, with friction under load."""
-    prior = JointFriction() + ContactFriction(load=True, expected=0.2)
+    forces = JointFriction(), ContactFriction(load=True, expected=0.2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         options = OptimizerOptions(iterations=3)
-        return StructuredGP(arm_system(), prior).fit(arm_data(30, 0), restarts=1, options=options)
+        return fit(arm_model().with_forces(forces), arm_data(30, 0), restarts=1, options=options)
 
 
 def state(posterior):
@@ -140,8 +139,8 @@ def test_learned_forces_are_compensated_and_uncertainty_stiffens(touching):
 def test_forces_that_depend_on_the_torque_are_compensated():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = StructuredGP(arm_system(), JointForces()).fit(
-            arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3)
+        model = fit(
+            arm_model().with_forces(JointForces()), arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3)
         )
     free = model.with_contacts([])
     q, v = state(free)
@@ -158,7 +157,7 @@ def test_motion_and_force_are_those_of_the_dense_equations(touching):
     u = control(q, v, q, v, wanted, [7.0])
     found = touching.predict(q, v, u)
     assert float(found.multiplier.mean) == pytest.approx(7.0, rel=1e-8)
-    at = touching.system.dynamics(*(torch.tensor(x) for x in (q, v)), torch.zeros(3).double())
+    at = touching.model.dynamics(*(torch.tensor(x) for x in (q, v)), torch.zeros(3).double())
     M, A, b = (x.numpy() for x in (at.M, at.A, at.b))
     dense = np.linalg.solve(np.block([[M, -A.T], [A, np.zeros((1, 1))]]), np.concatenate([M @ wanted, b]))
     np.testing.assert_allclose(found.mean, dense[:3], rtol=1e-8)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from forcegp.data import REVOLUTE_UNITS, Dataset
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 NAMES = ("shoulder", "elbow")
@@ -20,10 +20,10 @@ TWO_JOINTS = """<robot name="slider">
 </robot>"""
 
 
-def system(elbow: str = "revolute") -> MechanicalSystem:
+def model(elbow: str = "revolute") -> Model:
     """A robot with the joints `NAMES`, the second one revolute or prismatic, that touches nothing."""
     text = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow=elbow)
-    return MechanicalSystem(Robot.from_urdf_text(text))
+    return Model(Robot.from_urdf_text(text))
 
 
 def columns(rows: int = 40, nv: int = 2, seed: int = 0) -> dict[str, np.ndarray]:
@@ -45,7 +45,7 @@ def dataset(rows: int = 40, seed: int = 0, **changes: object) -> Dataset:
 
 
 def complete(rows: int = 40) -> Dataset:
-    """With every optional field but the system."""
+    """With every optional field but the model."""
     rng = np.random.default_rng(1)
     return dataset(
         rows,

@@ -8,7 +8,8 @@ from tests.checks.clean_logs import clean_logs
 from tests.checks.corruptions import clean, invented, moved, on_a_line, two_links, without_contacts
 
 from forcegp.data import Dataset, contact_doubts, differentiate
-from forcegp.mechanics import Contact, MechanicalSystem, Plane
+from forcegp.mechanics import Contact, Plane
+from forcegp.model import Model
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -19,8 +20,8 @@ def simulated(seed: int, surface: str = "plane", noise: float = 0.1, seconds: fl
     return simulate_kuka_surface(KukaSurfaceConfig(seconds=seconds, seed=seed, surface=surface, noise=noise))
 
 
-def kinds(data: Dataset, system: MechanicalSystem | None = None) -> list[str]:
-    return [doubt.kind for doubt in contact_doubts(data, system)]
+def kinds(data: Dataset, model: Model | None = None) -> list[str]:
+    return [doubt.kind for doubt in contact_doubts(data, model)]
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +36,8 @@ def test_a_point_two_centimetres_sideways_is_measured(sliding):
         (doubt,) = contact_doubts(moved(sliding, shift))
         assert doubt.kind == "point"
         assert doubt.numbers["shift"] == pytest.approx(0.02, abs=0.012)
-        assert sliding.system is not None
-        near = np.array(doubt.numbers["point"]) - np.array(sliding.system.contacts[0].point)
+        assert sliding.model is not None
+        near = np.array(doubt.numbers["point"]) - np.array(sliding.model.contacts[0].point)
         assert np.linalg.norm(near) < 0.012
 
 
@@ -57,9 +58,9 @@ def test_few_rows_are_enough_and_never_too_many(sliding):
 
 def test_a_contact_without_a_force_is_doubted():
     free = simulated(7, surface="none")
-    assert free.system is not None
+    assert free.model is not None
     height = Plane((0.0, 0.0, 1.0), 0.105)  # where the tool moves in the air
-    air = free.system.with_contacts([Contact("lbr_iiwa_link_7", (0.0, 0.0, 0.1), height)])
+    air = free.model.with_contacts([Contact("lbr_iiwa_link_7", (0.0, 0.0, 0.1), height)])
     assert kinds(free) == []
     assert kinds(free, air) == ["no force"]
     assert kinds(free, air.with_contacts([replace(air.contacts[0], surface=Plane((0.0, 0.0, 1.0), 0.055))])) == ["off"]
@@ -77,7 +78,7 @@ def test_an_arm_on_a_line(noise):
 def test_nothing_is_said_without_torques_and_of_a_single_joint():
     data = on_a_line(4)
     assert kinds(replace(data, u=0.0 * data.u)) == []
-    assert contact_doubts(replace(data, system=None)) == []
+    assert contact_doubts(replace(data, model=None)) == []
 
 
 @pytest.mark.nightly
@@ -105,7 +106,7 @@ def test_wrong_contacts_of_five_seeds_are_doubted(seed):
 def test_noise_of_positions_is_no_motion_of_feet_that_stand():
     """At .03 mm and .1 mrad a standing foot is differentiated to .02 m/s, and swings in some rows."""
     clean_walk = simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=1))
-    space, noise = clean_walk.system.robot.space, np.random.default_rng(0)
+    space, noise = clean_walk.model.robot.space, np.random.default_rng(0)
     q = clean_walk.q.copy()
     q[:, :3] += 3e-5 * noise.standard_normal((len(q), 3))
     q[:, 7:] += 1e-4 * noise.standard_normal(q[:, 7:].shape)

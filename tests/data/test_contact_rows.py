@@ -48,7 +48,7 @@ def test_an_ideal_contact_keeps_its_rows(surface):
 
 def test_a_row_that_leaves_the_constraint_does_not_count():
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=2.0, seed=6, noise=0.0))
-    dynamics = data.system.dynamics(*(torch.tensor(getattr(data, name)) for name in "qvu"))
+    dynamics = data.model.dynamics(*(torch.tensor(getattr(data, name)) for name in "qvu"))
     pull = 1.0 * torch.linalg.pinv(dynamics.A[50])[:, 0].numpy()  # 1 m/s^2 along the normal
     a = data.a.copy()
     a[50] += pull
@@ -59,31 +59,31 @@ def test_a_row_that_leaves_the_constraint_does_not_count():
 
 def test_the_length_of_the_gradient_does_not_matter(hopping):
     """Any function that vanishes on the surface describes it; a factor changes neither distances nor directions."""
-    (contact,) = hopping.system.contacts
+    (contact,) = hopping.model.contacts
     scaled = Contact(contact.frame, contact.point, ImplicitSurface(lambda p: 100.0 * contact.surface.value(p)))
-    data = dataclasses.replace(hopping, system=hopping.system.with_contacts([scaled]), truth={})
+    data = dataclasses.replace(hopping, model=hopping.model.with_contacts([scaled]), truth={})
     np.testing.assert_array_equal(contact_rows(data), contact_rows(hopping))
 
 
 def test_a_surface_in_the_wrong_place_is_told(hopping):
-    (contact,) = hopping.system.contacts
+    (contact,) = hopping.model.contacts
     wrong = Contact(contact.frame, contact.point, Plane((0.0, 0.0, 1.0), 0.5))
-    data = dataclasses.replace(hopping, system=hopping.system.with_contacts([wrong]))
+    data = dataclasses.replace(hopping, model=hopping.model.with_contacts([wrong]))
     with pytest.raises(ContactError, match=r"contact 0 \(frame 'lbr_iiwa_link_7'\).*0\.445 m") as error:
         rows_in_contact(data)
     assert "leave this contact out" in str(error.value)
 
 
 def test_without_contacts_there_is_nothing_to_find(hopping):
-    for nothing, message in ((None, "no system"), (hopping.system.with_contacts([]), "without contacts")):
+    for nothing, message in ((None, "no model"), (hopping.model.with_contacts([]), "without contacts")):
         truth = {"a": hopping.truth["a"]}
         with pytest.raises(ContactError, match=message):
-            contact_rows(dataclasses.replace(hopping, system=nothing, truth=truth))
+            contact_rows(dataclasses.replace(hopping, model=nothing, truth=truth))
 
 
 def test_every_contact_has_a_column_and_all_must_act(hopping):
-    (contact,) = hopping.system.contacts
+    (contact,) = hopping.model.contacts
     here = contact_rows(hopping)[:, 0]
-    both = dataclasses.replace(hopping, truth={}, system=hopping.system.with_contacts([contact, contact]))
+    both = dataclasses.replace(hopping, truth={}, model=hopping.model.with_contacts([contact, contact]))
     np.testing.assert_array_equal(contact_rows(both), np.stack([here, here], axis=1))
     assert len(rows_in_contact(both)) == here.sum()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.data.samples import NAMES, arrays, assert_equal, columns, complete, dataset, system
+from tests.data.samples import NAMES, arrays, assert_equal, columns, complete, dataset, model
 
 from forcegp.data import REVOLUTE_UNITS, Dataset, units_for
 from forcegp.errors import DatasetError, InvalidInput
@@ -180,7 +180,7 @@ def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
     assert dataset(time=np.repeat(time[:20], 2), episode=interleaved).episodes == (0, 1)
 
 
-# ---------------------------------------------------------------- units and system
+# ---------------------------------------------------------------- units and model
 
 
 @pytest.mark.parametrize(
@@ -208,8 +208,8 @@ def test_units_may_differ_between_joints():
         "time": "s",
     }
     assert dataset(units=units).units == units
-    assert units_for(system("prismatic").robot) == units
-    assert units_for(system().robot) == REVOLUTE_UNITS
+    assert units_for(model("prismatic").robot) == units
+    assert units_for(model().robot) == REVOLUTE_UNITS
 
 
 def test_equal_units_per_joint_become_one_text():
@@ -217,13 +217,13 @@ def test_equal_units_per_joint_become_one_text():
 
 
 def test_a_system_must_have_the_same_joints_and_units():
-    assert dataset(system=system()).system is not None
+    assert dataset(model=model()).model is not None
     with pytest.raises(DatasetError, match="in the robot's order"):
-        dataset(system=system(), joint_names=("elbow", "shoulder"))
+        dataset(model=model(), joint_names=("elbow", "shoulder"))
     with pytest.raises(DatasetError, match="joint types of 'slider'"):
-        dataset(system=system("prismatic"))
-    with pytest.raises(DatasetError, match="3 columns; the system has 0 contacts"):
-        dataset(system=system(), truth={"lambda": np.zeros((40, 3))})
+        dataset(model=model("prismatic"))
+    with pytest.raises(DatasetError, match="3 columns; the model has 0 contacts"):
+        dataset(model=model(), truth={"lambda": np.zeros((40, 3))})
 
 
 # ---------------------------------------------------------------- choosing rows

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
 
 import forcegp.data.dataset_writer as dataset_writer
 from forcegp.data import REVOLUTE_UNITS, Dataset
@@ -21,7 +21,7 @@ def rows(count, start=0):
 
 
 def writer(path, **changes):
-    return DatasetWriter(path, **{"joint_names": NAMES, "units": REVOLUTE_UNITS, "system": None, **changes})
+    return DatasetWriter(path, **{"joint_names": NAMES, "units": REVOLUTE_UNITS, "model": None, **changes})
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 8, 100])
@@ -65,12 +65,12 @@ def test_chunks_are_what_the_filters_of_hdf5_would_have_made(tmp_path):
 
 
 def test_the_robot_comes_along(tmp_path):
-    data, system = arm_data(20, seed=0), arm_system()
-    with writer(tmp_path / "log.h5", units=data.units, system=system) as file:
+    data, model = arm_data(20, seed=0), arm_model()
+    with writer(tmp_path / "log.h5", units=data.units, model=model) as file:
         signals = {name: getattr(data, name) for name in ("q", "v", "u", "a", "time")}
         file.append(**signals, episode=0)
         file.finish({})
-    assert Dataset.load(tmp_path / "log.h5").system.robot.joint_names == NAMES
+    assert Dataset.load(tmp_path / "log.h5").model.robot.joint_names == NAMES
 
 
 @pytest.mark.parametrize(

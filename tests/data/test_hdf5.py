@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from tests.data.samples import assert_equal, complete, dataset, system
+from tests.data.samples import assert_equal, complete, dataset, model
 
 from forcegp.data import Dataset, preparation_report
 from forcegp.errors import FileFormatError, InvalidInput
@@ -30,11 +30,11 @@ def test_everything_comes_back(file):
 
 
 def test_the_system_comes_back(tmp_path):
-    data = dataset(system=system())
+    data = dataset(model=model())
     data.save(tmp_path / "log.h5")
-    found = Dataset.load(tmp_path / "log.h5").system
+    found = Dataset.load(tmp_path / "log.h5").model
     assert found is not None
-    assert found.to_json() == system().to_json()
+    assert found.to_json() == model().to_json()
 
 
 def test_a_sample_out_of_order_and_units_per_joint_come_back(tmp_path):
@@ -73,7 +73,7 @@ class Interrupted(BaseException):
     pass
 
 
-@pytest.mark.usefixtures("unchecked")  # its system is none
+@pytest.mark.usefixtures("unchecked")  # its model is none
 @pytest.mark.parametrize("exists", [False, True])
 def test_an_interrupted_save_leaves_what_was_there_and_nothing_else(tmp_path, exists):
     path = tmp_path / "log.h5"
@@ -81,8 +81,8 @@ def test_an_interrupted_save_leaves_what_was_there_and_nothing_else(tmp_path, ex
         complete().save(path)
     before = path.read_bytes() if exists else None
 
-    class UnwritableSystem:  # the system is written last, when the rest is on the disk
-        robot = system().robot
+    class UnwritableSystem:  # the model is written last, when the rest is on the disk
+        robot = model().robot
         inputs = robot.joint_names
         contacts = ()
 
@@ -91,7 +91,7 @@ def test_an_interrupted_save_leaves_what_was_there_and_nothing_else(tmp_path, ex
             raise Interrupted
 
     with pytest.raises(Interrupted):
-        dataset(system=UnwritableSystem()).save(path)
+        dataset(model=UnwritableSystem()).save(path)
     assert [item.name for item in tmp_path.iterdir()] == (["log.h5"] if exists else [])
     assert not exists or path.read_bytes() == before
 
@@ -184,7 +184,7 @@ def test_a_quantity_without_units_is_refused(file):
 
 def test_a_system_that_cannot_be_used_is_refused(file):
     with h5py.File(file, "a") as opened:
-        opened["system"] = "{}"
+        opened["model"] = "{}"
     with pytest.raises(FileFormatError, match=r"log\.h5"):
         Dataset.load(file)
 
@@ -260,7 +260,7 @@ def test_every_stored_name_is_in_the_docs(repository, file):
     with h5py.File(file, "r") as opened:
         names = [*opened.attrs]
         opened.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    assert all(f"`{name}`" in text for name in [*names, "system"]), names
+    assert all(f"`{name}`" in text for name in [*names, "model"]), names
 
 
 FULL = """

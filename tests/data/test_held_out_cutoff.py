@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.analytical.test_payload import ROBOT, TEXT, log
+from tests.fit.test_payload import ROBOT, TEXT, log
 
-from forcegp.analytical import identify_analytical, motion_residuals
+from forcegp import Model, Rotor, Stribeck, Torques, Viscous, fit
 from forcegp.data import Preparation, estimate_delay
 from forcegp.data.held_out_cutoff import FACTORS, held_out_cutoff
 from forcegp.errors import DatasetError
+from forcegp.evidence import motion_residuals
+from forcegp.forces import RigidBodies
 
 STEP = 0.004
 
@@ -45,8 +47,8 @@ def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
     def error(cutoff):
         """Rms of what the identified robot misses of the torques of another motion, without noise."""
         prepared = Preparation(cutoff=cutoff, trim=1.0, every=5).apply(rows).dataset
-        found = identify_analytical(prepared, friction=("viscous", "stribeck"))
-        return np.sqrt(np.square(motion_residuals(log(TEXT, 9), found.system)[0]).mean())
+        found = fit(Model(ROBOT).with_forces(RigidBodies("all"), Viscous(), Stribeck(), Rotor()), prepared, Torques())
+        return np.sqrt(np.square(motion_residuals(log(TEXT, 9), found.model)[0]).mean())
 
     assert error(best) < 0.6 * error(low)
 
@@ -54,7 +56,7 @@ def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
 def test_preparations_take_it_and_report_why():
     report = Preparation(cutoff="auto", delay="auto").apply(raw(3, 1e-4)).report
     assert "of held-out torques stay unexplained" in report["why"]["cutoff"]
-    alone = Preparation(cutoff="auto").apply(replace(raw(3, 1e-4), system=None)).report
+    alone = Preparation(cutoff="auto").apply(replace(raw(3, 1e-4), model=None)).report
     assert "held-out" not in alone["why"]["cutoff"]
 
 
@@ -62,7 +64,7 @@ def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
     """Where no torque acts, every cut-off explains all of it."""
     rows = raw(3, 1e-4)
     still = replace(rows, u=0.0 * rows.u)
-    passive, alone = (Preparation(cutoff="auto").apply(x).report for x in (still, replace(still, system=None)))
+    passive, alone = (Preparation(cutoff="auto").apply(x).report for x in (still, replace(still, model=None)))
     assert passive["cutoff"] == alone["cutoff"]
     with pytest.raises(DatasetError, match="no torque acts"):
         held_out_cutoff(still, ROBOT, 6.0)

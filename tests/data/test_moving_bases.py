@@ -11,7 +11,8 @@ from tests.robots.test_moving_bases import LIMBS
 from forcegp import Preparation
 from forcegp.data import Dataset, differentiate, differentiated, low_pass, motion_spectrum, resample
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.mechanics import MechanicalSystem, fixed_point
+from forcegp.mechanics import fixed_point
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 RATE, SECONDS = 240.0, 4.0
@@ -57,10 +58,10 @@ def tumbling(
     if base == "floating":
         q, v, a = (np.concatenate(x, 1) for x in ((p, q), (linear, v), (linear_rate, a)))
     robot = Robot.from_urdf_text(LIMBS, base=base)
-    system = MechanicalSystem(robot, fixed_point("a_foot", (0.0, 0.0, 0.0), switch="down"))
+    model = Model(robot, fixed_point("a_foot", (0.0, 0.0, 0.0), switch="down"))
     u = np.stack([np.sin(5 * t), np.cos(4 * t), np.sin(3 * t), (t % 1.0 < 0.5).astype(float)], 1)
     q, v, a = (np.column_stack([x, *more]) for x, more in ((q, joints), (v, djoints), (a, ddjoints)))
-    return Dataset(q=q, v=v, u=u, a=a, time=t, system=system)
+    return Dataset(q=q, v=v, u=u, a=a, time=t, model=model)
 
 
 def jumbled(log: Dataset, base: str = "floating") -> Dataset:
@@ -85,7 +86,7 @@ def test_velocities_and_accelerations_of_a_tumbling_body(base):
 def test_a_filter_far_above_the_motion_leaves_it():
     log = tumbling()
     found = differentiated(low_pass(jumbled(log), 30.0, signals=("q", "u")), "q")
-    robot = log.system.robot
+    robot = log.model.robot
     assert np.abs(robot.difference(torch.tensor(log.q), torch.tensor(found.q)).numpy())[INNER].max() < 1e-6
     assert np.abs(found.v - log.v)[INNER].max() < 4e-3
     assert np.abs(found.a - log.a)[INNER].max() < 2e-2
@@ -95,7 +96,7 @@ def test_a_filter_far_above_the_motion_leaves_it():
 def test_noise_of_a_pose_is_taken_away():
     log, generator = tumbling(), np.random.default_rng(1)
     noise = torch.tensor(1e-4 * generator.normal(size=log.v.shape))
-    noisy = replace(log, q=log.system.robot.integrate(torch.tensor(log.q), noise).numpy())
+    noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
     prepared = Preparation(cutoff=8.0, trim=0.5).apply(noisy)
     raw = differentiated(noisy, "q").a
     true = log.a[np.isin(log.time, prepared.dataset.time)]
@@ -110,7 +111,7 @@ def test_neither_signs_nor_the_frame_of_the_world_matter(how):
     one, other = tumbling(), jumbled(tumbling(world=world, shift=(1.0, -2.0, 0.5)))
     bump = torch.tensor(1e-3 * generator.normal(size=one.v.shape))
     one, other = (
-        replace(x, q=x.system.robot.integrate(torch.tensor(x.q), bump).numpy(), v=x.v + bump.numpy())
+        replace(x, q=x.model.robot.integrate(torch.tensor(x.q), bump).numpy(), v=x.v + bump.numpy())
         for x in (one, other)
     )
     a, b = (
@@ -136,7 +137,7 @@ def test_poses_at_other_times():
     log, fine = tumbling(), tumbling(rate=1000.0)
     found = resample(jumbled(log), 1e-3)
     at = slice(0, len(found))
-    away = log.system.robot.difference(torch.tensor(found.q), torch.tensor(fine.q[at]))
+    away = log.model.robot.difference(torch.tensor(found.q), torch.tensor(fine.q[at]))
     assert float(away.abs().max()) < 1e-5
     np.testing.assert_allclose(found.v, fine.v[at], atol=1e-4)
     assert set(np.unique(found.u[:, 3])) == {0.0, 1.0}
@@ -145,7 +146,7 @@ def test_poses_at_other_times():
 def test_the_automatic_cutoff_passes_the_motion_and_its_price_is_reported_per_joint():
     log = tumbling()
     noise = torch.tensor(2e-4 * np.random.default_rng(4).normal(size=log.v.shape))
-    noisy = replace(log, q=log.system.robot.integrate(torch.tensor(log.q), noise).numpy())
+    noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
     prepared = Preparation(cutoff="auto", trim=0.5).apply(noisy)
     assert 1.0 < prepared.report["cutoff"] < 20.0
     assert [len(prepared.report["power_removed"][name]) for name in "qvau"] == [9, 9, 9, 4]
@@ -159,11 +160,11 @@ def test_what_no_filter_can_follow_is_refused():
     with pytest.raises(DatasetError, match="'base' turns by more than 90 degrees after row 299"):
         differentiated(replace(log, q=q), "q")
     spin = torch.tensor(log.time)[:, None] * torch.tensor([0, 0, 0, 0, 0, 90.0, 0, 0, 0]).double()
-    fast = replace(log, q=log.system.robot.integrate(torch.tensor(log.q[:1]), spin).numpy())
+    fast = replace(log, q=log.model.robot.integrate(torch.tensor(log.q[:1]), spin).numpy())
     with pytest.raises(DatasetError, match="episode 0: 'base' turns faster than the filter passes"):
         low_pass(fast, 3.0)
     with pytest.raises(InvalidInput, match="delay has 4 numbers; the dataset has 3 actuators"):
         Preparation(delay=(0.0,) * 4).apply(log)
-    loose = replace(log, system=MechanicalSystem(log.system.robot), u=log.u[:, :3])
+    loose = replace(log, model=Model(log.model.robot), u=log.u[:, :3])
     with pytest.raises(InvalidInput, match=r"a base that moves.* give the delay in s"):
         Preparation(delay="auto").apply(loose)

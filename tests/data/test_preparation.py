@@ -9,17 +9,9 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 from tests.data.samples import assert_equal, dataset
-from tests.models.arm import arm_system
+from tests.posterior.arm import arm_model
 
-from forcegp.data import (
-    REVOLUTE_UNITS,
-    Dataset,
-    Preparation,
-    differentiated,
-    estimate_delay,
-    low_pass,
-    motion_spectrum,
-)
+from forcegp.data import REVOLUTE_UNITS, Dataset, Preparation, differentiated, estimate_delay, low_pass, motion_spectrum
 from forcegp.data.delay import lagged
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 
@@ -48,13 +40,13 @@ def noisy(seconds: float = 12.0, seed: int = 0, sigma: float = SIGMA, rate: floa
 
 def arm_log(delay: float = 0.0, seconds: float = 8.0, seed: int = 1, noise: float = 0.02) -> Dataset:
     """The three-joint arm in free motion with the torques of inverse dynamics and friction, logged `delay` s late."""
-    system = arm_system(contacts=0)
+    model = arm_model(contacts=0)
     time = np.arange(round(seconds * 200)) / 200
     q, v, a = swings(time, seed, 3)
     late = swings(time - delay, seed, 3)
-    u = system.robot.inverse_dynamics(*(torch.tensor(x) for x in late)).numpy()
+    u = model.robot.inverse_dynamics(*(torch.tensor(x) for x in late)).numpy()
     u += 0.8 * np.tanh(late[1] / 0.1) + 0.3 * late[1] + noise * np.random.default_rng(seed).normal(size=u.shape)
-    return Dataset(q=q, v=v, u=u, a=a, time=time, system=system)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=model)
 
 
 # ---------------------------------------------------------------- spectrum
@@ -170,11 +162,11 @@ def test_what_a_delay_needs_is_said():
     with pytest.raises(InvalidInput, match="needs the robot: give its URDF"):
         estimate_delay(noisy()[0])
     with pytest.raises(InvalidInput, match="forces of contacts are not known"):
-        estimate_delay(replace(arm_log(), system=arm_system()))
+        estimate_delay(replace(arm_log(), model=arm_model()))
     with pytest.raises(DatasetError, match=r"rows lie more than 0.05 s from the ends.*at least 80"):
         estimate_delay(arm_log().rows(slice(0, 60)))
     with pytest.raises(InvalidInput, match="the joints of dataset are one, two, those of arm pan, lift, bend"):
-        estimate_delay(noisy()[0], arm_system().robot)
+        estimate_delay(noisy()[0], arm_model().robot)
 
 
 # ---------------------------------------------------------------- lag

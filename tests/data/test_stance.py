@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import Dataset, MechanicalSystem, Preparation, Robot
+from forcegp import Dataset, Model, Preparation, Robot
 from forcegp.data import estimate_stance, motion_spectrum
 from forcegp.errors import ContactError, DatasetError, DataWarning, InvalidInput
 from forcegp.mechanics import fixed_frame, fixed_point
@@ -29,7 +29,7 @@ def test_flags_are_those_of_the_simulation(seed, noise):
     log, flags = walk(seed, noise)
     found = estimate_stance(log)
     decided = np.isfinite(found.flags)
-    assert found.names == log.system.inputs[SWITCHES]
+    assert found.names == log.model.inputs[SWITCHES]
     assert (found.flags == flags)[decided].all()
     assert decided.all(axis=1).mean() > 0.85
     swing = flags == 0.0
@@ -39,7 +39,7 @@ def test_flags_are_those_of_the_simulation(seed, noise):
 def test_what_a_filter_leaves_of_noise_is_no_motion():
     """Poses with noise of 1 mm and .1 degrees, filtered at 10 Hz: feet at rest seem to move at up to 3 cm/s."""
     log, flags = walk(1)
-    robot, draw = log.system.robot, np.random.default_rng(0)
+    robot, draw = log.model.robot, np.random.default_rng(0)
     noise = draw.normal(size=log.v.shape) * np.array([1e-3] * 3 + [1.7e-3] * 3 + [2e-4] * 12)
     q = robot.integrate(torch.tensor(log.q), torch.tensor(noise)).numpy()
     filtered = Preparation(cutoff=10.0).apply(replace(log, q=q, noise_std=None)).dataset
@@ -59,9 +59,9 @@ def test_a_foot_that_swings_most_of_the_time():
     v, a = np.zeros((2, len(time), 6))
     v[:, 2] = (1.0 - flags) * np.random.default_rng(0).normal(size=len(time))
     a[:, 2] = -9.75 * (1.0 - flags)
-    system = MechanicalSystem(robot, fixed_point("foot", switch="stands"))
+    model = Model(robot, fixed_point("foot", switch="stands"))
     q = np.tile(robot.neutral().numpy(), (len(time), 1))
-    found = estimate_stance(Dataset(q=q, v=v, u=0.0 * flags[:, None], a=a, time=time, system=system))
+    found = estimate_stance(Dataset(q=q, v=v, u=0.0 * flags[:, None], a=a, time=time, model=model))
     decided = np.isfinite(found.flags[:, 0])
     assert (found.flags[:, 0] == flags)[decided].all()
     assert decided.mean() > 0.75
@@ -92,8 +92,8 @@ def hop(base: str, rate: float, stands: float, gravity=(0.0, 0.0, -9.81)):
     q[:, up], v[:, up], a[:, up] = 0.5 + z, dz, ddz
     q[:, -1], v[:, -1], a[:, -1] = 0.5 + flags * z, flags * dz, flags * ddz
     u = np.stack([5.0 * (ddz + 9.81), 0.0 * flags], 1)
-    system = MechanicalSystem(robot, fixed_point("foot", switch="stands"))
-    return Dataset(q=q, v=v, u=u, a=a, time=time, system=system), flags
+    model = Model(robot, fixed_point("foot", switch="stands"))
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=model), flags
 
 
 @pytest.mark.parametrize("base", ["floating", "planar"])
@@ -132,7 +132,7 @@ def test_without_forces_the_motion_decides():
 def test_forces_are_the_weight_where_nothing_moves():
     log, _ = walk(6, lift=False, joint_friction="none", payload=0.0, noise=0.0)
     found = estimate_stance(log)
-    robot = log.system.robot
+    robot = log.model.robot
     weight = 9.81 * sum(robot.link(name).mass for name in robot.link_names)
     assert (found.flags == 1.0).all()
     assert found.force.sum(axis=1).mean() == pytest.approx(weight, rel=0.1)  # sizes of forces that also lean
@@ -146,9 +146,9 @@ def test_the_order_of_rows_does_not_matter():
 
 def test_a_flat_foot_is_one_force():
     log, flags = walk(8)
-    contacts = [c for name in log.system.inputs[SWITCHES] for c in fixed_frame(name.replace("stands", "foot"), name)]
-    system = log.system.with_contacts(contacts)
-    found = estimate_stance(replace(log, system=system))
+    contacts = [c for name in log.model.inputs[SWITCHES] for c in fixed_frame(name.replace("stands", "foot"), name)]
+    model = log.model.with_contacts(contacts)
+    found = estimate_stance(replace(log, model=model))
     assert found.force.shape == flags.shape  # feet turn here, which a flat one must not
     assert (found.flags[flags == 0.0] != 1.0).mean() > 0.99
 
@@ -186,21 +186,21 @@ def test_the_cutoff_of_a_robot_on_feet_is_not_far_beyond_that_of_its_base():
     log, _ = walk(2, lift=False)
     noise = np.random.default_rng(0).normal(size=log.v.shape) * np.array([1e-3] * 6 + [1e-4] * 12)
     noise[:, 8] += 0.02 * np.sin(2.0 * np.pi * 30.0 * log.time)  # a knee shakes
-    q = log.system.robot.integrate(torch.tensor(log.q), torch.tensor(noise)).numpy()
+    q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(noise)).numpy()
     noisy = replace(log, q=q, noise_std=None)
     each = motion_spectrum(noisy).cutoff
     found = Preparation(cutoff="auto").apply(noisy)
     assert found.preparation.cutoff == pytest.approx(8.0 * np.nanmax(each[:6]), rel=0.01)
     assert "joints do up to" in found.report["why"]["cutoff"]
-    free = replace(noisy, u=noisy.u[:, :12], system=log.system.with_contacts([]))
+    free = replace(noisy, u=noisy.u[:, :12], model=log.model.with_contacts([]))
     assert Preparation(cutoff="auto").apply(free).preparation.cutoff == pytest.approx(np.nanmax(each), rel=0.01)
     assert np.nanmax(each) > 25.0 > 8.0 * np.nanmax(each[:6])
 
 
 def test_what_stance_needs_is_named():
     log, _ = walk(0)
-    with pytest.raises(ContactError, match="no contact of the system has a switch"):
-        estimate_stance(log, log.system.with_contacts(()))
+    with pytest.raises(ContactError, match="no contact of the model has a switch"):
+        estimate_stance(log, log.model.with_contacts(()))
     with pytest.raises(InvalidInput, match="stance is 'yes'; allowed: 'log' or 'auto'"):
         Preparation(stance="yes")
     wild = replace(log, v=np.random.default_rng(0).normal(size=log.v.shape) * 5.0, u=0.0 * log.u, a=0.0 * log.a)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import AerodynamicForce, Dataset, MechanicalSystem, Robot, StructuredGP
-from forcegp.cli.fit import fit_summary
+from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
 from forcegp.data import AirLaw, find_wind, with_wind
 from forcegp.data.wind import steady_forces
-from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters, fixed_point
-from forcegp.models import load_posterior, observing, save_posterior
+from forcegp.forces import Actuation, RigidBodies, Thrusters
+from forcegp.mechanics import fixed_point
+from forcegp.posterior import load_posterior, observing, save_posterior
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 BODY = (
@@ -27,7 +27,7 @@ def flight(wind, *, drag=1.0, episodes=1, rows=800, seed=0, noise=0.0):
     """Random smooth motions of a body on which drag is the only unmodelled force, a law that `AirLaw` holds exactly."""
     robot = Robot.from_urdf_text(BODY, base="floating")
     rotors = Thrusters("body", PLACES, 1.0, [0.02, 0.02, -0.02, -0.02])
-    system = MechanicalSystem(robot, (), (Actuation(), rotors, RigidBodyBias()))
+    model = Model(robot, (), (Actuation(), rotors, RigidBodies()))
     rng, parts = np.random.default_rng(seed), []
     time = np.arange(rows) / 100
     for episode in range(episodes):
@@ -42,14 +42,14 @@ def flight(wind, *, drag=1.0, episodes=1, rows=800, seed=0, noise=0.0):
             (q, waves(6, 1.5), 3.0 + waves(4, 0.5), np.full(rows, episode), np.broadcast_to(wind[episode], (rows, 3)))
         )
     q, v, u, episode, blowing = map(np.concatenate, zip(*parts, strict=True))
-    state = system.dynamics(*map(torch.tensor, (q, v, u)))
+    state = model.dynamics(*map(torch.tensor, (q, v, u)))
     rotation = state.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
     air = v[:, :3] - np.einsum("nji,nj->ni", rotation, blowing)
     force = -drag * (DRAG * air + SQUARED * np.linalg.norm(air, axis=1, keepdims=True) * air)
     torque = -drag * 0.01 * air[:, [1, 0, 2]]
     a = state.acceleration(torch.tensor(np.concatenate([force, torque], axis=1))).numpy()
     a = a + noise * rng.standard_normal(a.shape)
-    return Dataset(q=q, v=v, u=u, a=a, time=np.tile(time, episodes) + 100.0 * episode, episode=episode, system=system)
+    return Dataset(q=q, v=v, u=u, a=a, time=np.tile(time, episodes) + 100.0 * episode, episode=episode, model=model)
 
 
 @pytest.mark.parametrize("wind", [(0.0, 0.0, 0.0), (3.0, -2.0, 0.0), (-9.0, 7.0, 0.0)])
@@ -105,7 +105,7 @@ def test_nothing_is_found_where_rows_do_not_show_it(case, seed):
     if case == "out of order":
         dataset = dataset.rows(np.random.default_rng(0).permutation(len(dataset)))
     if case == "contact":
-        dataset = replace(dataset, system=dataset.system.with_contacts(fixed_point("body", (0.0, 0.0, 0.0))))
+        dataset = replace(dataset, model=dataset.model.with_contacts(fixed_point("body", (0.0, 0.0, 0.0))))
     assert find_wind(dataset) is None
 
 
@@ -113,29 +113,29 @@ def test_wind_and_velocity_are_the_same_to_the_air():
     """Features of a body in wind are those of one that moves against still air."""
     dataset = flight([(3.0, -2.0, 1.0)], rows=500)
     there = with_wind(dataset, np.broadcast_to((3.0, -2.0, 1.0), (500, 3)))
-    assert there.system.inputs[4:] == ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
-    windy = there.system.dynamics(*map(torch.tensor, (there.q, there.v, there.u)))
+    assert there.model.inputs[4:] == ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
+    windy = there.model.dynamics(*map(torch.tensor, (there.q, there.v, there.u)))
     rotation = windy.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
     v = dataset.v.copy()
     v[:, :3] -= np.einsum("nji,j->ni", rotation, (3.0, -2.0, 1.0))
-    still = dataset.system.dynamics(*map(torch.tensor, (dataset.q, v, dataset.u)))
+    still = dataset.model.dynamics(*map(torch.tensor, (dataset.q, v, dataset.u)))
     prior = AerodynamicForce()
     torch.testing.assert_close(prior.features(windy)[0], prior.features(still)[0])
-    without = dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u)))
+    without = dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u)))
     torch.testing.assert_close(AerodynamicForce(wind=(3.0, -2.0, 1.0)).features(without)[0], prior.features(still)[0])
     # and it is no force
     torch.testing.assert_close(
-        windy.Q_K, dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K
+        windy.Q_K, dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K
     )
-    stored = MechanicalSystem.from_dict(there.system.to_dict())
-    assert stored.inputs == there.system.inputs
+    stored = Model.from_dict(there.model.to_dict())
+    assert stored.inputs == there.model.inputs
     assert stored.held_inputs == (4, 5, 6)
 
 
 def pushed(forces, rows=120, seed=4, noise=0.0):
     """Flights in still air, each with a constant force of the world."""
     dataset = flight([(0.0, 0.0, 0.0)] * len(forces), episodes=len(forces), rows=rows, seed=seed, noise=noise)
-    state = dataset.system.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).state
+    state = dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).state
     rotation = state.kinematics.frame_pose("body")[:, :3, :3].numpy()
     a = dataset.a.copy()
     a[:, :3] += np.einsum("nji,nj->ni", rotation, np.array(forces)[dataset.episode]) / 1.2
@@ -152,11 +152,13 @@ def test_the_force_of_each_episode_is_found():
 
 def test_a_fit_leaves_the_force_of_each_episode_to_its_observer(tmp_path):
     """So no function has to explain it; later flights, stored models and rows that are added have one of their own."""
+    from forcegp.cli.fit import fit_summary
+
     train = pushed([(6.0, 0.0, 0.0), (-6.0, 0.0, 0.0)], noise=0.02)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        posterior = StructuredGP(train.system, AerodynamicForce(kernel="linear"), noise=0.02).fit(train, restarts=1)
-    assert posterior.system.inputs == train.system.inputs
+        posterior = fit(train.model.with_forces(AerodynamicForce(kernel="linear"), noise=0.02), train, restarts=1)
+    assert posterior.model.inputs == train.model.inputs
     np.testing.assert_allclose(posterior.settings["steady_forces"]["0"], (6.0, 0.0, 0.0), atol=1.0)
     assert fit_summary(posterior, 1.0)["wind_not_found"]
     there = pushed([(0.0, 9.0, 0.0)], seed=5, noise=0.02)

@@ -15,7 +15,7 @@ from forcegp import Dataset, load_posterior
 from forcegp.atomic_files import require_unchanged
 
 FEW = "--points 10 --iterations 3 --restarts 1"
-VALIDATE = "--split blocks:5:3 --models analytical --seeds 1 --points 10 --starts 1 --horizon 0.02"
+VALIDATE = "--split blocks:5:3 --models given --seeds 1 --points 10 --starts 1 --horizon 0.02"
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,7 @@ COMMANDS = {
     "import": Writing("import log.csv --time time --q q_a --u u_a --joints a --out OUT", "file"),
     "prepare": Writing("prepare train.h5 --cutoff 20 --out OUT", "file"),
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
-    "identify": Writing(f"identify train.h5 --learn lbr_iiwa_link_7:mass {FEW} --out OUT"),
-    "regression": Writing("identify air.h5 --model least-squares --out OUT"),
-    "compare": Writing(f"compare train.h5 --priors joint,joint-friction {FEW} --out OUT"),
+    "identification": Writing("fit air.h5 --forces bodies,viscous --no-checks --out OUT"),
     "evaluate": Writing("evaluate run test.h5 --every 20 --plots OUT"),
     "rollout": Writing("rollout run test.h5 --starts 1 --seconds 0.02 --out OUT"),
     "check": Writing("check train.h5 --plots OUT"),
@@ -61,7 +59,7 @@ COMMANDS = {
         "reproduce fig2b --preset smoke --points 10 --seed-list 7 --jobs 1 --out OUT", "store", again=""
     ),
 }
-KILLED = ("simulate", "import", "fit", "identify", "validate", "reproduce")
+KILLED = ("simulate", "import", "fit", "identification", "validate", "reproduce")
 
 
 def make_inputs(folder: Path, forcegp) -> None:

@@ -1,11 +1,13 @@
 """One small fitted arm for all tests of this package."""
 
 import pytest
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.data import Dataset
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
-from forcegp.models import StructuredGP, StructuredPosterior
+from forcegp.posterior import StructuredPosterior
 
 
 @pytest.fixture(scope="session")
@@ -20,15 +22,20 @@ def test_data() -> Dataset:
 
 @pytest.fixture(scope="session")
 def posterior(train) -> StructuredPosterior:
-    return StructuredGP(arm_system()).fit(train, restarts=1, options=OptimizerOptions(iterations=30))
+    return fit(arm_model().with_forces(JointForces()), train, restarts=1, options=OptimizerOptions(iterations=30))
 
 
 @pytest.fixture(scope="session")
 def without_mean(train) -> StructuredPosterior:
-    return StructuredGP(arm_system(), mean="zero").fit(train, restarts=1, options=OptimizerOptions(iterations=30))
+    return fit(
+        arm_model().with_forces(JointForces()).without_mean(),
+        train,
+        restarts=1,
+        options=OptimizerOptions(iterations=30),
+    )
 
 
 @pytest.fixture(scope="session")
 def without_contact(train) -> StructuredPosterior:
-    model = StructuredGP(arm_system(contacts=0))
-    return model.fit(train, restarts=1, options=OptimizerOptions(iterations=3))
+    model = arm_model(contacts=0).with_forces(JointForces())
+    return fit(model, train, restarts=1, options=OptimizerOptions(iterations=3))

@@ -4,14 +4,15 @@ import dataclasses
 
 import numpy as np
 import torch
-from tests.models.arm import NOISE, arm_data, arm_system
+from tests.posterior.arm import NOISE, arm_data, arm_model
 
 from forcegp.data import Dataset
+from forcegp.fit import fit
+from forcegp.forces import Unknown
+from forcegp.forces.tool_forces import ToolPoint
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models import StructuredGP, StructuredPosterior
-from forcegp.priors import ForcePrior
-from forcegp.priors.tool_forces import ToolPoint
+from forcegp.model import Model
+from forcegp.posterior import StructuredPosterior
 
 VISCOUS = 2.0
 """N/(m/s) at the tool."""
@@ -22,14 +23,14 @@ def joint_law(v):
     return 0.8 * np.tanh(v / 0.4) + 0.3 * v
 
 
-def friction_data(rows: int, seed: int, system: MechanicalSystem | None = None) -> Dataset:
+def friction_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     """Joint friction by `joint_law` and viscous friction at the tool, along the plane, with all of their truth."""
-    data = arm_data(rows, seed, system)
-    A = data.system.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u))).A.numpy()
+    data = arm_data(rows, seed, model)
+    A = data.model.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u))).A.numpy()
     along = data.v - (np.linalg.pinv(A) @ A @ data.v[..., None])[..., 0]  # the tool stays on the plane
     data = dataclasses.replace(data, v=along)
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
-    dynamics = data.system.dynamics(*states)
+    dynamics = data.model.dynamics(*states)
     where = ToolPoint.of(dynamics, "hand", (0.0, 0.0, 0.2))
     velocity = where.velocity(states[1])[:, :3]
     normal = torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
@@ -50,9 +51,8 @@ def friction_data(rows: int, seed: int, system: MechanicalSystem | None = None) 
     return dataclasses.replace(data, a=a + noise, truth=truth)
 
 
-def fitted(prior: ForcePrior, points: int = 40, iterations: int = 60, **changes) -> StructuredPosterior:
-    """A model of that arm with this prior."""
-    data = friction_data(points, seed=0)
-    return StructuredGP(arm_system(), prior, **changes).fit(
-        data, restarts=1, options=OptimizerOptions(iterations=iterations)
-    )
+def fitted(*forces: Unknown, points: int = 40, iterations: int = 60, mean: bool = True) -> StructuredPosterior:
+    """A model of that arm with these forces, with known forces as their mean or without."""
+    data, model = friction_data(points, seed=0), arm_model().with_forces(*forces)
+    options = OptimizerOptions(iterations=iterations)
+    return fit(model if mean else model.without_mean(), data, restarts=1, options=options)

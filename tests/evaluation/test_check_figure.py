@@ -12,7 +12,7 @@ def test_panels_of_a_floating_base_show_their_own_joint():
     axes = {each.get_title(loc="left"): each for each in check_figure(check(log)).axes}
     for name in ("front_left_roll", "rear_right_knee"):
         drawn = axes[name].lines[0].get_ydata()
-        recorded = log.q[:, log.system.robot.position_names.index(name)]
+        recorded = log.q[:, log.model.robot.position_names.index(name)]
         assert np.ptp(drawn) > 0.0
         np.testing.assert_allclose(drawn[0], recorded[0])
         assert recorded.min() <= drawn.min() <= drawn.max() <= recorded.max()

@@ -6,13 +6,14 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from tests.models.arm import NOISE, arm_data, arm_system
+from tests.posterior.arm import NOISE, arm_data, arm_model
 
 from forcegp.errors import DataWarning
 from forcegp.evaluation import evaluate, unfinished_search
+from forcegp.fit import fit
+from forcegp.forces import JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.models import Noise, StructuredGP
-from forcegp.priors import JointFriction
+from forcegp.noise import Noise
 
 QUICK = {"restarts": 1, "options": OptimizerOptions()}
 
@@ -20,7 +21,7 @@ QUICK = {"restarts": 1, "options": OptimizerOptions()}
 @pytest.fixture(scope="module")
 def friction():
     data = arm_data(40, 0)
-    return StructuredGP(data.system, JointFriction()).fit(data, **QUICK)
+    return fit(data.model.with_forces(JointFriction()), data, **QUICK)
 
 
 def about(warnings, topic) -> list[str]:
@@ -34,7 +35,7 @@ def test_of_a_good_model_nothing_is_said(friction):
 
 def test_a_search_that_did_not_end_is_named():
     data = arm_data(20, 0)
-    posterior = StructuredGP(data.system).fit(data, restarts=1, options=OptimizerOptions(iterations=2))
+    posterior = fit(data.model.with_forces(JointForces()), data, restarts=1, options=OptimizerOptions(iterations=2))
     (sentence,) = unfinished_search(posterior)
     assert "did not converge (stopped at the limit of 2 iterations" in sentence
     assert about(evaluate(posterior, arm_data(20, 1)).warnings, "did not converge") == [sentence]
@@ -53,7 +54,7 @@ def test_a_model_that_is_worse_than_its_known_forces_is_named(friction):
     """Without the friction that it has learned: u holds it already."""
     data = arm_data(60, 1)
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
-    a = data.system.dynamics(*states).acceleration_map().offset.numpy()
+    a = data.model.dynamics(*states).acceleration_map().offset.numpy()
     there = dataclasses.replace(data, a=a, truth={"a": a})
     found = evaluate(friction, there)
     (sentence,) = about(found.warnings, "worse here than its known forces alone")
@@ -74,7 +75,7 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
     """One joint lacks the friction that was learned, and another is as noisy as five times what is stated."""
     data = arm_data(200, 1)
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
-    known = data.system.dynamics(*states).acceleration_map().offset.numpy()
+    known = data.model.dynamics(*states).acceleration_map().offset.numpy()
     a, measured = data.truth["a"].copy(), data.a.copy()
     a[:, 0] = known[:, 0]
     measured[:, 0] = known[:, 0] + (data.a - data.truth["a"])[:, 0]
@@ -94,31 +95,31 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
 @pytest.mark.parametrize("identified", [True, False])
 def test_another_robot_is_advised_only_where_the_rows_bear_it_out(identified):
     """The advice to take the robot of the data turned an error of .28 into 25 where the model's own was identified."""
-    true = arm_system().with_robot(arm_system().robot.with_armature(torch.tensor([0.4, 0.4, 0.4])))
+    true = arm_model().with_robot(arm_model().robot.with_armature(torch.tensor([0.4, 0.4, 0.4])))
     data = {seed: arm_data(40, seed, true) for seed in (0, 1)}
-    mine, theirs = (true, arm_system()) if identified else (arm_system(), true)
-    train = dataclasses.replace(data[0], system=mine)
-    posterior = StructuredGP(mine, JointFriction()).fit(train, **QUICK)
-    test = dataclasses.replace(data[1], system=theirs)
+    mine, theirs = (true, arm_model()) if identified else (arm_model(), true)
+    train = dataclasses.replace(data[0], model=mine)
+    posterior = fit(mine.with_forces(JointFriction()), train, **QUICK)
+    test = dataclasses.replace(data[1], model=theirs)
     sentences = about(evaluate(posterior, test).warnings, "robot of the model is not that of the data")
-    kept, moved = (evaluate(model, test).mae for model in (posterior, posterior.with_system(theirs)))
+    kept, moved = (evaluate(model, test).mae for model in (posterior, posterior.with_model(theirs)))
     if identified:
         assert moved > 2.0 * kept
         assert sentences == []
     else:
         (sentence,) = sentences
-        assert "`posterior.with_system(dataset.system)`" in sentence
+        assert "`posterior.with_model(dataset.model)`" in sentence
         assert f"{moved:.3g} instead of {kept:.3g}" in sentence
 
 
 def test_noise_that_nobody_stated_is_learned_and_said_so():
     data = dataclasses.replace(arm_data(60, 0), noise_std=None)
-    model = StructuredGP(data.system, JointFriction())
+    model = data.model.with_forces(JointFriction())
     with pytest.warns(DataWarning, match="does not state the noise of its accelerations, so it is learned.*`noise`"):
-        posterior = model.fit(data, **QUICK)
+        posterior = fit(model, data, **QUICK)
     assert posterior.model.noise.learn
     np.testing.assert_allclose(posterior.noise_std.numpy(), NOISE, rtol=0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        asked = dataclasses.replace(model, noise=Noise(None, learn=True)).fit(data, **QUICK)
+        asked = fit(dataclasses.replace(model, noise=Noise(None, learn=True)), data, **QUICK)
     torch.testing.assert_close(asked.noise_std, posterior.noise_std)

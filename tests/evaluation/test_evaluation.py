@@ -8,12 +8,12 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal, norm
 from tests.data import samples
-from tests.models.arm import NOISE, arm_data, arm_system
+from tests.posterior.arm import NOISE, arm_data, arm_model
 
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import Evaluation, evaluate, predict_rows
 from forcegp.evaluation.predicted_rows import ROWS_PER_BLOCK
-from forcegp.models import load_posterior, save_posterior
+from forcegp.posterior import load_posterior, save_posterior
 
 ASKED_FOR = ("mae", "mae_noise_free", "rmse", "nlpd", "coverage_95", "constraint_error")
 
@@ -68,7 +68,7 @@ def test_learning_helps_and_the_constraint_holds(evaluation):
 
 
 def test_without_truth_and_noise_level_only_measurements_are_scored(posterior, test_data, evaluation):
-    bare = dataclasses.replace(test_data, truth={}, noise_std=None, system=None)
+    bare = dataclasses.replace(test_data, truth={}, noise_std=None, model=None)
     scores = evaluate(posterior, bare).to_dict()
     for name in ("mae_noise_free", "coverage_95_noise_free", "noise_floor", "force_mae", "unknown_force_mae"):
         assert scores[name] is None
@@ -119,7 +119,7 @@ def test_a_stored_model_scores_the_same(posterior, test_data, evaluation, tmp_pa
 def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(without_mean, test_data):
     evaluation = evaluate(without_mean, test_data)
     predicted = predict_rows(without_mean, test_data)
-    known = arm_system().dynamics(*(torch.tensor(x) for x in (test_data.q, test_data.v, test_data.u))).Q_K.numpy()
+    known = arm_model().dynamics(*(torch.tensor(x) for x in (test_data.q, test_data.v, test_data.u))).Q_K.numpy()
     carried = predicted.unknown_force - known
     expected = np.abs(carried - test_data.truth["Q_U"]).mean(axis=0)
     np.testing.assert_allclose(evaluation.unknown_force_mae_per_joint, expected, rtol=1e-9)

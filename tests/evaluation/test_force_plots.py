@@ -9,13 +9,13 @@ from matplotlib.collections import PolyCollection
 from matplotlib.image import imread
 from scipy.stats import norm
 from tests.evaluation.friction import VISCOUS, fitted, friction_data, joint_law
-from tests.models.arm import arm_system
+from tests.posterior.arm import arm_model
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_panels, friction_curves_figure, normal_force_figure, save_figure
-from forcegp.models import IndependentGP
-from forcegp.priors import ContactFriction, JointFriction, PeriodicJointForces, ToolForces
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointFriction, PeriodicJointForces, ToolForces
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def data() -> Dataset:
 
 @pytest.fixture(scope="module")
 def friction():
-    return fitted(JointFriction() + ContactFriction(kernel="linear"))
+    return fitted(JointFriction(), ContactFriction(kernel="linear"))
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_a_coefficient_is_the_true_force_per_true_load(data):
     axes = friction_curves_figure(model, data).axes[0]
     assert axes.get_ylabel() == "force / normal force"
     _, coefficient = line(axes, "true")
-    dynamics = data.system.dynamics(*(torch.tensor(x[:1]) for x in (data.q, data.v, data.u)))
+    dynamics = data.model.dynamics(*(torch.tensor(x[:1]) for x in (data.q, data.v, data.u)))
     size = torch.linalg.vector_norm(dynamics.normals)
     load = float(size) * np.abs(data.truth["lambda"][:, 0])
     expected = np.linalg.norm(data.truth["force.tool-friction"], axis=1) / load
@@ -135,7 +135,7 @@ def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, 
 
 
 def test_large_models_say_how_many_curves_are_shown_and_others_can_be_chosen(monkeypatch):
-    model = fitted(JointFriction() + PeriodicJointForces(1.0), iterations=1)
+    model = fitted(JointFriction(), PeriodicJointForces(1.0), iterations=1)
     monkeypatch.setattr("forcegp.evaluation.plots.friction_curves.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
     assert len(figure.axes) == 2
@@ -152,7 +152,7 @@ def test_the_normal_force_is_drawn_with_its_truth_and_its_errors(friction, data,
     force, errors = figure.axes
     rows = data.rows(data.time <= 0.5)
     prediction = friction.predict(rows.q, rows.v, rows.u)
-    dynamics = data.system.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u)))
+    dynamics = data.model.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u)))
     size = torch.linalg.vector_norm(dynamics.normals, dim=-1)[:, 0].numpy()
     time, mean = line(force, "predicted")
     np.testing.assert_allclose(time, rows.time)
@@ -175,7 +175,7 @@ def test_the_normal_force_is_drawn_with_its_truth_and_its_errors(friction, data,
 def test_every_contact_has_a_row_and_without_truth_only_the_prediction_is_drawn(friction, data):
     bare = dataclasses.replace(data, truth={})
     assert len(normal_force_figure(friction, bare).axes) == 1
-    two = friction.with_contacts(arm_system(contacts=1).contacts * 2)
+    two = friction.with_contacts(arm_model(contacts=1).contacts * 2)
     assert len(normal_force_figure(two, bare).axes) == 2
     assert len(normal_force_figure(two, data).axes) == 2  # the truth knows one contact only
     assert normal_force_figure(two, bare).axes[1].get_title(loc="left") == "Contact 1: plane at hand"
@@ -185,4 +185,4 @@ def test_models_without_normal_force_are_refused(without_contact, data):
     with pytest.raises(InvalidInput, match="no normal force"):
         normal_force_figure(without_contact, data)
     with pytest.raises(InvalidInput, match="no normal force"):
-        normal_force_figure(IndependentGP(data.system).fit(friction_data(10, 0)), data)
+        normal_force_figure(fit(data.model.black_box(), friction_data(10, 0)), data)

@@ -7,10 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import (
-    prediction_figure,
-    save_figure,
-)
+from forcegp.evaluation import prediction_figure, save_figure
 from forcegp.evaluation.plots.style import new_figure, plain_ticks, short_joint_names, window
 
 PNG = b"\x89PNG\r\n\x1a\n"

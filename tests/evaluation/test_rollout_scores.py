@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import JointFriction, StructuredGP
+from forcegp import JointFriction, fit
 from forcegp.data import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import rollout_errors, rollout_figure
@@ -20,7 +20,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def posterior(log):
-    return StructuredGP(log.system, JointFriction()).fit(log, points=20, restarts=1)
+    return fit(log.model.with_forces(JointFriction()), log, points=20, restarts=1)
 
 
 def rolled(posterior, log, **how):
@@ -30,47 +30,48 @@ def rolled(posterior, log, **how):
 
 def test_errors_are_ways_on_the_manifold(posterior, log):
     rollout, recorded = rolled(posterior, log)
-    robot = log.system.robot
+    robot = log.model.robot
     step = 0.05 * torch.randn(*recorded.v.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     moved = robot.integrate(torch.tensor(recorded.q), step)
     turned = moved.clone()
     turned[..., 3:7] *= -1.0  # the same orientation
     for q in (moved, turned):
-        errors = rollout_errors(replace(rollout, q=q), recorded, log.system)
+        errors = rollout_errors(replace(rollout, q=q), recorded, log.model)
         np.testing.assert_allclose(errors.joint, step.abs(), atol=1e-12)
     lost = moved.clone()
     lost[1, 5:] = torch.nan
-    errors = rollout_errors(replace(rollout, q=lost), recorded, log.system)
+    errors = rollout_errors(replace(rollout, q=lost), recorded, log.model)
     assert np.isnan(errors.joint[1, 5:]).all()
     assert np.isfinite(errors.joint[1, :5]).all()
     assert errors.tool is not None
     assert errors.constraint is None  # feet have no surface to be away from
 
 
+@pytest.mark.nightly
 def test_samples_give_intervals_about_the_mean(posterior, log):
     rollout, recorded = rolled(posterior, log, samples=8)
-    errors = rollout_errors(rollout, recorded, log.system)
+    errors = rollout_errors(rollout, recorded, log.model)
     assert errors.spread.shape == errors.inside.shape == recorded.v.shape
-    ways = log.system.robot.difference(rollout.q.expand_as(rollout.samples.q), rollout.samples.q).numpy()
+    ways = log.model.robot.difference(rollout.q.expand_as(rollout.samples.q), rollout.samples.q).numpy()
     low, high = np.quantile(ways, (0.025, 0.975), axis=0)
     np.testing.assert_allclose(errors.spread, 0.5 * (high - low), atol=1e-14)
 
 
 def test_a_base_is_drawn_by_its_way_from_the_start(posterior, log):
     rollout, recorded = rolled(posterior, log, samples=8)
-    errors = rollout_errors(rollout, recorded, log.system)
+    errors = rollout_errors(rollout, recorded, log.model)
     figure = rollout_figure(rollout, recorded, errors, log, "title")
     panels = figure.subfigs[0].axes
     drawn = panels[0].lines[0].get_ydata()
     start = torch.tensor(recorded.q[0, :1])
-    way = log.system.robot.difference(start.expand(len(drawn), -1), torch.tensor(recorded.q[0]))
+    way = log.model.robot.difference(start.expand(len(drawn), -1), torch.tensor(recorded.q[0]))
     np.testing.assert_allclose(drawn, way[:, 0], atol=1e-12)
 
 
 def test_a_diverged_motion_is_the_farthest_of_a_median(posterior, log):
     """A median over what is left would drop where the worst motion ends."""
     rollout, recorded = rolled(posterior, log)
-    errors = rollout_errors(rollout, recorded, log.system)
+    errors = rollout_errors(rollout, recorded, log.model)
     joint = np.ones((3, *errors.joint.shape[1:])) * np.array([1.0, 2.0, 4.0])[:, None, None]
     joint[2, 5:] = joint[1, 10:] = np.nan
     diverged = replace(errors, joint=joint, diverged_at=np.array([-1, 10, 5]))

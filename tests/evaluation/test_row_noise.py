@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
-from tests.models.arm import NOISE, arm_data, arm_system
+from tests.posterior.arm import NOISE, arm_data, arm_model
 
 from forcegp.evaluation import evaluate, predict_rows
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
-from forcegp.models import Noise, StructuredGP
+from forcegp.noise import Noise
 
 STATED = NOISE * np.where(np.arange(60)[:, None] % 2, 0.2, 4.0) * np.array([1.0, 1.5, 0.5])
 QUICK = OptimizerOptions(iterations=15)
@@ -25,8 +27,10 @@ def uneven(test_data):
 def with_level(posterior, level):
     """The posterior with another level of noise, conditioned again."""
     log_level = torch.as_tensor(level, dtype=torch.float64).log()
-    parameters = {**posterior.parameters, "noise.log_acceleration": log_level}
-    return posterior.model.condition(posterior.training, parameters, posterior.result, posterior.settings)
+    parameters = {**posterior.hyperparameters, "noise.log_acceleration": log_level}
+    return posterior.conditioned(
+        posterior.trained, posterior.training, parameters, posterior.result, posterior.settings, posterior.engine
+    )
 
 
 def test_the_noise_of_every_row_is_scored(posterior, uneven):
@@ -52,7 +56,7 @@ def test_a_model_whose_level_is_higher_counts_all_rows_as_noisier(posterior, une
 
 def test_rows_may_be_quieter_on_the_whole_than_those_learned_from(uneven):
     train = dataclasses.replace(arm_data(30, seed=0), noise_std=np.full((30, 3), NOISE))
-    fitted = StructuredGP(train.system).fit(train, restarts=1, options=QUICK)
+    fitted = fit(train.model.with_forces(JointForces()), train, restarts=1, options=QUICK)
     quiet = dataclasses.replace(uneven, noise_std=0.01 * STATED)
     predicted = predict_rows(fitted, quiet)
     np.testing.assert_allclose(predicted.measurement_variance - predicted.variance, (0.01 * STATED) ** 2, rtol=1e-5)
@@ -60,8 +64,8 @@ def test_rows_may_be_quieter_on_the_whole_than_those_learned_from(uneven):
 
 
 def test_noise_of_forces_is_added_to_that_of_rows(uneven):
-    train = dataclasses.replace(arm_data(30, seed=0, system=arm_system()), noise_std=np.full((30, 3), NOISE))
-    fitted = StructuredGP(train.system, noise=Noise(None, 0.1)).fit(train, restarts=1, options=QUICK)
+    train = dataclasses.replace(arm_data(30, seed=0, model=arm_model()), noise_std=np.full((30, 3), NOISE))
+    fitted = fit(train.model.with_forces(JointForces(), noise=Noise(None, 0.1)), train, restarts=1, options=QUICK)
     predicted = predict_rows(fitted, uneven)
     H = fitted.dynamics(*map(torch.tensor, (uneven.q, uneven.v, uneven.u))).H.numpy()
     expected = STATED**2 + 0.01 * np.square(H).sum(-1)

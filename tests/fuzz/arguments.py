@@ -14,12 +14,14 @@ import torch
 from hypothesis import strategies as st
 from tests.fuzz.made import INPUTS, QUICK
 from tests.fuzz.oracle import DefectError, Target, allowed
-from tests.models.arm import URDF, arm_system
+from tests.posterior.arm import URDF, arm_model
 from tests.robots.mjcf_models import FOUR_BAR
 
 import forcegp
-from forcegp import mechanics, models
-from forcegp.priors.named import named_prior
+from forcegp import forces, mechanics
+from forcegp.evidence import parse_evidence
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 
 STATE = (np.full(3, 0.3), np.full(3, 0.1), np.full(3, 0.5))
 POSE = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8])
@@ -111,10 +113,10 @@ MADE: dict[str, Callable[[], Any]] = {
     "array (6,)": lambda: np.ones(6),
     "array (2, 3)": lambda: np.ones((2, 3)),
     "array (6, 2)": lambda: np.ones((6, 2)),
-    "a robot": lambda: INPUTS.data.system.robot,
-    "a system": lambda: INPUTS.data.system,
-    "a free system": lambda: arm_system(0),
-    "a contact": lambda: INPUTS.data.system.contacts[0],
+    "a robot": lambda: INPUTS.data.model.robot,
+    "a model": lambda: INPUTS.data.model,
+    "a free model": lambda: arm_model(0),
+    "a contact": lambda: INPUTS.data.model.contacts[0],
     "a noise": lambda: forcegp.Noise(0.1),
     "a plane": lambda: forcegp.Plane((0.0, 0.0, 1.0), 0.0),
 }
@@ -123,7 +125,7 @@ MADE: dict[str, Callable[[], Any]] = {
 
 def _dataset() -> dict[str, Any]:
     data = INPUTS.data
-    names = ("q", "v", "u", "a", "time", "joint_names", "units", "episode", "system", "noise_std", "truth", "metadata")
+    names = ("q", "v", "u", "a", "time", "joint_names", "units", "episode", "model", "noise_std", "truth", "metadata")
     return {name: getattr(data, name) for name in names}
 
 
@@ -132,14 +134,14 @@ def _states() -> dict[str, Any]:
 
 
 def _robot() -> Any:
-    return INPUTS.data.system.robot
+    return INPUTS.data.model.robot
 
 
 def _prior(kind: Any, **arguments: Any) -> Any:
     """A prior shows what is wrong with it where it meets a robot."""
-    dynamics = INPUTS.data.system.dynamics(*(torch.tensor(x)[None] for x in STATE))
+    dynamics = INPUTS.data.model.dynamics(*(torch.tensor(x)[None] for x in STATE))
     made = kind(**arguments)
-    made.mixing(dynamics), made.features(dynamics)
+    made.direction(dynamics), made.features(dynamics)
     made.latent_names(_robot())
     return made
 
@@ -147,22 +149,26 @@ def _prior(kind: Any, **arguments: Any) -> Any:
 def _forces(kind: Any, **arguments: Any) -> None:
     """No numbers are returned: what a coefficient of 1e308 overflows to is refused by `predict`."""
     made = kind(**arguments)
-    system = INPUTS.data.system.with_contacts(())
-    known = (*system.known_forces, made)
-    forcegp.MechanicalSystem(system.robot, (), known).dynamics(*(torch.tensor(x) for x in STATE)).acceleration_map(True)
+    model = INPUTS.data.model.with_contacts(())
+    known = (*model.forces, made)
+    forcegp.Model(model.robot, (), known).dynamics(*(torch.tensor(x) for x in STATE)).acceleration_map(True)
+
+
+def _with(force: Any) -> Any:
+    return INPUTS.data.model.with_forces(force).dynamics(*(torch.tensor(x) for x in STATE)).A
 
 
 def _surface(kind: Any, **arguments: Any) -> Any:
-    system = arm_system(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),))
-    return system.dynamics(*(torch.tensor(x) for x in STATE)).A
+    model = arm_model(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),))
+    return model.dynamics(*(torch.tensor(x) for x in STATE)).A
 
 
 def _contact(**arguments: Any) -> Any:
-    return arm_system(0).with_contacts((forcegp.Contact(**arguments),)).dynamics(*(torch.tensor(x) for x in STATE)).A
+    return arm_model(0).with_contacts((forcegp.Contact(**arguments),)).dynamics(*(torch.tensor(x) for x in STATE)).A
 
 
 def _baumgarte(**arguments: Any) -> Any:
-    return arm_system(baumgarte=forcegp.Baumgarte(**arguments)).dynamics(*(torch.tensor(x) for x in STATE)).b
+    return arm_model(baumgarte=forcegp.Baumgarte(**arguments)).dynamics(*(torch.tensor(x) for x in STATE)).b
 
 
 def _robot_from(**arguments: Any) -> Any:
@@ -170,34 +176,30 @@ def _robot_from(**arguments: Any) -> Any:
 
 
 def _drone() -> Any:
-    return INPUTS.moving.system.robot
+    return INPUTS.moving.model.robot
 
 
 def _link_force(kind: Any, **arguments: Any) -> Any:
     made = kind(**arguments)
     known = (made,) if kind is forcegp.Actuation else (forcegp.Actuation(), made)
-    system = forcegp.MechanicalSystem(_drone(), (), (*known, forcegp.RigidBodyBias()))
-    forcegp.MechanicalSystem.from_json(system.to_json())
-    return system.dynamics(POSE, np.zeros(6), np.ones(len(system.inputs))).M
+    model = forcegp.Model(_drone(), (), (*known, forcegp.RigidBodies()))
+    forcegp.Model.from_json(model.to_json())
+    return model.dynamics(POSE, np.zeros(6), np.ones(len(model.inputs))).M
 
 
 def _held(contacts: Any) -> Any:
-    system = INPUTS.moving.system.with_contacts(contacts)
-    return system.dynamics(POSE, np.zeros(6), np.ones(len(system.inputs))).A
+    model = INPUTS.moving.model.with_contacts(contacts)
+    return model.dynamics(POSE, np.zeros(6), np.ones(len(model.inputs))).A
 
 
 def _flying(made: Any) -> None:
-    dynamics = INPUTS.moving.system.dynamics(POSE[None], np.zeros((1, 6)), np.ones((1, 4)))
-    made.mixing(dynamics), made.features(dynamics)
+    dynamics = INPUTS.moving.model.dynamics(POSE[None], np.zeros((1, 6)), np.ones((1, 4)))
+    made.direction(dynamics), made.features(dynamics)
     made.latent_names(_drone())
 
 
 def _fitted(noise: Any) -> Any:
-    return forcegp.StructuredGP(INPUTS.data.system, noise=noise).fit(INPUTS.data, restarts=1, options=QUICK)
-
-
-def _model(**arguments: Any) -> Any:
-    return forcegp.StructuredGP(**arguments).fit(INPUTS.data, points=6, restarts=1, options=QUICK)
+    return fit(INPUTS.data.model.with_forces(JointForces(), noise=noise), INPUTS.data, restarts=1, options=QUICK)
 
 
 def _options(**arguments: Any) -> Any:
@@ -206,12 +208,17 @@ def _options(**arguments: Any) -> Any:
     made = OptimizerOptions(**arguments)
     if isinstance(made.iterations, int) and made.iterations > 50:
         return None
-    return forcegp.StructuredGP(INPUTS.data.system).fit(INPUTS.data, points=6, restarts=1, options=made)
+    return fit(INPUTS.data.model.with_forces(JointForces()), INPUTS.data, points=6, restarts=1, options=made)
 
 
 def _engine(kind: Any, **arguments: Any) -> Any:
-    return forcegp.StructuredGP(INPUTS.data.system).fit(
-        INPUTS.data, points=8, restarts=1, options=QUICK, engine=kind(**arguments)
+    return fit(
+        INPUTS.data.model.with_forces(JointForces()),
+        INPUTS.data,
+        points=8,
+        restarts=1,
+        options=QUICK,
+        engine=kind(**arguments),
     )
 
 
@@ -254,7 +261,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "curve": (lambda **k: INPUTS.posterior.curve(**k), lambda: {"latent": "pan", "features": None, "points": 5}),
     "with_contacts": (lambda **k: INPUTS.posterior.with_contacts(**k), lambda: {"contacts": ()}),
     "with_robot": (lambda **k: INPUTS.posterior.with_robot(**k), lambda: {"robot": _robot()}),
-    "with_system": (lambda **k: INPUTS.posterior.with_system(**k), lambda: {"system": INPUTS.data.system}),
+    "with_model": (lambda **k: INPUTS.posterior.with_model(**k), lambda: {"model": INPUTS.data.model}),
     "predictor": (
         lambda **k: INPUTS.posterior.predictor(**{**k, "compile": False})(*STATE),
         lambda: {"covariance": "auto", "tolerance": 0.01, "largest_rank": 64},
@@ -263,14 +270,11 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "predictor().mean": (lambda **k: INPUTS.predictor.mean(**k), _states),
     "Noise": (lambda **k: _fitted(forcegp.Noise(**k)), lambda: {"acceleration": 0.1, "force": 0.1, "learn": False}),
     "noise": (_fitted, lambda: {"noise": 0.1}),
-    "StructuredGP": (
-        _model,
-        lambda: {"system": INPUTS.data.system, "prior": named_prior("joint"), "mean": "zero", "noise": None},
-    ),
     "fit": (
-        lambda **k: forcegp.StructuredGP(INPUTS.data.system).fit(**k),
+        lambda **k: fit(INPUTS.data.model.with_forces(JointForces()), **k),
         lambda: {
             "dataset": INPUTS.data,
+            "evidence": None,
             **FIT,
             "hyperprior": True,
             "start": None,
@@ -278,9 +282,11 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "learning_points": None,
         },
     ),
-    "IndependentGP": (
-        lambda **k: forcegp.IndependentGP(**k).fit(INPUTS.data, **FIT),
-        lambda: {"system": INPUTS.data.system, "inputs": ("q",), "noise": None},
+    "IndependentAccelerations": (
+        lambda **k: fit(
+            INPUTS.data.model.without_mean().with_forces(forcegp.IndependentAccelerations(**k)), INPUTS.data, **FIT
+        ),
+        lambda: {"inputs": ("q",)},
     ),
     "OptimizerOptions": (
         _options,
@@ -305,8 +311,8 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             **{"base": None, "strict": False},
         },
     ),
-    "MechanicalSystem.from_file": (
-        lambda **k: repr(forcegp.MechanicalSystem.from_file(**k)),
+    "Model.from_file": (
+        lambda **k: repr(forcegp.Model.from_file(**k)),
         lambda: {"path": INPUTS.folder / "drone.xml", "base": None, "locked": None},
     ),
     "floating": (
@@ -317,18 +323,18 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "difference": (lambda **k: _drone().difference(**k), lambda: {"q0": POSE, "q1": POSE}),
     "normalized": (lambda **k: _drone().normalized(**k), lambda: {"q": POSE}),
     "dynamics (drone)": (
-        lambda **k: INPUTS.moving.system.dynamics(**k).M,
+        lambda **k: INPUTS.moving.model.dynamics(**k).M,
         lambda: {"q": POSE, "v": np.full(6, 0.1), "u": np.full(4, 500.0)},
     ),
     "Thrusters": (
-        functools.partial(_link_force, mechanics.Thrusters),
+        functools.partial(_link_force, forces.Thrusters),
         lambda: {
             **{"frame": "body", "places": [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], "thrust": 1.0, "torque": 0.1},
             **{"axes": (0.0, 0.0, 1.0), "power": 2, "names": ("one", "two")},
         },
     ),
     "ObservedWrench": (
-        functools.partial(_link_force, mechanics.ObservedWrench),
+        functools.partial(_link_force, forces.ObservedWrench),
         lambda: {"frame": "body", "names": ("x", "y", "z")},
     ),
     "Actuation": (
@@ -374,11 +380,11 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "mass_matrix": (lambda **k: _robot().mass_matrix(**k), lambda: {"q": STATE[0]}),
     "frame_pose": (lambda frame, q: _robot().frame_pose(frame, q), lambda: {"frame": "hand", "q": STATE[0]}),
     "with_armature": (lambda armature: _robot().with_armature(armature), lambda: {"armature": (0.1, 0.1, 0.1)}),
-    "MechanicalSystem": (
-        forcegp.MechanicalSystem,
-        lambda: {"robot": _robot(), "contacts": (), "known_forces": (forcegp.Actuation(),), "baumgarte": None},
+    "Model": (
+        forcegp.Model,
+        lambda: {"robot": _robot(), "contacts": (), "forces": (forcegp.Actuation(),), "noise": None, "baumgarte": None},
     ),
-    "dynamics": (lambda **k: INPUTS.data.system.dynamics(**k).A, _states),
+    "dynamics": (lambda **k: INPUTS.data.model.dynamics(**k).A, _states),
     "Contact": (_contact, lambda: {"frame": "hand", "point": (0.0, 0.0, 0.2), "surface": forcegp.Plane(**SURFACES)}),
     "Plane": (functools.partial(_surface, forcegp.Plane), lambda: dict(SURFACES)),
     "Sphere": (functools.partial(_surface, forcegp.Sphere), lambda: {"center": (0.0, 0.0, 0.1), "radius": 0.5}),
@@ -387,20 +393,36 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {"point": (0.0, 0.0, 0.1), "axis": (1.0, 0.0, 0.0), "radius": 0.5},
     ),
     "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
-    "viscous": (functools.partial(_forces, forcegp.ViscousJointFriction), lambda: {"coefficients": 0.1}),
+    "viscous": (functools.partial(_forces, forcegp.Viscous), lambda: {"damping": 0.1}),
     "coulomb": (
-        functools.partial(_forces, forcegp.CoulombJointFriction),
-        lambda: {"coefficients": 0.1, "velocity_scale": 0.01},
+        functools.partial(_forces, forcegp.Coulomb),
+        lambda: {"level": 0.1, "velocity_scale": 0.01},
     ),
     "stribeck": (
-        functools.partial(_forces, forcegp.StribeckJointFriction),
-        lambda: {"coulomb": 0.1, "static": 0.2, "stribeck_velocity": 0.1},
+        functools.partial(_forces, forcegp.Stribeck),
+        lambda: {"level": 0.1, "breakaway": 0.1, "stribeck_velocity": 0.1},
     ),
-    "constant": (functools.partial(_forces, forcegp.ConstantJointForce), lambda: {"values": 0.1}),
-    "direction": (functools.partial(_forces, forcegp.DirectionalJointFriction), lambda: {"differences": 0.1}),
-    "armature": (functools.partial(_forces, forcegp.Armature), lambda: {"inertia": 0.1}),
-    "rotor": (functools.partial(_forces, forcegp.RotorInertia), lambda: {"inertia": 0.1, "transmission": None}),
-    "named_prior": (named_prior, lambda: {"expression": "joint", "system": None}),
+    "constant": (functools.partial(_forces, forcegp.Offset), lambda: {"value": 0.1}),
+    "direction": (functools.partial(_forces, forcegp.DirectionalFriction), lambda: {"difference": 0.1}),
+    "armature": (functools.partial(_forces, forcegp.Rotor), lambda: {"inertia": 0.1}),
+    "rotor": (functools.partial(_forces, forcegp.CoupledRotors), lambda: {"inertia": 0.1, "transmission": None}),
+    "load": (functools.partial(_forces, forcegp.LoadFriction), lambda: {"level": 0.1, "factor": 0.1}),
+    "spring": (functools.partial(_forces, forcegp.Spring), lambda: {"stiffness": 0.1, "rest": None}),
+    "Normal": (
+        lambda **k: _forces(forcegp.Viscous, damping=forcegp.Normal(**k)),
+        lambda: {"mean": 0.1, "std": 0.1},
+    ),
+    "LogNormal": (
+        lambda **k: _forces(forcegp.Coulomb, level=0.1, velocity_scale=forcegp.LogNormal(**k)),
+        lambda: {"median": 0.1, "spread": 1.0},
+    ),
+    "RigidBodies": (lambda **k: _with(forcegp.RigidBodies(**k)), lambda: {"learn": ("hand",)}),
+    "with_forces": (
+        lambda **k: INPUTS.data.model.with_forces(k["forces"], noise=k["noise"]),
+        lambda: {"forces": forcegp.Viscous(), "noise": 0.1},
+    ),
+    "parse_forces": (forces.parse_forces, lambda: {"expression": "gp:joint"}),
+    "parse_evidence": (parse_evidence, lambda: {"words": "torques:mean=.4"}),
     "JointForces": (
         functools.partial(_prior, forcegp.JointForces),
         lambda: {"inputs": ("q",), "kernel": "linear", "angles": "plain"},
@@ -433,19 +455,22 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "kernel": None,
         },
     ),
-    "Payload": (functools.partial(_prior, forcegp.Payload), lambda: {"frame": "hand", "moments": True}),
+    "Payload": (
+        functools.partial(_forces, forcegp.Payload),
+        lambda: {"link": "hand", "mass": 1.0, "center_of_mass": (0.0, 0.0, 0.1), "inertia": None},
+    ),
     "Inducing": (functools.partial(_engine, forcegp.Inducing), lambda: {"points": 5, "tolerance": 0.02, "refine": 0}),
     "Preparation": (
         lambda **k: forcegp.Preparation(**k).apply(INPUTS.free),
         lambda: {"cutoff": 20.0, "order": 2, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
     ),
     "ComputedTorque": (
-        functools.partial(_control, forcegp.ComputedTorque, lambda: arm_system(0)),
+        functools.partial(_control, forcegp.ComputedTorque, lambda: arm_model(0)),
         lambda: {**TRACKING, "forces_at": "desired", "gain_factor": None, "on_failure": "raise"},
     ),
     "PDGravity": (functools.partial(_control, forcegp.PDGravity, _robot), lambda: {**TRACKING, "on_failure": "hold"}),
     "ContactMonitor": (
-        lambda **k: forcegp.ContactMonitor(arm_system(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
+        lambda **k: forcegp.ContactMonitor(arm_model(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
         lambda: {"dt": 0.01, "bandwidth": 5.0, "covariance": "noise"},
     ),
     "MPPI": (
@@ -481,21 +506,13 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         },
     ),
     "evaluate": (forcegp.evaluate, lambda: {"posterior": INPUTS.posterior, "dataset": INPUTS.data}),
-    "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "system": None, "preparation": None}),
-    "identify_analytical": (
-        forcegp.identify_analytical,
-        lambda: {
-            "dataset": INPUTS.free,
-            "system": None,
-            "friction": ("viscous",),
-            "rotors": None,
-            "inertias": "consistent",
-            "likelihood": "torque",
-            "prior_strength": 1.0,
-            "robust": False,
-            "rows": 50,
-        },
+    "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "model": None, "preparation": None}),
+    "fit (laws)": (
+        lambda **k: fit(INPUTS.free.model.with_forces(forcegp.Viscous()), **k),
+        lambda: {"dataset": INPUTS.free, "evidence": forcegp.Torques(), "rows": 50, "baseline": None},
     ),
+    "Torques": (forcegp.Torques, lambda: {"noisy": "u", "robust": False, "mean": None}),
+    "Motions": (forcegp.Motions, lambda: {"seconds": 1.0, "bodies": True}),
     "split_named": (forcegp.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
     "ColumnMapping": (
         forcegp.ColumnMapping,
@@ -528,9 +545,9 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "null_space_joints": (2,),
         },
     ),
-    "WeakForm": (forcegp.WeakForm, lambda: {"seconds": 0.1, "nodes": 6, "signal": "q", "order": 2}),
-    "Coefficients": (forcegp.Coefficients, lambda: {"force": "viscous", "joints": None, "start": None}),
-    "load_posterior": (models.load_posterior, lambda: {"path": INPUTS.folder / "carried", "contacts": None}),
+    "Windows": (forcegp.Windows, lambda: {"seconds": 0.1, "nodes": 6, "signal": "q", "order": 2}),
+    "Body": (forcegp.Body, lambda: {"strength": 1.0, "parts": ("mass",)}),
+    "load_posterior": (forcegp.load_posterior, lambda: {"path": INPUTS.folder / "carried", "contacts": None}),
     "Dataset.load": (forcegp.Dataset.load, lambda: {"path": INPUTS.folder / "train.h5"}),
 }
 

@@ -29,9 +29,30 @@ FILES = (
     "log.mcap",
 )
 NAMES = "carried independent nowhere train.h5/x . .. hostile.pkl loop out.h5 out carried/model.json - -x ~"
-AIR = ("aerodynamic", "aerodynamic:frame=body", "aerodynamic:observe=0", "aerodynamic:observe=-1", "aerodynamic:")
-AIR += ("aerodynamic:observe=nan", "aerodynamic:frame=x", "aerodynamic:observe", "aerodynamic+aerodynamic")
-AIR += ("aerodynamic:height=1", "aerodynamic:inputs=x", "aerodynamic + base-wrench", "floating", "planar", "spherical")
+AIR = ("gp:aerodynamic", "gp:aerodynamic:frame=body", "gp:aerodynamic:observe=0", "gp:aerodynamic:observe=-1", "gp:")
+AIR += (
+    "gp:aerodynamic:observe=nan",
+    "gp:aerodynamic:frame=x",
+    "gp:aerodynamic:observe",
+    "gp:joint,gp:joint",
+    "viscous",
+)
+AIR += (
+    "gp:aerodynamic:height=1",
+    "gp:aerodynamic:inputs=x",
+    "aerodynamic,gp:base-wrench",
+    "floating",
+    "planar",
+    "spherical",
+)
+AIR += (
+    "viscous:damping=x",
+    "coulomb:,rotor",
+    "payload:nowhere",
+    "payload:hand:mass=-1",
+    "bodies:hand",
+    "torques:mean=x",
+)
 ODD = ("", "a" * 300, "nowhere/x.h5", "\udcff.h5", "x\udcff", "x\x00y", "\u202ex")
 PATHS = st.sampled_from((*FILES, *NAMES.split(), *ODD))
 """None is absolute, and commands run some folders deep: nothing outside of the folder of a case is ever named."""
@@ -47,13 +68,11 @@ VALID = {
         "out.h5",
     ),
     "auto": ("auto", "log.csv", "--robot", "arm.urdf", "--step", "0", "--out", "out"),
-    "payload": ("payload", "test.h5", "--friction", "none-such"),
+    "payload": ("payload", "test.h5", "--forces", "none-such"),
     "robot": ("robot", "arm.urdf"),
     "check": ("check", "test.h5"),
     "prepare": ("prepare", "test.h5", "--cutoff", "20", "--out", "out.h5"),
     "fit": ("fit", "train.h5", *SMALL, "--out", "out"),
-    "compare": ("compare", "train.h5", "--priors", "joint,none", *SMALL),
-    "identify": ("identify", "test.h5", "--model", "least-squares", "--out", "out"),
     "evaluate": ("evaluate", "carried", "train.h5"),
     "rollout": ("rollout", "carried", "train.h5", "--starts", "1", "--seconds", "0.02", "--out", "out"),
     "monitor": ("monitor", "carried", "train.h5", "--free-seconds", "0.1", "--out", "out"),
@@ -72,12 +91,12 @@ MOVING = {
     "check": ("check", "moving.h5"),
     "prepare": ("prepare", "moving.h5", "--cutoff", "20", "--out", "out.h5"),
     "prepare ": ("prepare", "moving.h5", "--cutoff", "20", "--lag", "auto", "--out", "out.h5"),
-    "fit": ("fit", "moving.h5", "--prior", "aerodynamic:frame=body", *SMALL, "--no-checks", "--out", "out"),
-    "fit ": ("fit", "moving.h5", "--prior", "base-wrench", *SMALL, "--no-checks", "--out", "out"),
-    "compare": ("compare", "moving.h5", "--priors", "aerodynamic,none", *SMALL),
+    "fit": ("fit", "moving.h5", "--forces", "gp:aerodynamic:frame=body", *SMALL, "--no-checks", "--out", "out"),
+    "fit ": ("fit", "moving.h5", "--forces", "gp:base-wrench", *SMALL, "--no-checks", "--out", "out"),
+    "fit  ": ("fit", "test.h5", "--forces", "viscous", "--rows", "50", "--no-checks", "--out", "out"),
     "simulate": ("simulate", "quadrotor", "--seconds", "0.1", "--wind", "3", "--out", "out.h5"),
 }
-"""The same of robots whose base moves."""
+"""Other lines of the same commands, most of robots whose base moves."""
 LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
 """Nobody may ask for so many seconds of simulation, say, in a test."""
 NEVER = ("debug", "browser")

@@ -30,7 +30,7 @@ NAMES = (
     "truth/lambda",
     "joint_names",
     "metadata",
-    "system",
+    "model",
 )
 ATTRIBUTES = ("format", "format_version", "written_by", "time_ordered", "units")
 ARRAYS = {
@@ -84,7 +84,7 @@ CHANGES = st.one_of(
     st.builds(Change, st.just("metadata"), st.just("motion"), JSON),
     st.builds(Change, st.sampled_from(ATTRIBUTES), st.just("attribute"), SCALARS),
     st.builds(Change, st.just("joint_names"), st.just("names"), st.lists(WORDS, max_size=4)),
-    st.builds(Change, st.just("system"), st.just("edit"), st.lists(JSON_EDITS, min_size=1, max_size=2)),
+    st.builds(Change, st.just("model"), st.just("edit"), st.lists(JSON_EDITS, min_size=1, max_size=2)),
 )
 
 

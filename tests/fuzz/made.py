@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from tests.data.samples import dataset
-from tests.models.arm import URDF, arm_data, arm_system
+from tests.posterior.arm import URDF, arm_data, arm_model
 from tests.recordings.log_files import (
     motion,
     table,
@@ -22,18 +22,13 @@ from tests.recordings.log_files import (
 )
 from tests.robots.mjcf_models import FOUR_BAR, QUADROTOR
 
+from forcegp.fit import fit
+from forcegp.forces import Actuation, JointForces, JointFriction, ObservedWrench, RigidBodies, Thrusters
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import (
-    Actuation,
-    MechanicalSystem,
-    ObservedWrench,
-    RigidBodyBias,
-    Thrusters,
-    fixed_point,
-    loop_point,
-)
-from forcegp.models import IndependentGP, Noise, StructuredGP, save_posterior
-from forcegp.priors.named import named_prior
+from forcegp.mechanics import fixed_point, loop_point
+from forcegp.model import Model
+from forcegp.noise import Noise
+from forcegp.posterior import save_posterior
 from forcegp.robots import Robot
 from forcegp.simulation import QuadrotorConfig
 from forcegp.simulation.quadrotor import simulate_quadrotor
@@ -50,22 +45,26 @@ def make(folder: Path) -> None:
     import numpy as np
 
     data = arm_data(14, 5)
-    free = arm_data(80, 6, arm_system(0))
-    structured = StructuredGP(
-        data.system, named_prior("joint") + named_prior("joint-friction"), noise=Noise(0.05, 0.02, learn=True)
-    ).fit(data, points=8, restarts=1, options=QUICK)
-    plain = StructuredGP(data.system).fit(data, points=8, restarts=1, options=QUICK)
+    free = arm_data(80, 6, arm_model(0))
+    structured = fit(
+        data.model.with_forces(JointForces(), JointFriction(), noise=Noise(0.05, 0.02, learn=True)),
+        data,
+        points=8,
+        restarts=1,
+        options=QUICK,
+    )
+    plain = fit(data.model.with_forces(JointForces()), data, points=8, restarts=1, options=QUICK)
     heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.9"'))
     models = {
         "structured": structured,
-        "carried": plain.with_system(MechanicalSystem(heavier, data.system.contacts, data.system.known_forces)),
-        "independent": IndependentGP(data.system).fit(data, points=8, restarts=1, options=QUICK),
+        "carried": plain.with_model(Model(heavier, data.model.contacts, data.model.forces)),
+        "independent": fit(data.model.black_box(), data, points=8, restarts=1, options=QUICK),
     }
     for name, model in models.items():
         save_posterior(model, folder / name)
     data.save(folder / "train.h5")
     free.save(folder / "test.h5")
-    dataclasses.replace(data, system=None, truth={}, noise_std=None).save(folder / "bare.h5")
+    dataclasses.replace(data, model=None, truth={}, noise_std=None).save(folder / "bare.h5")
     (folder / "arm.urdf").write_text(URDF)
     rows = motion(60)
     write_text(folder / "log.csv", table(rows))
@@ -85,14 +84,14 @@ def make(folder: Path) -> None:
     INPUTS.moving.save(folder / "moving.h5")
     (folder / "drone.xml").write_text(QUADROTOR)
     (folder / "arm.armature.json").write_text('{"pan": 0.1}')
-    INPUTS.systems = (INPUTS.moving.system.to_json(), looped().to_json())
+    INPUTS.models = (INPUTS.moving.model.to_json(), looped().to_json())
     INPUTS.predictor = plain.predictor(compile=False)
 
 
-def looped() -> MechanicalSystem:
+def looped() -> Model:
     """A loop, a contact with a switch, and forces of every kind that files carry."""
     robot = Robot.from_mjcf_text(FOUR_BAR.split("<equality>")[0] + "</mujoco>")
     loop = loop_point("coupler", (0.4, 0.0, 0.05), "rocker", (0.0, 0.0, 0.25))
     push = Thrusters("coupler", [[0.0, 0.0, 0.1]])
-    forces = (Actuation([[1.0], [0.0], [0.0]], ("motor",)), push, ObservedWrench("rocker"), RigidBodyBias())
-    return MechanicalSystem(robot, (*loop, *fixed_point("crank", (0.0, 0.0, 0.1), switch="held")), forces)
+    forces = (Actuation([[1.0], [0.0], [0.0]], ("motor",)), push, ObservedWrench("rocker"), RigidBodies())
+    return Model(robot, (*loop, *fixed_point("crank", (0.0, 0.0, 0.1), switch="held")), forces)

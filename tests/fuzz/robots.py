@@ -10,10 +10,10 @@ import torch
 from hypothesis import strategies as st
 from tests.fuzz.oracle import DefectError, Target, allowed, require_no_code
 from tests.fuzz.values import DAMAGE, MJCF_EDITS, PROLOGUES, XML_EDITS, Damage, XmlEdit, damaged, edited_xml
-from tests.models.arm import URDF
+from tests.posterior.arm import URDF
 from tests.robots.mjcf_models import ALL
 
-from forcegp import MechanicalSystem, Robot
+from forcegp import Model, Robot
 
 SECRET = "nobody may read this"
 
@@ -83,23 +83,23 @@ def check(case: RobotFile, folder: Path) -> None:
     path = folder / ("arm.xml" if case.robot.startswith("mjcf") else "arm.urdf")
     write(case, path)
     try:
-        system = MechanicalSystem.from_file(path, base=case.base)
-        robot = system.robot
-        repr(system)
+        model = Model.from_file(path, base=case.base)
+        robot = model.robot
+        repr(model)
         if robot.nv:
             q = robot.random(torch.Generator().manual_seed(0))[0]
             M = robot.mass_matrix(q)
             if not bool(torch.isfinite(M).all()):
                 raise DefectError("a mass matrix that is not finite")
-            system.dynamics(q, torch.zeros(robot.nv).double(), torch.zeros(len(system.inputs)).double())
+            model.dynamics(q, torch.zeros(robot.nv).double(), torch.zeros(len(model.inputs)).double())
         text = robot.to_urdf()
         again = Robot.from_urdf_text(text, base=robot.base, locked=robot.locked)
         if again.nv != robot.nv:
             raise DefectError("another robot is read from what was written")
-        MechanicalSystem.from_json(system.to_json())
+        Model.from_json(model.to_json())
         if case.robot.startswith("mjcf") and case.damage is None:
             Robot.from_mjcf_text(path.read_text(errors="replace"), base=case.base)
-        system.to_mjcf()
+        model.to_mjcf()
     except Exception as error:
         if SECRET in str(error):
             raise DefectError("an external entity was read") from None

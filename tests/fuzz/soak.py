@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tests.models.arm import arm_data, arm_system
+from tests.posterior.arm import arm_data, arm_model
 
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
-from forcegp.models import Posterior, StructuredGP
+from forcegp.posterior import Posterior
 
 BUDGET = 8
 POOL = 400
@@ -20,9 +22,12 @@ POOL = 400
 
 def start() -> tuple[Posterior, list]:
     """A posterior of a few rows, and single rows to learn from."""
-    data = arm_data(POOL, 1, arm_system(0))
-    posterior = StructuredGP(data.system).fit(
-        data.rows(slice(0, BUDGET)), restarts=1, options=OptimizerOptions(iterations=8)
+    data = arm_data(POOL, 1, arm_model(0))
+    posterior = fit(
+        data.model.with_forces(JointForces()),
+        data.rows(slice(0, BUDGET)),
+        restarts=1,
+        options=OptimizerOptions(iterations=8),
     )
     return posterior, [data.rows([k]) for k in range(POOL)]
 
@@ -31,7 +36,7 @@ def drift(posterior: Posterior) -> float:
     """The largest difference of a mean or covariance to conditioning on its rows at once, relative to the largest."""
     training = posterior.training
     settings = {"widening": posterior.widening}
-    fresh = posterior.model.condition(training, posterior.parameters, posterior.result, settings)
+    fresh = posterior.conditioned(posterior.trained, training, posterior.hyperparameters, posterior.result, settings)
     states = tuple(torch.tensor(x) for x in _states())
     mine, theirs = posterior.predict(*states), fresh.predict(*states)
     return max(
@@ -70,5 +75,5 @@ def tensors(posterior: Posterior) -> int:
 
 
 def _states() -> tuple[np.ndarray, ...]:
-    test = arm_data(5, 2, arm_system(0))
+    test = arm_data(5, 2, arm_model(0))
     return test.q, test.v, test.u

@@ -16,7 +16,7 @@ from tests.fuzz.made import INPUTS, MODELS
 from tests.fuzz.oracle import DefectError, Target, allowed, require_ended_well, require_no_code
 from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, XML_EDITS, Damage, damaged, edited_json, edited_xml
 
-from forcegp import MechanicalSystem, load_posterior
+from forcegp import Model, load_posterior
 from forcegp.atomic_files import write_digests
 
 TENSORS = "tensors.safetensors"
@@ -142,7 +142,7 @@ def check(case: Stored, folder: Path) -> None:
         if not case.again and not same:
             raise DefectError("a changed model was loaded")
         repr(posterior)
-        states = (torch.full((2, posterior.system.robot.nv), 0.3, dtype=torch.float64),) * 3
+        states = (torch.full((2, posterior.model.robot.nv), 0.3, dtype=torch.float64),) * 3
         predicted = posterior.predict(*states)
         if not bool(torch.isfinite(predicted.mean).all() and torch.isfinite(predicted.covariance).all()):
             raise DefectError("a prediction that is not finite")
@@ -159,24 +159,24 @@ def check_commands(case: Stored, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredSystem:
-    """A system of thrusters, loops and switches, with these edits."""
+    """A model of thrusters, loops and switches, with these edits."""
 
     which: int
     edits: list[Any]
 
 
 def check_system(case: StoredSystem, folder: Path) -> None:
-    """Refused, or a system that moves and is stored again."""
-    text = edited_json(json.loads(INPUTS.systems[case.which]), case.edits)
+    """Refused, or a model that moves and is stored again."""
+    text = edited_json(json.loads(INPUTS.models[case.which]), case.edits)
     with allowed():
-        system = MechanicalSystem.from_json(text)
-        repr(system)
-        robot = system.robot
+        model = Model.from_json(text)
+        repr(model)
+        robot = model.robot
         q = robot.random(torch.Generator().manual_seed(0))
-        dynamics = system.dynamics(q, 0.0 * q[:, : robot.nv], torch.ones(1, len(system.inputs)).double())
+        dynamics = model.dynamics(q, 0.0 * q[:, : robot.nv], torch.ones(1, len(model.inputs)).double())
         if not bool(torch.isfinite(dynamics.M).all()):
             raise DefectError("a mass matrix that is not finite")
-        MechanicalSystem.from_json(system.to_json())
+        Model.from_json(model.to_json())
     require_no_code(folder)
 
 

@@ -13,12 +13,12 @@ from tests.fuzz.arguments import CALLS
 from tests.fuzz.datasets import OTHERS
 from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import require_ended_well
-from tests.models.arm import URDF
+from tests.posterior.arm import URDF
 
 import forcegp
 from forcegp.atomic_files import write_digests
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.recordings.mapping import read_mapping
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -114,8 +114,8 @@ def test_mappings_of_any_shape_are_refused(tmp_path, text):
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"urdf": ' + "9" * 5000 + "}"], ids=["deep", "digits"])
 def test_systems_of_any_shape_are_refused(text):
-    with pytest.raises(FileFormatError, match="stored system"):
-        MechanicalSystem.from_json(text)
+    with pytest.raises(FileFormatError, match="stored model"):
+        Model.from_json(text)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ WRONG = {
     "rollout": {"baumgarte": 3},
     "Dataset": {"units": 5},
     "Dataset ": {"joint_names": 5},
-    "Dataset  ": {"system": ()},
+    "Dataset  ": {"model": ()},
     "Dataset.rows": {"index": torch.ones(3, requires_grad=True)},
     "Dataset.load": {"path": 7},
     "load_posterior": {"path": 7},
@@ -162,14 +162,14 @@ WRONG = {
     "Robot.from_urdf_text  ": {"locked": 5},
     "normalized": {"q": 7},
     "normalized ": {"q": torch.zeros(7).double()},
-    "MechanicalSystem.from_file": {"path": 7},
+    "Model.from_file": {"path": 7},
     "Actuation": {"names": ("one", None)},
     "Thrusters": {"names": ("one", 2)},
     "ObservedWrench": {"names": (None, "y", "z")},
     "Plane": {"normal": torch.tensor([0.0, 0.0, 1.0]).to_sparse()},
     "with_armature": {"armature": torch.ones(2, 3).to_sparse()},
-    "MechanicalSystem": {"contacts": torch.tensor(1.0)},
-    "MechanicalSystem ": {"baumgarte": 5.0},
+    "Model": {"contacts": torch.tensor(1.0)},
+    "Model ": {"baumgarte": 5.0},
     "OptimizerOptions": {"iterations": None},
     "OptimizerOptions ": {"patience": 1.5},
     "OptimizerOptions  ": {"memory": "x"},
@@ -183,24 +183,28 @@ WRONG = {
     "fit     ": {"engine": np.zeros(3, [("a", "f8")])},
     "Noise": {"learn": torch.ones(3)},
     "Noise ": {"acceleration": torch.ones(3, device="meta")},
-    "StructuredGP": {"mean": np.ones(3)},
-    "IndependentGP": {"inputs": np.zeros(3, [("a", "f8")])},
+    "fit (laws)": {"rows": 1.5},
+    "fit (laws) ": {"evidence": np.ones(3)},
+    "Torques": {"noisy": np.ones(3)},
+    "Torques ": {"robust": np.ones(3)},
+    "Torques  ": {"mean": "x"},
+    "Motions": {"seconds": "x"},
+    "Body": {"strength": "x"},
+    "IndependentAccelerations": {"inputs": np.zeros(3, [("a", "f8")])},
     "JointForces": {"angles": np.ones(3)},
     "ContactFriction": {"load": np.ones(3)},
     "ContactFriction ": {"axes": np.ones(3)},
     "ToolForces": {"axes": np.ones(3)},
+    "ToolForces ": {"torque": np.ones(3)},
+    "Body ": {"parts": np.ones(3)},
+    "Body  ": {"parts": forcegp.Plane((0.0, 0.0, 1.0), 0.0)},
     "Baumgarte": {"omega": 2**63},
     "Baumgarte ": {"omega": 1e308},
-    "Payload": {"moments": np.ones(3)},
-    "named_prior": {"expression": 5},
+    "Payload": {"mass": np.ones(3)},
+    "parse_forces": {"expression": 5},
     "Preparation": {"order": 2, "trim": 10**30, "delay": 10**30},
     "Preparation ": {"cutoff": np.ones(3)},
     "check": {"preparation": np.ones(3)},
-    "identify_analytical": {"friction": 5},
-    "identify_analytical ": {"rows": 1.5},
-    "identify_analytical  ": {"robust": np.ones(3)},
-    "identify_analytical   ": {"prior_strength": "x"},
-    "identify_analytical    ": {"likelihood": np.ones(3)},
     "split_named": {"text": 5},
     "split_named ": {"guard": {}},
     "ColumnMapping": {"step": "x"},
@@ -208,8 +212,7 @@ WRONG = {
     "ImportOptions": {"gap": "x"},
     "ImportOptions ": {"most_rows": None},
     "KukaSurfaceConfig": {"null_space_joints": None},
-    "WeakForm": {"signal": np.ones(3)},
-    "Coefficients": {"joints": 5},
+    "Windows": {"signal": np.ones(3)},
     "JointFriction": {"joints": torch.tensor(5.0)},
 }
 

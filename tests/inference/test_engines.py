@@ -8,13 +8,7 @@ import torch
 
 from forcegp.errors import InvalidInput, NotEnoughMemory
 from forcegp.inference import engines, memory
-from forcegp.inference.engines import (
-    Exact,
-    Inducing,
-    ProblemSize,
-    choose_engine,
-    engine_from_dict,
-)
+from forcegp.inference.engines import Exact, Inducing, ProblemSize, choose_engine, engine_from_dict
 
 CPU = torch.device("cpu")
 SIZE = ProblemSize(rows=1000, outputs=2, rank=2, latents=3, features=9)

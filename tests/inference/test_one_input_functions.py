@@ -12,6 +12,7 @@ from tests.inference.problems import normal
 
 from forcegp.codegen.library import Purpose
 from forcegp.errors import CompilerError
+from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.one_input_functions import (
     OneInputFunctions,
@@ -22,7 +23,6 @@ from forcegp.inference.one_input_functions import (
 )
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.priors.kernels import kernel_of
 
 EXACT = [
     "friction",

@@ -1,19 +1,12 @@
-"""Motions with known answers: the small arm of `tests.models.arm` on all surfaces, and damped oscillators."""
+"""Motions with known answers: the small arm of `tests.posterior.arm` on all surfaces, and damped oscillators."""
 
 import torch
-from tests.models.arm import arm_system, unknown_force
+from tests.posterior.arm import arm_model, unknown_force
 
+from forcegp.forces import Actuation, RigidBodies, Stribeck
 from forcegp.integration import ConstraintManifold
-from forcegp.mechanics import (
-    Actuation,
-    Contact,
-    Cylinder,
-    MechanicalSystem,
-    Plane,
-    RigidBodyBias,
-    Sphere,
-    StribeckJointFriction,
-)
+from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 TOOL = (0.0, 0.0, 0.2)
@@ -26,24 +19,24 @@ CONTACTS = {
 }
 
 
-def free_system(contacts: str) -> MechanicalSystem:
+def free_system(contacts: str) -> Model:
     """The arm with these contacts and no stabilisation."""
-    return arm_system(baumgarte=None).with_contacts(CONTACTS[contacts])
+    return arm_model(baumgarte=None).with_contacts(CONTACTS[contacts])
 
 
-def start(system: MechanicalSystem, speed: float = 0.6) -> tuple[torch.Tensor, torch.Tensor]:
+def start(model: Model, speed: float = 0.6) -> tuple[torch.Tensor, torch.Tensor]:
     """Two states that meet the constraint."""
     q = torch.tensor([[0.3, 0.7, 0.8], [-0.5, 0.9, 0.6]], dtype=torch.float64)
     v = speed * torch.tensor([[0.8, -0.5, 0.9], [0.7, 0.6, -0.4]], dtype=torch.float64)
-    return ConstraintManifold(system).project(q, v)
+    return ConstraintManifold(model).project(q, v)
 
 
-def physics(system: MechanicalSystem):
+def physics(model: Model):
     """a(q, v, u) of the arm with a little friction and with gravity compensated, so that u = 0 keeps it in reach."""
 
     def acceleration(q, v, u):
-        dynamics = system.dynamics(q, v, u)
-        return dynamics.acceleration(0.03 * unknown_force(v) + system.robot.gravity_forces(q))
+        dynamics = model.dynamics(q, v, u)
+        return dynamics.acceleration(0.03 * unknown_force(v) + model.robot.gravity_forces(q))
 
     return acceleration
 
@@ -54,7 +47,7 @@ LIGHT_JOINT = """<joint name="{name}" type="revolute"><origin xyz="{x} 0 0"/><pa
 <child link="{child}"/><axis xyz="0 0 1"/><limit lower="-9" upper="9" effort="9" velocity="9"/></joint>"""
 
 
-def light_arm() -> MechanicalSystem:
+def light_arm() -> Model:
     """Two links of inertia .003 kg m^2 with dry friction that rises and falls within .1 rad/s: a stiff system."""
     urdf = [
         LIGHT_LINK.format(name="upper"),
@@ -63,5 +56,5 @@ def light_arm() -> MechanicalSystem:
         LIGHT_JOINT.format(name="elbow", x=0.2, parent="upper", child="fore"),
     ]
     robot = Robot.from_urdf_text('<robot name="light"><link name="base"/>' + "".join(urdf) + "</robot>")
-    stribeck = StribeckJointFriction(coulomb=0.3, static=0.4, stribeck_velocity=0.1, velocity_scale=0.1)
-    return MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), stribeck))
+    stribeck = Stribeck(level=0.3, breakaway=0.1, stribeck_velocity=0.1, velocity_scale=0.1)
+    return Model(robot, (), (Actuation(), RigidBodies(), stribeck))

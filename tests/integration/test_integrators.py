@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from tests.integration.motions import CONTACTS, free_system, light_arm, physics, start
-from tests.models.arm import arm_system
+from tests.posterior.arm import arm_model
 
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.integration import (
@@ -17,7 +17,8 @@ from forcegp.integration import (
     integrate,
     integrator_named,
 )
-from forcegp.mechanics import Contact, ImplicitSurface, MechanicalSystem, Plane
+from forcegp.mechanics import Contact, ImplicitSurface, Plane
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 POINT = """<robot name="point"><link name="base"/>
@@ -38,7 +39,7 @@ def observed_order(errors: list[float]) -> float:
         (SymplecticEuler(), 1),
         (RungeKutta4(), 4),
         (ImplicitMidpoint(), 2),
-        (Projected(ConstraintManifold(MechanicalSystem(Robot.from_urdf_text(POINT)))), 2),
+        (Projected(ConstraintManifold(Model(Robot.from_urdf_text(POINT)))), 2),
     ],
     ids=["symplectic-euler", "rk4", "implicit-midpoint", "projected without contacts"],
 )
@@ -70,18 +71,18 @@ def test_implicit_midpoint_is_cayleys_transform_of_a_linear_system():
 
 
 def test_implicit_midpoint_follows_stiff_friction_where_explicit_steps_fail():
-    system, n = light_arm(), 4
+    model, n = light_arm(), 4
     q0 = torch.linspace(-0.3, 0.3, n, dtype=torch.float64)[:, None] + torch.tensor([1.4, 0.2], dtype=torch.float64)
     time = 0.04 * torch.arange(25, dtype=torch.float64)[:, None, None]
     phase = torch.linspace(0.0, 2.0, n, dtype=torch.float64)[:, None] + torch.tensor([0.0, 1.0], dtype=torch.float64)
     u = torch.tensor([0.5, 0.4], dtype=torch.float64) * torch.sin(2.0 * math.pi * time + phase)
 
     def ends(name, finer):
-        method = integrator_named(name, system)
+        method = integrator_named(name, model)
         forces = u.repeat_interleave(finer, 0)
         motion = integrate(
             method,
-            lambda q, v, u: system.dynamics(q, v, u).acceleration_map().offset,
+            lambda q, v, u: model.dynamics(q, v, u).acceleration_map().offset,
             q0,
             0.0 * q0,
             forces,
@@ -101,9 +102,9 @@ def test_implicit_midpoint_follows_stiff_friction_where_explicit_steps_fail():
 
 @pytest.mark.parametrize("contacts", ["plane twice", "sphere", "cylinder"])
 def test_the_projected_scheme_is_of_second_order_on_every_surface(contacts):
-    system = free_system(contacts)
-    q0, v0 = start(system)
-    acceleration, end = physics(system), 0.2
+    model = free_system(contacts)
+    q0, v0 = start(model)
+    acceleration, end = physics(model), 0.2
 
     def last(integrator, steps):
         force = torch.zeros(steps, 2, 3, dtype=torch.float64)
@@ -112,7 +113,7 @@ def test_the_projected_scheme_is_of_second_order_on_every_surface(contacts):
 
     reference = last(RungeKutta4(), 80)  # its drift off the surface is far below the errors measured here
     errors = [
-        float((last(Projected(ConstraintManifold(system)), steps) - reference).abs().max()) for steps in (10, 20, 40)
+        float((last(Projected(ConstraintManifold(model)), steps) - reference).abs().max()) for steps in (10, 20, 40)
     ]
     assert observed_order(errors) == pytest.approx(2.0, abs=0.25)
 
@@ -120,11 +121,11 @@ def test_the_projected_scheme_is_of_second_order_on_every_surface(contacts):
 @pytest.mark.parametrize("contacts", ["sphere", "cylinder"])
 def test_the_projected_scheme_stays_on_the_surface_for_5_s(contacts):
     # Steps of 1/60 s are coarser, so harder, than the 1/240 s of recordings, and four times as fast.
-    system = free_system(contacts)
-    q0, v0 = start(system)
+    model = free_system(contacts)
+    q0, v0 = start(model)
     force = 0.3 * torch.randn(300, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    motion = integrate(Projected(ConstraintManifold(system)), physics(system), q0, v0, force, 1 / 60)
-    c, rate = ConstraintManifold(system).violation(motion.q, motion.v)
+    motion = integrate(Projected(ConstraintManifold(model)), physics(model), q0, v0, force, 1 / 60)
+    c, rate = ConstraintManifold(model).violation(motion.q, motion.v)
     assert (motion.diverged_at == -1).all()
     assert (motion.q[-1] - motion.q[0]).abs().max() > 0.1  # it did move
     assert c.abs().max() <= 1e-11
@@ -132,14 +133,14 @@ def test_the_projected_scheme_stays_on_the_surface_for_5_s(contacts):
 
 
 def test_the_velocity_projection_solves_the_dense_equations():
-    system = free_system("sphere").with_contacts((*CONTACTS["sphere"], *CONTACTS["plane"]))
+    model = free_system("sphere").with_contacts((*CONTACTS["sphere"], *CONTACTS["plane"]))
     q = torch.tensor([[0.3, 0.7, 0.8]], dtype=torch.float64)
     v = torch.tensor([[0.8, -0.5, 0.9]], dtype=torch.float64)
-    manifold = ConstraintManifold(system)
+    manifold = ConstraintManifold(model)
     at = manifold.project_position(q)
     projected = manifold.project_velocity(at, v)
-    M = system.robot.mass_matrix(q)[0]  # the metric is that of the given position
-    A = system.dynamics(at.q, v, v).A[0]
+    M = model.robot.mass_matrix(q)[0]  # the metric is that of the given position
+    A = model.dynamics(at.q, v, v).A[0]
     zero = torch.zeros(2, 2, dtype=torch.float64)
     dense = torch.cat([torch.cat([M, A.mT], dim=1), torch.cat([A, zero], dim=1)])
     right = torch.cat([M @ v[0], torch.zeros(2, dtype=torch.float64)])
@@ -147,15 +148,15 @@ def test_the_velocity_projection_solves_the_dense_equations():
 
 
 def test_the_position_projection_acts_along_the_contact_forces_and_changes_nothing_on_the_surface():
-    system = free_system("cylinder")
-    manifold = ConstraintManifold(system)
-    q0, _ = start(system)
+    model = free_system("cylinder")
+    manifold = ConstraintManifold(model)
+    q0, _ = start(model)
     torch.testing.assert_close(manifold.project_position(q0).q, q0, rtol=0, atol=1e-15)
     off = q0 + 1e-5
     at = manifold.project_position(off)
     assert at.converged.all()
     assert manifold.violation(at.q, at.q)[0].abs().max() <= 1e-12
-    push = (system.robot.mass_matrix(off) @ (at.q - off)[..., None])[..., 0]
+    push = (model.robot.mass_matrix(off) @ (at.q - off)[..., None])[..., 0]
     normal = at.A[:, 0]
     along = (push * normal).sum(-1, keepdim=True) / normal.square().sum(-1, keepdim=True) * normal
     assert (push - along).abs().max() <= 1e-3 * push.abs().max()
@@ -165,23 +166,23 @@ def test_the_position_projection_acts_along_the_contact_forces_and_changes_nothi
 def test_the_position_tolerance_is_a_distance_whatever_the_scale_of_the_surface(scale):
     plane = Plane((0.2, 0.0, 1.0), 0.4)
     surface = ImplicitSurface(lambda p: scale * plane.value(p))
-    system = arm_system(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), surface)])
+    model = arm_model(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), surface)])
     q0, _ = start(free_system("plane"))
     distance = free_system("plane").contacts[0].distance
-    assert distance(system.robot.kinematics(q0 + 1e-6)).abs().min() > 1e-7
+    assert distance(model.robot.kinematics(q0 + 1e-6)).abs().min() > 1e-7
     for off in (1e-2, 1e-6, 1e-10):  # a tolerance of 1e-12 in c itself would leave the last as it is, 1e-10 m off
-        at = ConstraintManifold(system).project_position(q0 + off)
+        at = ConstraintManifold(model).project_position(q0 + off)
         assert at.converged.all()
-        assert distance(system.robot.kinematics(at.q)).abs().max() <= 1e-12
+        assert distance(model.robot.kinematics(at.q)).abs().max() <= 1e-12
 
 
 def test_a_start_out_of_reach_is_refused_with_a_remedy():
-    system = arm_system(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 5.0))])
+    model = arm_model(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 5.0))])
     q, v = start(free_system("plane"))
     with pytest.raises(NumericalError, match=r"state 0 .*nearer"):
-        ConstraintManifold(system).project(q, v)
+        ConstraintManifold(model).project(q, v)
 
 
 def test_unknown_integrators_are_named_with_those_that_exist():
     with pytest.raises(InvalidInput, match=r"'rk5' .*'rk4'\? .* implicit-midpoint, projected, rk4, symplectic-euler"):
-        integrator_named("rk5", arm_system())
+        integrator_named("rk5", arm_model())

@@ -6,7 +6,7 @@ from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import InvalidInput
 from forcegp.integration import ConstraintManifold, integrate, integrator_named
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
@@ -20,11 +20,12 @@ def moved(robot, name, dt, seconds, speed=1.0):
     q = robot.random(generator)
     v = speed * torch.randn(1, robot.nv, dtype=torch.float64, generator=generator)
     steps = torch.zeros(round(seconds / dt), 1, robot.nv, dtype=torch.float64)
-    method = integrator_named(name, MechanicalSystem(robot))
+    method = integrator_named(name, Model(robot))
     with torch.no_grad():
         return integrate(method, robot.forward_dynamics, q, v, steps, dt)
 
 
+@pytest.mark.nightly
 def test_a_tumbling_body_in_free_fall_keeps_energy_and_momentum():
     robot = Robot.from_urdf_text(BODY, base="floating")
     motion, seconds, mass = moved(robot, "implicit-midpoint", 0.02, 4.0), 4.0, 3.0
@@ -64,7 +65,7 @@ def test_a_motion_that_is_lost_has_no_distance_from_its_contacts_and_no_error():
     q, v = (torch.tensor(x[:3]) for x in (data.q, data.v))
     lost = q.clone()
     lost[1] = torch.nan
-    (c, rate), (known, known_rate) = (ConstraintManifold(data.system).violation(each, v) for each in (lost, q))
+    (c, rate), (known, known_rate) = (ConstraintManifold(data.model).violation(each, v) for each in (lost, q))
     assert torch.isnan(c[1]).all()
     assert torch.isnan(rate[1]).all()
     torch.testing.assert_close(c[[0, 2]], known[[0, 2]], rtol=0.0, atol=0.0)
@@ -72,6 +73,6 @@ def test_a_motion_that_is_lost_has_no_distance_from_its_contacts_and_no_error():
 
 
 def test_contacts_that_are_switched_are_not_projected_onto():
-    system = simulate_quadruped(QuadrupedConfig(seconds=0.1)).system
+    model = simulate_quadruped(QuadrupedConfig(seconds=0.1)).model
     with pytest.raises(InvalidInput, match=r"front_left_stands.* switch some of them"):
-        integrator_named("projected", system)
+        integrator_named("projected", model)

@@ -2,62 +2,62 @@
 
 import pytest
 import torch
-from tests.models import floating_arm
-from tests.models.arm import arm_system
+from tests.posterior import floating_arm
+from tests.posterior.arm import arm_model
 
 from forcegp.integration import midpoint_sensitivities
 from forcegp.integration.integrators import ImplicitMidpoint, rows_jacobian
 from forcegp.integration.midpoint_sensitivities import Accelerations, Linear, window_motions
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 
 H = 0.01
 WINDOWS, STEPS = 3, 12
 
 
-def accelerations(system: MechanicalSystem, friction: torch.Tensor, width: float) -> Accelerations:
+def accelerations(model: Model, friction: torch.Tensor, width: float) -> Accelerations:
     """With dry friction of these levels (nv,)."""
-    nv, space = system.robot.nv, system.robot.space
+    nv, space = model.robot.nv, model.robot.space
 
     def mean(q, v, u):
-        return system.dynamics(q, v, u).acceleration(-friction * torch.tanh(v / width))
+        return model.dynamics(q, v, u).acceleration(-friction * torch.tanh(v / width))
 
     def linear(q, v, u, parameters):
         at = torch.cat([torch.zeros_like(v), v], dim=-1)
         a, slopes = rows_jacobian(lambda x: mean(space.integrate(q, x[:, :nv]), x[:, nv:], u), at)
-        H_friction = system.dynamics(q, v, u).H * -torch.tanh(v / width)[:, None]
+        H_friction = model.dynamics(q, v, u).H * -torch.tanh(v / width)[:, None]
         return Linear(a, *slopes.split(nv, dim=-1), H_friction if parameters else None)
 
     return Accelerations(mean, linear, space)
 
 
-BASES = {"arm": lambda: arm_system(0), "falling": floating_arm.falling}
+BASES = {"arm": lambda: arm_model(0), "falling": floating_arm.falling}
 
 
 @pytest.fixture(scope="module", params=BASES.values(), ids=BASES)
 def given(request):
     """System, q0, v0 and u of the windows, and as guess of the middles that nothing moves."""
-    system = request.param()
-    nv, generator = system.robot.nv, torch.Generator().manual_seed(2)
-    q0 = system.robot.neutral().expand(WINDOWS, -1)
+    model = request.param()
+    nv, generator = model.robot.nv, torch.Generator().manual_seed(2)
+    q0 = model.robot.neutral().expand(WINDOWS, -1)
     if nv == 3:
         q0 = torch.tensor([0.2, 0.7, 0.8]).double()
-    q0 = system.robot.integrate(q0, 0.3 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64))
+    q0 = model.robot.integrate(q0, 0.3 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64))
     v0 = 0.4 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64)
-    u = 3.0 * torch.randn(WINDOWS, STEPS, system.sizes[2], generator=generator, dtype=torch.float64)
+    u = 3.0 * torch.randn(WINDOWS, STEPS, model.sizes[2], generator=generator, dtype=torch.float64)
     rest = tuple(x[:, None].expand(WINDOWS, STEPS, -1) for x in (q0, v0))
-    return system, q0, v0, u, rest
+    return model, q0, v0, u, rest
 
 
-def levels(system: MechanicalSystem) -> torch.Tensor:
+def levels(model: Model) -> torch.Tensor:
     """Of friction; also of a base, as of air."""
-    return torch.tensor([0.8, 0.5, 0.3] * 3, dtype=torch.float64)[-system.robot.nv :]
+    return torch.tensor([0.8, 0.5, 0.3] * 3, dtype=torch.float64)[-model.robot.nv :]
 
 
 @pytest.mark.parametrize(("width", "passes"), [(0.4, 20), (0.01, 20), (0.01, 1)])
 def test_motions_are_those_of_the_integrator(given, width, passes, monkeypatch):
     monkeypatch.setattr(midpoint_sensitivities, "MOST_PASSES", passes)  # one: all are stepped through one by one
-    system, q0, v0, u, guess = given
-    of = accelerations(system, levels(system), width)
+    model, q0, v0, u, guess = given
+    of = accelerations(model, levels(model), width)
     found = window_motions(of, q0, v0, u, H, guess, derivatives=False)
     assert bool(found.found.all())
     q, v = q0, v0
@@ -70,15 +70,15 @@ def test_motions_are_those_of_the_integrator(given, width, passes, monkeypatch):
 
 
 def test_derivatives_are_those_of_finite_differences(given):
-    system, q0, v0, u, guess = given
-    small, nv, robot = 1e-6, system.robot.nv, system.robot
+    model, q0, v0, u, guess = given
+    small, nv, robot = 1e-6, model.robot.nv, model.robot
 
     def q_at(dq, dv, friction):
-        of = accelerations(system, levels(system) + friction, 0.1)
+        of = accelerations(model, levels(model) + friction, 0.1)
         start = robot.integrate(q0, torch.as_tensor(dq).expand(nv).double())
         return window_motions(of, start, v0 + dv, u, H, guess, derivatives=False).q
 
-    found = window_motions(accelerations(system, levels(system), 0.1), q0, v0, u, H, guess, derivatives=True)
+    found = window_motions(accelerations(model, levels(model), 0.1), q0, v0, u, H, guess, derivatives=True)
     for k in range(0, nv, 1 if nv == 3 else 3):
         e = small * torch.eye(nv, dtype=torch.float64)[k]
         for derivative, ends in (
@@ -91,7 +91,7 @@ def test_derivatives_are_those_of_finite_differences(given):
 
 
 def test_windows_without_an_end_are_reported(given):
-    system, q0, v0, u, guess = given
+    model, q0, v0, u, guess = given
 
     def away(q, v, u):  # v_m = v + h/2 (v_m^2 + 1) / h has no solution
         return 2.0 * (v.square() + v + 1.0) / H
@@ -100,7 +100,5 @@ def test_windows_without_an_end_are_reported(given):
         a, slope = rows_jacobian(lambda v: away(q, v, u), v)
         return Linear(a, torch.zeros_like(slope), slope)
 
-    found = window_motions(
-        Accelerations(away, linear, system.robot.space), q0, v0.abs(), u, H, guess, derivatives=False
-    )
+    found = window_motions(Accelerations(away, linear, model.robot.space), q0, v0.abs(), u, H, guess, derivatives=False)
     assert not bool(found.found.any())

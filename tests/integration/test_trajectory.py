@@ -48,17 +48,17 @@ def test_a_diverging_motion_is_nan_from_where_it_says_and_the_others_go_on(integ
 
 
 def test_a_motion_that_leaves_its_constraint_ends_alone():
-    system = free_system("sphere")
-    q0, v0 = start(system)
+    model = free_system("sphere")
+    q0, v0 = start(model)
 
     def thrown(q, v, u):
-        return torch.cat([torch.full_like(q[:1], 2e5), physics(system)(q, v, u)[1:]])
+        return torch.cat([torch.full_like(q[:1], 2e5), physics(model)(q, v, u)[1:]])
 
     def calm(q, v, u):
-        return physics(system)(q, v, u)
+        return physics(model)(q, v, u)
 
     force = torch.zeros(20, 2, 3, dtype=torch.float64)
-    method = Projected(ConstraintManifold(system))
+    method = Projected(ConstraintManifold(model))
     with pytest.warns(NumericalWarning, match="1 of 2 motions diverged, the first at step 1"):
         motion = integrate(method, thrown, q0, v0, force, 1 / 240)
     assert motion.diverged_at.tolist() == [1, -1]

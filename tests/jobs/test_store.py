@@ -128,7 +128,7 @@ def test_a_job_takes_the_place_of_an_outdated_one_when_it_is_complete(results):
 def test_only_one_at_a_time_where_the_system_has_no_fcntl(tmp_path):
     script = """
 import sys, warnings
-sys.modules["fcntl"] = None  # as on systems that are neither Unix nor Windows
+sys.modules["fcntl"] = None  # as on systems that are neither Unix nor WindowedRows
 warnings.simplefilter("ignore")
 from pathlib import Path
 from forcegp.errors import InvalidInput

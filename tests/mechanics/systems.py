@@ -5,7 +5,9 @@ from functools import cache
 import torch
 from tests.robots.robot_models import FRAMES, MODELS
 
-from forcegp.mechanics import Contact, Cylinder, ImplicitSurface, MechanicalSystem, Plane, Sphere
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.mechanics import Contact, Cylinder, ImplicitSurface, Plane, Sphere
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 POINT = (0.02, -0.03, 0.1)
@@ -46,8 +48,10 @@ INDEPENDENT = ["none", "one", "three"]
 REDUNDANT = ["same twice", "four corners"]
 
 
-def system(model: str = "iiwa", kind: str = "one", **options: object) -> MechanicalSystem:
-    return MechanicalSystem(robot(model), contacts(kind, FRAMES[model]), **options)
+def model_with(model: str = "iiwa", kind: str = "one", **options: object) -> Model:
+    """Without friction that the URDF may state."""
+    forces = (Actuation(), RigidBodies())
+    return Model(robot(model), contacts(kind, FRAMES[model]), **{"forces": forces, **options})
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -60,7 +64,7 @@ def states(nv: int, *batch: int, seed: int = 0) -> tuple[torch.Tensor, torch.Ten
     return 0.8 * q, 0.7 * v, 5.0 * u
 
 
-def regular_states(built: MechanicalSystem, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def regular_states(built: Model, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Of many random states those farthest from postures where the contacts lose rank, and any method its digits."""
     candidates = states(built.robot.nv, 20 * count)
     A = built.dynamics(*candidates).A

@@ -10,7 +10,8 @@ from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import Baumgarte, Contact, MechanicalSystem, Plane, State
+from forcegp.mechanics import Baumgarte, Contact, Plane, State
+from forcegp.model import Model
 
 SURFACES = list(surfaces())
 FLOOR = Plane((0.0, 0.0, 1.0), 0.0)
@@ -80,10 +81,10 @@ def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, z
     """c'' + 2 zeta omega c' + omega^2 c = 0, with c and its derivatives from finite differences."""
     touching, built = contact("chain", surface), robot("chain")
     baumgarte = Baumgarte(omega, zeta)
-    system = MechanicalSystem(built, (touching,), baumgarte=baumgarte)
+    model = Model(built, (touching,), baumgarte=baumgarte)
     q, v, u = states(built.nv, 5, seed=2)
     u = 0.01 * u
-    a = system.dynamics(q, v, u).acceleration(torch.zeros_like(u))
+    a = model.dynamics(q, v, u).acceleration(torch.zeros_like(u))
     step = 1e-3 / max(1.0, float(a.abs().max()) ** 0.5)
     rate, second = along(lambda t: touching.distance(built.kinematics(q + v * t + 0.5 * a * t**2)), step)
     distance = touching.distance(built.kinematics(q))
@@ -107,11 +108,11 @@ def test_baumgarte_brings_a_drifted_tool_back_to_the_surface():
     frame = FRAMES["chain"]
     height = float(built.frame_pose(q, frame)[2, 3]) - 0.02
     touching = Contact(frame, (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), height))
-    system = MechanicalSystem(built, (touching,), baumgarte=Baumgarte(20.0, 1.0))
+    model = Model(built, (touching,), baumgarte=Baumgarte(20.0, 1.0))
     v, u = torch.zeros_like(q), torch.zeros_like(q)
     dt, distances = 2e-3, []
     for _ in range(100):
-        v = v + dt * system.dynamics(q, v, -0.5 * v).acceleration(u)
+        v = v + dt * model.dynamics(q, v, -0.5 * v).acceleration(u)
         q = q + dt * v
         distances.append(float(touching.distance(built.kinematics(q))))
     exact = [0.02 * (1.0 + 20.0 * t) * math.exp(-20.0 * t) for t in dt * np.arange(1, 101)]

@@ -9,17 +9,19 @@ from tests.mechanics.systems import (
     REDUNDANT,
     assert_close,
     assert_derivatives,
+    model_with,
     normal,
     regular_states,
     robot,
     solve_kkt,
     states,
-    system,
 )
 from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.errors import NumericalError
-from forcegp.mechanics import Actuation, Baumgarte, Contact, MechanicalSystem, Plane, Sphere
+from forcegp.evidence import standard_parameters
+from forcegp.mechanics import Baumgarte, Contact, Plane, Sphere
+from forcegp.model import Model
 
 TOLERANCE = 1e-10
 ALL = [*INDEPENDENT, *REDUNDANT]
@@ -28,7 +30,7 @@ LINKS = {"iiwa": ("lbr_iiwa_link_7", "lbr_iiwa_link_4"), "tree": ("right_hand", 
 
 @cache
 def regular_dynamics(model: str, kind: str):
-    built = system(model, kind, baumgarte=Baumgarte(10.0, 1.0))
+    built = model_with(model, kind, baumgarte=Baumgarte(10.0, 1.0))
     return built.dynamics(*regular_states(built, 20)), normal(20, built.robot.nv, seed=9)
 
 
@@ -90,7 +92,7 @@ class TestAgainstDenseEquations:
     def test_contact_forces_do_the_work_of_the_multiplier(self, solved, model):
         """sum_k J_k^T F_k = A^T lambda, with every F_k along the normal of its surface."""
         dynamics, Q_U = solved
-        built = system(model, "none")
+        built = model_with(model, "none")
         forces = dynamics.contact_force_map()(Q_U).unflatten(-1, (-1, 3)) if dynamics.b.shape[-1] else None
         multiplier = dynamics.multiplier(Q_U)
         total = torch.zeros_like(Q_U)
@@ -107,7 +109,7 @@ class TestAgainstDenseEquations:
     @staticmethod
     def point_of(dynamics, index, model):
         kinds = {1: "one", 2: "same twice", 3: "three", 4: "four corners"}
-        return system(model, kinds[dynamics.b.shape[-1]]).contacts[index].point
+        return model_with(model, kinds[dynamics.b.shape[-1]]).contacts[index].point
 
     def test_least_constraint(self, solved):
         """Among all accelerations with A a = b, a is nearest to the free one in the metric of M (Gauss 1829)."""
@@ -125,7 +127,7 @@ class TestAgainstDenseEquations:
 
 
 def test_redundant_contacts_share_the_force_equally():
-    once, twice = system("iiwa", "one"), system("iiwa", "one")
+    once, twice = model_with("iiwa", "one"), model_with("iiwa", "one")
     twice = twice.with_contacts(once.contacts * 2)
     q_v_u, Q_U = states(7, 5), normal(5, 7)
     single, shared = once.dynamics(*q_v_u), twice.dynamics(*q_v_u)
@@ -134,7 +136,7 @@ def test_redundant_contacts_share_the_force_equally():
 
 
 def test_without_contacts_it_is_forward_dynamics():
-    built = system("tree", "none")
+    built = model_with("tree", "none")
     q, v, u = states(built.robot.nv, 6)
     Q_U = normal(6, built.robot.nv)
     dynamics = built.dynamics(q, v, u)
@@ -147,7 +149,7 @@ def test_without_contacts_it_is_forward_dynamics():
 
 def test_as_many_constraints_as_joints_leave_nothing_to_move():
     """H = 0: the acceleration is what the constraints say, whatever the forces."""
-    built = system("chain", "three")
+    built = model_with("chain", "three")
     frame = FRAMES["chain"]
     fixed = tuple(
         Contact(frame, point, Plane(axis, 0.1))
@@ -165,7 +167,7 @@ def test_as_many_constraints_as_joints_leave_nothing_to_move():
 @pytest.mark.parametrize("kind", ["none", "one", "four corners"])
 @pytest.mark.parametrize("batch", [(), (1,), (0,), (3,), (2, 3)], ids=str)
 def test_batch_dimensions_are_arbitrary(batch, kind):
-    built = system("iiwa", kind, baumgarte=Baumgarte(3.0))
+    built = model_with("iiwa", kind, baumgarte=Baumgarte(3.0))
     q, v, u = states(7, *batch)
     Q_U, m = normal(*batch, 7, seed=4), len(built.contacts)
     dynamics = built.dynamics(q, v, u)
@@ -184,7 +186,7 @@ def test_batch_dimensions_are_arbitrary(batch, kind):
 
 
 def test_states_broadcast():
-    built = system("iiwa", "one")
+    built = model_with("iiwa", "one")
     q, v, u = states(7, 4)
     for given in ((q[0], v, u), (q, v[:1], u), (q, v, u[2]), (q[:, None], v, u)):
         dynamics = built.dynamics(*given)
@@ -193,48 +195,36 @@ def test_states_broadcast():
     assert many.shape == (5, 7)
 
 
-@pytest.mark.parametrize("known", ["default", "actuation only"])
-@pytest.mark.parametrize("kind", ["none", "three"])
-def test_inertial_parameters_may_have_batch_dimensions_of_their_own(kind, known):
-    options = {} if known == "default" else {"known_forces": (Actuation(),)}
-    built = system("iiwa", kind, **options)
-    link = LINKS["iiwa"][0]
-    parameters = built.robot.inertial_parameters(link)[link] + 0.1 * normal(5, 10)
-    q, v, u = states(7)
-    Q_U = normal(7, seed=5)
-    dynamics = built.dynamics(q, v, u, {link: parameters})
-    expected = [built.dynamics(q, v, u, {link: row}).acceleration(Q_U) for row in parameters]
-    assert_close(dynamics.acceleration(Q_U.expand(5, 7)), torch.stack(expected), TOLERANCE)
-    assert dynamics.H.shape == (5, 7, 7)
-    assert dynamics.Q_K.shape == (5, 7)
-
-
 # ---------------------------------------------------------------- derivatives
+
+
+def bodies_of(built: Model) -> torch.Tensor:
+    """Standard parameters (bodies, 10) of the robot."""
+    return standard_parameters(built.robot).reshape(-1, 10)
 
 
 @pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("model", ["tree", "chain"])
 def test_derivatives(model, kind):
-    """With respect to q, v, u and the inertial parameters of two links, also where contacts are redundant.
+    """With respect to q, v, u and the parameters of all bodies, also where contacts are redundant.
 
     Rotor inertia makes the light wrists heavier, so that finite differences keep their digits.
     """
-    built = system(model, kind, baumgarte=Baumgarte(2.0, 0.7))
+    built = model_with(model, kind, baumgarte=Baumgarte(2.0, 0.7))
     built = built.with_robot(built.robot.with_armature([0.5] * built.robot.nv))
-    parameters = built.robot.inertial_parameters(*LINKS[model])
     Q_U = normal(built.robot.nv)
 
-    def function(q, v, u, *inertials):
-        dynamics = built.dynamics(q, v, u, dict(zip(parameters, inertials, strict=True)))
+    def function(q, v, u, bodies):
+        dynamics = built.dynamics(q, v, u, bodies)
         parts = dynamics.acceleration(Q_U), dynamics.multiplier(Q_U), dynamics.Q_b, dynamics.H.sum(-1)
         return torch.cat([part.flatten() for part in parts])
 
-    assert_derivatives(function, *(x[0] for x in regular_states(built, 1)), *parameters.values())
+    assert_derivatives(function, *(x[0] for x in regular_states(built, 1)), bodies_of(built))
 
 
 @pytest.mark.parametrize("kind", ["none", "one", "four corners"])
 def test_vmap_and_jacrev(kind):
-    built = system("chain", kind, baumgarte=Baumgarte(2.0))
+    built = model_with("chain", kind, baumgarte=Baumgarte(2.0))
     nv = built.robot.nv
     q, v, u = states(nv, 3)
     Q_U = normal(3, nv)
@@ -273,17 +263,16 @@ def derivative_rounding(M, A) -> float:
 
 def test_inertial_parameters_do_not_move_the_contact():
     """A centre of mass that moved the contact point would tell the answer through the constraint (A and b)."""
-    built = system("iiwa", "three", baumgarte=Baumgarte(10.0))
-    link = FRAMES["iiwa"]
+    built = model_with("iiwa", "three", baumgarte=Baumgarte(10.0))
     q, v, u = states(7, 3)
-    parameters = built.robot.inertial_parameters(link)[link].requires_grad_()
-    dynamics = built.dynamics(q, v, u, {link: parameters})
+    bodies = bodies_of(built).requires_grad_()
+    dynamics = built.dynamics(q, v, u, bodies)
     nominal = built.dynamics(q, v, u)
     assert torch.equal(dynamics.A, nominal.A)
     assert torch.equal(dynamics.b, nominal.b)
     assert not dynamics.A.requires_grad
     assert not dynamics.b.requires_grad
-    moved = built.dynamics(q, v, u, {link: parameters.detach() + torch.tensor([0.0] * 7 + [0.3] * 3).double()})
+    moved = built.dynamics(q, v, u, 1.3 * bodies.detach())
     assert torch.equal(moved.A, nominal.A)
     assert torch.equal(moved.b, nominal.b)
     assert not torch.allclose(moved.H, nominal.H)
@@ -296,7 +285,7 @@ def test_states_that_are_not_finite():
     q, v, u = states(7, 3)
     q[1, 2] = torch.nan
     with pytest.raises(NumericalError, match="mass matrix is not positive definite"):
-        system("iiwa", "one").dynamics(q, v, u)
+        model_with("iiwa", "one").dynamics(q, v, u)
 
 
 def test_a_constraint_that_is_not_finite():
@@ -304,6 +293,6 @@ def test_a_constraint_that_is_not_finite():
     built = robot("iiwa")
     q, v, u = states(7)
     center = tuple(built.frame_pose(q, FRAMES["iiwa"])[:3, 3].tolist())
-    held = MechanicalSystem(built, (Contact(FRAMES["iiwa"], (0.0, 0.0, 0.0), Sphere(center, 0.1)),))
+    held = Model(built, (Contact(FRAMES["iiwa"], (0.0, 0.0, 0.0), Sphere(center, 0.1)),))
     with pytest.raises(NumericalError, match="constraint matrix A is not finite"):
         held.dynamics(q, v, u)

@@ -7,16 +7,9 @@ import torch
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import ContactError, InvalidInput
-from forcegp.mechanics import (
-    Actuation,
-    Contact,
-    MechanicalSystem,
-    Plane,
-    RigidBodyBias,
-    Sphere,
-    fixed_frame,
-    fixed_point,
-)
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.mechanics import Contact, Plane, Sphere, fixed_frame, fixed_point
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 POINT = (0.05, -0.02, 0.1)
@@ -30,7 +23,7 @@ def robot():
 @pytest.fixture(scope="module")
 def walker(robot):
     feet = (*fixed_point("a_foot", POINT, "a_stands"), *fixed_point("b_foot", (0.0, 0.0, 0.1), "b_stands"))
-    return MechanicalSystem(robot, feet)
+    return Model(robot, feet)
 
 
 def states(robot, inputs, rows=6):
@@ -48,10 +41,10 @@ def test_inputs_are_actuators_then_switches(walker):
 def test_a_point_in_a_plane_is_held_in_two_directions(robot):
     body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
     flat = Robot.from_urdf_text(f'<robot name="r"><link name="base">{body}</link></robot>', base="planar")
-    system = MechanicalSystem(flat, fixed_point("base", (0.1, 0.0, 0.0)))
+    model = Model(flat, fixed_point("base", (0.1, 0.0, 0.0)))
     q, v, u = states(flat, 0)
-    system.check_states(q, v, u)
-    along = MechanicalSystem(flat, (fixed_point("base")[2],))
+    model.check_states(q, v, u)
+    along = Model(flat, (fixed_point("base")[2],))
     with pytest.raises(ContactError, match="no direction at row 0"):
         along.check_states(q, v, u)
 
@@ -84,21 +77,21 @@ def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walk
 
 
 def test_a_frame_that_is_held_neither_moves_nor_turns(robot):
-    system = MechanicalSystem(robot, fixed_frame("a_foot"))
+    model = Model(robot, fixed_frame("a_foot"))
     q, v, u = states(robot, 3)
     v = v - v  # at rest, so that the frame has to stay without acceleration of any kind
-    a = system.dynamics(q, v, u).acceleration(torch.zeros_like(v))
+    a = model.dynamics(q, v, u).acceleration(torch.zeros_like(v))
     moved = (robot.frame_jacobian(q, "a_foot") @ a[..., None])[..., 0]
     assert moved.abs().max() < 1e-9 * a.abs().max()
 
 
 def test_switches_and_matrices_survive_files(walker, robot):
-    again = MechanicalSystem.from_json(walker.to_json())
+    again = Model.from_json(walker.to_json())
     assert (again.inputs, again.robot.base, again.contacts) == (walker.inputs, "floating", walker.contacts)
     matrix = np.zeros((robot.nv, 2))
     matrix[6:8, 0], matrix[8, 1] = (0.5, -0.5), 2.0
-    coupled = MechanicalSystem(robot, known_forces=(Actuation(matrix, ("differential", "spindle")), RigidBodyBias()))
-    again = MechanicalSystem.from_json(coupled.to_json())
+    coupled = Model(robot, forces=(Actuation(matrix, ("differential", "spindle")), RigidBodies()))
+    again = Model.from_json(coupled.to_json())
     q, v, u = states(robot, 2)
     assert again.inputs == ("differential", "spindle")
     tau = torch.cat([torch.zeros(len(u), 6), 0.5 * u[:, :1], -0.5 * u[:, :1], 2.0 * u[:, 1:]], -1).double()
@@ -108,32 +101,32 @@ def test_switches_and_matrices_survive_files(walker, robot):
 
 def test_matrices_that_do_not_fit_are_refused(robot):
     with pytest.raises(InvalidInput, match=r"9\s*rows, one per degree of freedom"):
-        MechanicalSystem(robot, known_forces=(Actuation(np.eye(3)),))
+        Model(robot, forces=(Actuation(np.eye(3)),))
     with pytest.raises(InvalidInput, match="give 2 different ones"):
-        MechanicalSystem(robot, known_forces=(Actuation(np.eye(9)[:, :2], ("one", "one")),))
+        Model(robot, forces=(Actuation(np.eye(9)[:, :2], ("one", "one")),))
     with pytest.raises(InvalidInput, match="lists Actuation twice"):
-        MechanicalSystem(robot, known_forces=(Actuation(), Actuation()))
+        Model(robot, forces=(Actuation(), Actuation()))
 
 
 def test_noise_of_velocities_is_no_contradiction_of_a_flat_foot(robot):
     """Three points of a link that turns by noise have centripetal accelerations that no motion of the link has."""
-    system = MechanicalSystem(robot, fixed_frame("a_foot"))
+    model = Model(robot, fixed_frame("a_foot"))
     q, v, u = states(robot, 3)
     noisy = 0.1 * v
-    dynamics = system.dynamics(q, noisy, u)
+    dynamics = model.dynamics(q, noisy, u)
     a = dynamics.acceleration_map().offset
     assert float(((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs().max()) > 1e-3
-    system.check_states(q, noisy, u)
+    model.check_states(q, noisy, u)
 
 
 def test_two_feet_that_hold_one_link_are_legal_and_a_sphere_through_a_held_point_is_not(robot):
     feet = (*fixed_point("a_foot", POINT), *fixed_point("a_foot", POINT))
     q, v, u = states(robot, 3)
-    MechanicalSystem(robot, feet).check_states(q, 0.1 * v, u)  # redundant
+    Model(robot, feet).check_states(q, 0.1 * v, u)  # redundant
     sphere = Contact("a_foot", POINT, Sphere((0.0, 0.0, -9.0), 3.0))
     plane = Contact("a_foot", POINT, Plane((0.0, 0.0, 1.0), 0.0))
     q[:, :3] = 0.0
     kinematics = robot.kinematics(q)
     q[:, :3] = torch.tensor([0.0, 0.0, 1.0]) - sphere.position(kinematics)  # above the centre: both normals are up
     with pytest.raises(ContactError, match=r"contradict each other.*'a_foot'"):
-        MechanicalSystem(robot, (sphere, plane)).check_states(q, v, u)
+        Model(robot, (sphere, plane)).check_states(q, v, u)

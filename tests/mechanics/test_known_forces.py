@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import FrozenInstanceError, dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,26 +13,25 @@ from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS
 
 from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint
-from forcegp.mechanics import (
+from forcegp.forces import (
     Actuation,
-    Armature,
-    ConstantJointForce,
-    CoulombJointFriction,
-    DirectionalJointFriction,
-    KnownForce,
-    LoadJointFriction,
-    MechanicalSystem,
-    ObservedWind,
-    ObservedWrench,
-    RigidBodyBias,
-    RotorInertia,
-    State,
-    StribeckJointFriction,
-    Thrusters,
-    ViscousJointFriction,
+    Coulomb,
+    CoupledRotors,
+    DirectionalFriction,
+    Law,
+    LoadFriction,
+    Offset,
+    RigidBodies,
+    Rotor,
+    Spring,
+    Stribeck,
+    Viscous,
 )
-from forcegp.mechanics.known_forces import KNOWN_FORCES, known_force_to_dict
-from forcegp.mechanics.surfaces import object_from_dict
+from forcegp.forces.force import JointLaw
+from forcegp.forces.parameters import Coefficient
+from forcegp.forces.registry import FORCES, force_class, force_from_dict, force_to_dict
+from forcegp.mechanics import State
+from forcegp.model import Model
 
 JOINTS = ("slide", "spin", "skew", "tilt")
 NUMBERS = [0.5, 1.5, 0.0, 2.0]
@@ -41,24 +41,25 @@ TRANSMISSION = ((6.0, 0.0, 0.0, 0.0), (-1.0, 6.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0
 
 FORMULAS = {
     "actuation": (lambda: Actuation(), lambda q, v, u: u),
-    "bias": (lambda: RigidBodyBias(), lambda q, v, u: -pinocchio_bias(q, v)),
-    "viscous": (lambda: ViscousJointFriction(NUMBERS), lambda q, v, u: -TENSOR * v),
+    "bias": (lambda: RigidBodies(), lambda q, v, u: -pinocchio_bias(q, v)),
+    "viscous": (lambda: Viscous(NUMBERS), lambda q, v, u: -TENSOR * v),
     "Coulomb": (
-        lambda: CoulombJointFriction(NUMBERS, 0.02),
+        lambda: Coulomb(NUMBERS, 0.02),
         lambda q, v, u: -TENSOR * (v / 0.02).tanh(),
     ),
     "Stribeck": (
-        lambda: StribeckJointFriction(NUMBERS, 3.0, [0.1, 0.2, 0.3, 0.4], 0.02),
-        lambda q, v, u: -(TENSOR + (3.0 - TENSOR) * (-((v / TENTHS) ** 2)).exp()) * (v / 0.02).tanh(),
+        lambda: Stribeck(NUMBERS, 3.0, [0.1, 0.2, 0.3, 0.4], 0.02),
+        lambda q, v, u: -(TENSOR + 3.0 * (-((v / TENTHS) ** 2)).exp()) * (v / 0.02).tanh(),
     ),
     "load": (
-        lambda: LoadJointFriction(NUMBERS, 0.7, 0.02),
-        lambda q, v, u: -(0.7 + TENSOR * u.abs()) * (v / 0.02).tanh(),
+        lambda: LoadFriction(0.7, [0.5, 0.8, 0.0, 0.2], 0.02),
+        lambda q, v, u: -(0.7 + torch.tensor([0.5, 0.8, 0.0, 0.2], dtype=torch.float64) * u.abs()) * (v / 0.02).tanh(),
     ),
-    "constant": (lambda: ConstantJointForce(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
-    "direction": (lambda: DirectionalJointFriction(-TENSOR), lambda q, v, u: TENSOR * v.abs()),
-    "armature": (lambda: Armature(NUMBERS), lambda q, v, u: torch.zeros_like(u)),
-    "rotors": (lambda: RotorInertia(NUMBERS, TRANSMISSION), lambda q, v, u: torch.zeros_like(u)),
+    "spring": (lambda: Spring(NUMBERS, 0.3), lambda q, v, u: -TENSOR * (q - 0.3)),
+    "constant": (lambda: Offset(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
+    "direction": (lambda: DirectionalFriction(-TENSOR), lambda q, v, u: TENSOR * v.abs()),
+    "armature": (lambda: Rotor(NUMBERS), lambda q, v, u: torch.zeros_like(u)),
+    "rotors": (lambda: CoupledRotors(NUMBERS, TRANSMISSION), lambda q, v, u: torch.zeros_like(u)),
 }
 
 
@@ -71,8 +72,8 @@ def pinocchio_bias(q, v):
     return torch.as_tensor(np.stack([oracle.bias_forces(*row) for row in zip(q.numpy(), v.numpy(), strict=True)]))
 
 
-def known(*forces: KnownForce, **options) -> MechanicalSystem:
-    return MechanicalSystem(chain(), known_forces=forces, **options)
+def known(*forces: Law, **options) -> Model:
+    return Model(chain(), forces=forces, **options)
 
 
 @pytest.mark.parametrize("make_and_formula", FORMULAS.values(), ids=FORMULAS)
@@ -86,7 +87,7 @@ def test_each_against_its_formula(make_and_formula):
 
 def test_none_can_be_changed():
     numbers = [(force, field.name) for force in (make() for make, _ in FORMULAS.values()) for field in fields(force)]
-    assert len({type(force) for force, _ in numbers}) == len(FORMULAS) - 1  # the bias has no numbers
+    assert len({type(force) for force, _ in numbers}) == len(FORMULAS)
     for force, name in numbers:
         with pytest.raises(FrozenInstanceError):
             setattr(force, name, 0.0)
@@ -98,8 +99,8 @@ def test_the_sum_is_what_is_listed_and_nothing_else():
     together = known(*parts).dynamics(q, v, u).Q_K
     assert_close(together, sum(formula(q, v, u) for _, formula in FORMULAS.values()), 1e-10)
     assert not known().dynamics(q, v, u).Q_K.any()
-    default = MechanicalSystem(chain()).dynamics(q, v, u).Q_K
-    assert_close(default, u - pinocchio_bias(q, v), 1e-10)  # damping of the URDF enters only where it is listed
+    listed = known(Actuation(), RigidBodies()).dynamics(q, v, u).Q_K
+    assert_close(listed, u - pinocchio_bias(q, v), 1e-10)  # without the damping of the URDF
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -109,27 +110,27 @@ def test_the_numbers_of_the_urdf(model):
     damping = torch.tensor([joint.damping for joint in built.joints], dtype=torch.float64)
     friction = torch.tensor([joint.friction for joint in built.joints], dtype=torch.float64)
     assert damping.any() or model == "iiwa"
-    system = MechanicalSystem(
-        built, known_forces=(ViscousJointFriction.from_robot(built), CoulombJointFriction.from_robot(built, 0.05))
-    )
-    assert_close(system.dynamics(q, v, u).Q_K, -damping * v - friction * (v / 0.05).tanh(), 1e-14)
+    single = torch.tensor([name in built.single_joint_names for name in built.joint_names])
+    expected = torch.where(single, -damping * v - friction * (v / 0.01).tanh(), 0.0)
+    laws = tuple(law for law in Model(built).forces if isinstance(law, Viscous | Coulomb))
+    assert_close(Model(built, forces=laws).dynamics(q, v, u).Q_K, expected, 1e-14)
 
 
 def test_friction_never_drives():
     q, v, u = states(4, 50)
-    for force in (ViscousJointFriction(NUMBERS), CoulombJointFriction(NUMBERS)):
+    for force in (Viscous(NUMBERS), Coulomb(NUMBERS)):
         assert float((known(force).dynamics(q, v, u).Q_K * v).max()) <= 0.0
 
 
 def test_friction_by_load_alone_is_none_without_load():
     q, v, u = states(4, 5)
-    friction = known(LoadJointFriction(NUMBERS))  # c = 0 and w = 0.01, if nothing else is said
+    friction = known(LoadFriction(0.0, NUMBERS))  # w = 0.01, if nothing else is said
     assert_close(friction.dynamics(q, v, u).Q_K, -TENSOR * u.abs() * (v / 0.01).tanh(), 1e-12)
 
 
 def test_dry_friction_saturates_at_its_coefficient():
     q, v, u = states(4, 50)
-    friction = known(CoulombJointFriction(NUMBERS, 1e-9)).dynamics(q, v, u).Q_K
+    friction = known(Coulomb(NUMBERS, 1e-9)).dynamics(q, v, u).Q_K
     assert_close(friction, -TENSOR * v.sign(), 1e-12)
 
 
@@ -138,10 +139,8 @@ def test_dry_friction_saturates_at_its_coefficient():
 
 def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
     q, v, u = states(4, 5)
-    geared = MechanicalSystem(
-        chain().with_armature([0.1, 0.2, 0.3, 0.4]), known_forces=(Actuation(), RigidBodyBias(), Armature(NUMBERS))
-    )
-    plain = MechanicalSystem(chain()).dynamics(q, v, u)
+    geared = Model(chain().with_armature([0.1, 0.2, 0.3, 0.4]), forces=(Actuation(), RigidBodies(), Rotor(NUMBERS)))
+    plain = known(Actuation(), RigidBodies()).dynamics(q, v, u)
     added = torch.diag(TENSOR + torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64))
     dynamics = geared.dynamics(q, v, u)
     assert_close(dynamics.M, plain.M + added, 1e-13)
@@ -152,29 +151,29 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
 def test_armature_as_a_known_force_equals_armature_of_the_robot():
     q, v, u = states(4, 5)
     nothing = torch.zeros_like(u)
-    one = MechanicalSystem(chain().with_armature(NUMBERS)).dynamics(q, v, u)
-    other = known(Actuation(), RigidBodyBias(), Armature(NUMBERS)).dynamics(q, v, u)
+    one = Model(chain().with_armature(NUMBERS), forces=(Actuation(), RigidBodies())).dynamics(q, v, u)
+    other = known(Actuation(), RigidBodies(), Rotor(NUMBERS)).dynamics(q, v, u)
     assert_close(one.acceleration(nothing), other.acceleration(nothing), 1e-10)
 
 
 def test_rotors_that_a_moving_link_carries():
     """The kinetic energy of two rotors: the first sits in the base, the second turns with the first link, too."""
     ratio, rotor = 6.0, [1e-3, 2e-3, 0.0, 0.0]
-    M = RotorInertia(rotor, TRANSMISSION).bound_to(chain()).added_inertia()
+    M = CoupledRotors(rotor, TRANSMISSION).bound_to(chain()).added_inertia(chain())
     v = normal(4)
     energy = 0.5 * rotor[0] * (ratio * v[0]) ** 2 + 0.5 * rotor[1] * (ratio * v[1] - v[0]) ** 2
     assert_close(0.5 * v @ M @ v, energy, 1e-14)
     q, v, u = states(4, 5)
-    added = known(Actuation(), RigidBodyBias(), RotorInertia(rotor, TRANSMISSION)).dynamics(q, v, u).M
-    assert_close(added, MechanicalSystem(chain()).dynamics(q, v, u).M + M, 1e-13)
-    one_each = RotorInertia(NUMBERS).bound_to(chain()).added_inertia()
-    assert_close(one_each, Armature(NUMBERS).bound_to(chain()).added_inertia(), 1e-14)
+    added = known(Actuation(), RigidBodies(), CoupledRotors(rotor, TRANSMISSION)).dynamics(q, v, u).M
+    assert_close(added, Model(chain()).dynamics(q, v, u).M + M, 1e-13)
+    one_each = CoupledRotors(NUMBERS).bound_to(chain()).added_inertia(chain())
+    assert_close(one_each, Rotor(NUMBERS).bound_to(chain()).added_inertia(chain()), 1e-14)
 
 
-def test_stribeck_friction_falls_from_static_to_coulomb():
+def test_dry_friction_falls_from_breakaway_to_its_level():
     slow, fast = torch.full((1, 4), 1e-4, dtype=torch.float64), torch.full((1, 4), 5.0, dtype=torch.float64)
     nothing = torch.zeros_like(slow)
-    friction = known(StribeckJointFriction(1.0, 3.0, 0.1, 1e-6))
+    friction = known(Stribeck(1.0, 2.0, 0.1, 1e-6))
     assert_close(friction.dynamics(nothing, slow, nothing).Q_K, torch.full((1, 4), -3.0).double(), 1e-4)
     assert_close(friction.dynamics(nothing, fast, nothing).Q_K, torch.full((1, 4), -1.0).double(), 1e-12)
 
@@ -197,74 +196,54 @@ def test_stribeck_friction_falls_from_static_to_coulomb():
 )
 def test_numbers_may_come_in_any_form(given, expected):
     v = normal(3, 4)
-    for force in (ViscousJointFriction(given), CoulombJointFriction(given), Armature(given)):
-        (name,) = (name for name in force.per_joint if name != "velocity_scale")
-        bound = getattr(force.bound_to(chain()), name)
+    for force in (Viscous(given), Coulomb(given), Rotor(given)):
+        name = next(iter(force.coefficients))
+        bound = force.bound_to(chain()).values[name]
         assert bound.dtype == torch.float64
         assert bound.tolist() == expected
         assert getattr(force, name) is given  # binding makes another one
-    system = known(ViscousJointFriction(given))
-    assert_close(system.dynamics(v, v, v).Q_K, -torch.tensor(expected, dtype=torch.float64) * v, 1e-14)
+    model = known(Viscous(given))
+    assert_close(model.dynamics(v, v, v).Q_K, -torch.tensor(expected, dtype=torch.float64) * v, 1e-14)
 
 
 def test_a_coefficient_may_be_learned():
     damping = TENSOR.clone().requires_grad_()
     q, v, u = states(4, 3)
-    known(ViscousJointFriction(damping)).dynamics(q, v, u).Q_K.sum().backward()
+    known(Viscous(damping)).dynamics(q, v, u).Q_K.sum().backward()
     assert_close(damping.grad, -v.sum(0), 1e-14)
-    assert known(ViscousJointFriction(damping)).to_json() == known(ViscousJointFriction(NUMBERS)).to_json()
+    assert known(Viscous(damping)).to_json() == known(Viscous(NUMBERS)).to_json()
 
 
 @pytest.mark.usefixtures("unchecked")  # forces check their numbers where they meet a robot
 @pytest.mark.parametrize(
     ("kind", "arguments", "error", "message"),
     [
-        (ViscousJointFriction, ([1.0, 2.0],), InvalidInput, r"has \(2,\) values; chain has 4 joints: slide, spin"),
-        (ViscousJointFriction, ([[1.0] * 4],), InvalidInput, r"has \(1, 4\) values"),
-        (ViscousJointFriction, ([1.0, -2.0, 0.0, 0.0],), InvalidInput, "every joint needs a finite number >= 0"),
-        (ViscousJointFriction, (math.nan,), InvalidInput, "every joint needs a finite number"),
-        (ViscousJointFriction, (math.inf,), InvalidInput, "every joint needs a finite number"),
-        (ConstantJointForce, (math.nan,), InvalidInput, "every joint needs a finite number"),
-        (StribeckJointFriction, (1.0, 2.0, 0.0), InvalidInput, "stribeck_velocity is .* must be positive"),
-        (StribeckJointFriction, (1.0, -2.0, 1.0), InvalidInput, "StribeckJointFriction static"),
-        (RotorInertia, (-1.0,), InvalidInput, "RotorInertia inertia"),
-        (RotorInertia, (1.0, [[1.0, 0.0]]), InvalidInput, r"has shape \(1, 2\); chain needs a finite matrix \(4, 4\)"),
-        (RotorInertia, (1.0, "gears"), InvalidInput, "RotorInertia transmission is 'gears'"),
-        (ViscousJointFriction, ({"elbow": 1.0},), UnknownJoint, "no joint 'elbow' in chain"),
-        (ViscousJointFriction, ({"tlit": 1.0},), UnknownJoint, "did you mean 'tilt'"),
-        (ViscousJointFriction, ({"tilt": None},), InvalidInput, "give a number, one per joint, or a mapping"),
-        (ViscousJointFriction, ("strong",), InvalidInput, "ViscousJointFriction coefficients is 'strong'"),
-        (ViscousJointFriction, (None,), InvalidInput, "coefficients is None"),
+        (Viscous, ([1.0, 2.0],), InvalidInput, r"has \(2,\) values; chain has 4 joints: slide, spin"),
+        (Viscous, ([[1.0] * 4],), InvalidInput, r"has \(1, 4\) values"),
+        (Viscous, ([1.0, -2.0, 0.0, 0.0],), InvalidInput, "every joint needs a finite number >= 0"),
+        (Viscous, (math.nan,), InvalidInput, "every joint needs a finite number"),
+        (Viscous, (math.inf,), InvalidInput, "every joint needs a finite number"),
+        (Offset, (math.nan,), InvalidInput, "every joint needs a finite number"),
+        (Stribeck, (1.0, 2.0, 0.0), InvalidInput, "stribeck_velocity is .* a finite number > 0"),
+        (Stribeck, (1.0, -2.0, 1.0), InvalidInput, "Stribeck breakaway"),
+        (CoupledRotors, (-1.0,), InvalidInput, "CoupledRotors inertia"),
+        (CoupledRotors, (1.0, [[1.0, 0.0]]), InvalidInput, r"has shape \(1, 2\); chain needs a finite matrix \(4, 4\)"),
+        (CoupledRotors, (1.0, "gears"), InvalidInput, "CoupledRotors transmission is 'gears'"),
+        (Viscous, ({"elbow": 1.0},), UnknownJoint, "no joint 'elbow' in chain"),
+        (Viscous, ({"tlit": 1.0},), UnknownJoint, "did you mean 'tilt'"),
+        (Viscous, ({"tilt": None},), InvalidInput, "give a number, one per joint, or a mapping"),
+        (Viscous, ("strong",), InvalidInput, "Viscous damping is 'strong'"),
+        (Coulomb, (1.0, 0.0), InvalidInput, "velocity_scale is .* every joint needs a finite number > 0"),
         (
-            CoulombJointFriction,
-            (
-                1.0,
-                0.0,
-            ),
+            Coulomb,
+            (1.0, [1.0, 1.0, 0.0, 1.0]),
             InvalidInput,
-            "velocity_scale is .* it must be positive for every joint",
+            "velocity_scale is .* every joint needs a finite number > 0",
         ),
-        (
-            CoulombJointFriction,
-            (
-                1.0,
-                [1.0, 1.0, 0.0, 1.0],
-            ),
-            InvalidInput,
-            "velocity_scale is .* must be positive",
-        ),
-        (
-            CoulombJointFriction,
-            (
-                1.0,
-                {"tilt": 0.1},
-            ),
-            InvalidInput,
-            "velocity_scale is .* must be positive",
-        ),
-        (CoulombJointFriction, (-1.0,), InvalidInput, "CoulombJointFriction coefficients"),
-        (Armature, (-1e-3,), InvalidInput, "Armature inertia"),
-        (Armature, ({"elbow": 1.0},), UnknownJoint, "elbow"),
+        (Coulomb, (1.0, {"tilt": 0.1}), InvalidInput, "velocity_scale is .* every joint needs a finite number > 0"),
+        (Coulomb, (-1.0,), InvalidInput, "Coulomb level"),
+        (Rotor, (-1e-3,), InvalidInput, "Rotor inertia"),
+        (Rotor, ({"elbow": 1.0},), UnknownJoint, "elbow"),
     ],
     ids=str,
 )
@@ -279,16 +258,16 @@ def test_wrong_numbers_are_named(kind, arguments, error, message):
 @pytest.mark.parametrize("make_and_formula", FORMULAS.values(), ids=FORMULAS)
 def test_they_survive_a_file_exactly(make_and_formula):
     force = make_and_formula[0]().bound_to(chain())
-    stored = json.loads(json.dumps(known_force_to_dict(force)))
-    again = object_from_dict("known force", KNOWN_FORCES, stored).bound_to(chain())
+    again = force_from_dict(json.loads(json.dumps(force_to_dict(force)))).bound_to(chain())
     assert type(again) is type(force)
-    for name in force.per_joint:
-        assert torch.equal(getattr(again, name), getattr(force, name))
+    for name, value in force.values.items():
+        assert torch.equal(again.values[name], value)
 
 
-def test_every_known_force_of_files_is_tested_here():
-    elsewhere = {Thrusters, ObservedWrench, ObservedWind}  # test_thrusters.py, tests/data/test_wind.py
-    assert {type(make()) for make, _ in FORMULAS.values()} | elsewhere == set(KNOWN_FORCES.values())
+def test_every_law_of_joints_is_tested_here():
+    tested = {type(make()) for make, _ in FORMULAS.values()}
+    own = {kind for kind in map(force_class, FORCES) if kind.__module__.startswith("forcegp.")}
+    assert {kind for kind in own if issubclass(kind, JointLaw)} <= tested
 
 
 @pytest.mark.parametrize(
@@ -298,49 +277,43 @@ def test_every_known_force_of_files_is_tested_here():
         {"type": ["actuation"]},
         {},
         {"type": "actuation", "coefficients": 1.0},
-        {"type": "viscous-joint-friction"},
         "actuation",
         None,
     ],
     ids=str,
 )
 def test_damaged_forces_are_refused(stored):
-    with pytest.raises(FileFormatError, match="known force"):
-        object_from_dict("known force", KNOWN_FORCES, stored)
+    with pytest.raises(FileFormatError, match="force"):
+        force_from_dict(stored)
 
 
-# ---------------------------------------------------------------- a force of the user
-
-
-class Spring(KnownForce):
-    """As the documentation promises: one subclass with a `force`."""
-
-    def __init__(self, stiffness: float) -> None:
-        self.stiffness = stiffness
-
-    def force(self, state: State) -> torch.Tensor:
-        return -self.stiffness * state.q
+# ---------------------------------------------------------------- a law of the user
 
 
 @dataclass(frozen=True, eq=False)
-class SpringPerJoint(KnownForce):
-    stiffness: float | list[float]
-    per_joint = ("stiffness",)
+class Sinking(JointLaw):
+    """As the documentation promises: one subclass with features and an amplitude."""
 
-    def force(self, state: State) -> torch.Tensor:
-        return -self.stiffness * state.q
+    stiffness: float | list[float] | None = None
+    coefficients: ClassVar[dict[str, Coefficient]] = {"stiffness": Coefficient("force/position")}
+
+    def features(self, state: State) -> tuple[torch.Tensor, ...]:
+        return (state.positions,)
+
+    def amplitude(self, features, parameters) -> torch.Tensor:
+        return -parameters["stiffness"] * features[0] ** 3
 
 
-def test_a_force_of_the_user():
+def test_a_law_of_the_user():
     q, v, u = states(4, 3)
-    assert_close(known(Spring(2.0)).dynamics(q, v, u).Q_K, -2.0 * q, 1e-14)
-    assert_close(known(SpringPerJoint(NUMBERS)).dynamics(q, v, u).Q_K, -TENSOR * q, 1e-14)
-    with pytest.raises(InvalidInput, match="a Spring cannot be stored; files carry actuation"):
-        known(Spring(2.0)).to_json()
+    assert_close(known(Sinking(2.0)).dynamics(q, v, u).Q_K, -2.0 * q**3, 1e-14)
+    assert_close(known(Sinking(NUMBERS)).dynamics(q, v, u).Q_K, -TENSOR * q**3, 1e-14)
+    with pytest.raises(InvalidInput, match="a Sinking cannot be stored: register it first"):
+        known(Sinking(2.0)).to_json()
 
 
 def test_numbers_are_copied():
     numbers = np.array(NUMBERS)
-    bound = ViscousJointFriction(torch.from_numpy(numbers)).bound_to(chain())
+    bound = Viscous(torch.from_numpy(numbers)).bound_to(chain())
     numbers[:] = -1.0
-    assert bound.coefficients.tolist() == NUMBERS
+    assert bound.values["damping"].tolist() == NUMBERS

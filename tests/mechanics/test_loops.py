@@ -13,8 +13,9 @@ from tests.robots.mujoco_oracle import MujocoOracle
 from forcegp.errors import ContactError, InvalidInput, RobotFileWarning
 from forcegp.integration import ConstraintManifold, integrate
 from forcegp.integration.integrators import integrator_named
-from forcegp.mechanics import Baumgarte, Held, LoopClosure, MechanicalSystem, Plane, loop_frame, loop_point
+from forcegp.mechanics import Baumgarte, Held, LoopClosure, Plane, loop_frame, loop_point
 from forcegp.mechanics.gauss_principle import Contact
+from forcegp.model import Model
 
 mujoco = untyped
 LIMB = "".join(
@@ -31,44 +32,44 @@ WELD = SPATIAL.format('<weld name="seam" body1="a3" body2="b3" anchor=".1 0 .1" 
 CLOSED = {"four-bar": FOUR_BAR, "connect": CONNECT, "weld": WELD}
 
 
-def system_of(text, tmp_path, **options):
+def model_of(text, tmp_path, **options):
     (tmp_path / "loop.xml").write_text(text)
-    return MechanicalSystem.from_mjcf(tmp_path / "loop.xml", **options)
+    return Model.from_mjcf(tmp_path / "loop.xml", **options)
 
 
-def states(system, rows=3):
+def states(model, rows=3):
     """On the loop, with velocities that keep it closed, and inputs."""
     generator = torch.Generator().manual_seed(3)
-    q, v, u = (torch.randn(rows, system.robot.nv, dtype=torch.float64, generator=generator) for _ in range(3))
-    q, v = ConstraintManifold(system).project(0.1 * q, v)
+    q, v, u = (torch.randn(rows, model.robot.nv, dtype=torch.float64, generator=generator) for _ in range(3))
+    q, v = ConstraintManifold(model).project(0.1 * q, v)
     return q, v, 5.0 * u
 
 
 @pytest.mark.parametrize("name", CLOSED)
 def test_accelerations_and_forces_are_those_of_pinocchio(name, tmp_path):
-    system = system_of(CLOSED[name], tmp_path)
-    robot, (q, v, u) = system.robot, states(system)
+    model = model_of(CLOSED[name], tmp_path)
+    robot, (q, v, u) = model.robot, states(model)
     limits = '<limit lower="-9" upper="9" effort="1" velocity="1"/></joint>'  # without, q is (cos, sin) there
     text = robot.urdf_text.replace('type="continuous"', 'type="revolute"').replace("</joint>", limits)
-    model = pin.buildModelFromXML(text)
-    order = [robot.joint_names.index(model.names[k + 1]) for k in range(model.nv)]
-    loop = system.loops[0]
+    plain = pin.buildModelFromXML(text)
+    order = [robot.joint_names.index(plain.names[k + 1]) for k in range(plain.nv)]
+    loop = model.loops[0]
     ends = []
     for frame, point in ((loop.frame, loop.point), (loop.second_frame, loop.second_point)):
-        at = model.frames[model.getFrameId(frame, pin.FrameType.BODY)]
+        at = plain.frames[plain.getFrameId(frame, pin.FrameType.BODY)]
         ends += [at.parentJoint, at.placement * pin.SE3(np.eye(3), np.array(point))]
     kind = pin.ContactType.CONTACT_6D if name == "weld" else pin.ContactType.CONTACT_3D
-    constraint = pin.RigidConstraintModel(kind, model, *ends, pin.ReferenceFrame.LOCAL)
-    found = system.dynamics(q, v, u)
+    constraint = pin.RigidConstraintModel(kind, plain, *ends, pin.ReferenceFrame.LOCAL)
+    found = model.dynamics(q, v, u)
     a, force = found.acceleration(torch.zeros_like(v)), found.multiplier(torch.zeros_like(v))
     for k in range(len(q)):
-        data, models, datas = model.createData(), pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+        data, models, datas = plain.createData(), pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
         models.append(constraint)
         datas.append(constraint.createData())
-        pin.initConstraintDynamics(model, data, models, datas)
+        pin.initConstraintDynamics(plain, data, models, datas)
         settings = pin.ProximalSettings(1e-14, 1e-12, 100)
         numbers = (x[k].numpy()[order] for x in (q, v, u))
-        expected = pin.constraintDynamics(model, data, *numbers, models, datas, settings)
+        expected = pin.constraintDynamics(plain, data, *numbers, models, datas, settings)
         np.testing.assert_allclose(a[k].numpy()[order], expected, rtol=1e-9, atol=1e-9 * abs(expected).max())
         if name == "connect":  # three independent rows: the force is unique
             world = data.oMi[ends[0]].rotation @ ends[1].rotation @ datas[0].contact_force.linear
@@ -78,17 +79,17 @@ def test_accelerations_and_forces_are_those_of_pinocchio(name, tmp_path):
 @pytest.mark.parametrize("name", CLOSED)
 def test_rows_are_those_of_mujoco(name, tmp_path):
     """Positions and Jacobians at states that do not close the loop; MuJoCo's rows of a turn have other axes."""
-    system, model = system_of(CLOSED[name], tmp_path), mujoco.MjModel.from_xml_string(CLOSED[name])
-    oracle = MujocoOracle(model)
-    model.opt.disableflags = 0
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    model, plain = model_of(CLOSED[name], tmp_path), mujoco.MjModel.from_xml_string(CLOSED[name])
+    oracle = MujocoOracle(plain)
+    plain.opt.disableflags = 0
+    plain.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     generator = torch.Generator().manual_seed(0)
-    q = 0.3 * torch.randn(2, system.robot.nv, dtype=torch.float64, generator=generator)
-    c, _ = ConstraintManifold(system).violation(q, torch.zeros_like(q))
-    A = system.dynamics(q, torch.zeros_like(q), torch.zeros_like(q)).A
+    q = 0.3 * torch.randn(2, model.robot.nv, dtype=torch.float64, generator=generator)
+    c, _ = ConstraintManifold(model).violation(q, torch.zeros_like(q))
+    A = model.dynamics(q, torch.zeros_like(q), torch.zeros_like(q)).A
     for k in range(len(q)):
-        oracle.at(q[k].numpy(), np.zeros(system.robot.nv))
-        J = oracle.data.efc_J.reshape(-1, model.nv)
+        oracle.at(q[k].numpy(), np.zeros(model.robot.nv))
+        J = oracle.data.efc_J.reshape(-1, plain.nv)
         offset = (A[k, :3] - torch.tensor(J[:3])).abs().max()
         if name == "weld":  # MuJoCo holds the anchor, we the origin of the second body
             assert np.linalg.matrix_rank(np.vstack([A[k], J]), 1e-2) >= 6
@@ -98,11 +99,11 @@ def test_rows_are_those_of_mujoco(name, tmp_path):
 
 
 def test_a_weld_is_closed_where_mujoco_has_no_error(tmp_path):
-    system, model = system_of(WELD, tmp_path), mujoco.MjModel.from_xml_string(WELD)
-    q, v, _ = states(system)
-    oracle = MujocoOracle(model)
-    model.opt.disableflags = 0
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    model, plain = model_of(WELD, tmp_path), mujoco.MjModel.from_xml_string(WELD)
+    q, v, _ = states(model)
+    oracle = MujocoOracle(plain)
+    plain.opt.disableflags = 0
+    plain.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     for k in range(len(q)):
         oracle.at(q[k].numpy(), v[k].numpy())
         assert abs(oracle.data.efc_pos).max() < 1e-11
@@ -112,26 +113,26 @@ def test_a_weld_is_closed_where_mujoco_has_no_error(tmp_path):
 @pytest.mark.parametrize("name", CLOSED)
 def test_derivatives(name, tmp_path):
     """A' v is the derivative of A v; A is that of c where the loop is closed; accelerations pass gradcheck."""
-    system = system_of(CLOSED[name], tmp_path)
-    manifold, (q, v, u) = ConstraintManifold(system), states(system, 2)
+    model = model_of(CLOSED[name], tmp_path)
+    manifold, (q, v, u) = ConstraintManifold(model), states(model, 2)
     for k in range(2):
         at, moving, away = q[k], torch.roll(v[k], 1), q[k] + 0.3  # any velocity: A v is not 0
         _, slope = torch.func.jvp(lambda x, moving=moving: manifold.violation(x, moving)[0], (at,), (moving,))
         torch.testing.assert_close(slope, manifold.violation(at, moving)[1], rtol=1e-10, atol=1e-10)
         _, drift = torch.func.jvp(lambda x, moving=moving: manifold.violation(x, moving)[1], (away,), (moving,))
-        torch.testing.assert_close(-system.dynamics(away, moving, u[k]).b, drift, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(-model.dynamics(away, moving, u[k]).b, drift, rtol=1e-10, atol=1e-10)
     inputs = [x[:1].clone().requires_grad_() for x in (q, v, u)]
-    torch.autograd.gradcheck(lambda *x: system.dynamics(*x).acceleration(torch.zeros_like(v[:1])), inputs)
+    torch.autograd.gradcheck(lambda *x: model.dynamics(*x).acceleration(torch.zeros_like(v[:1])), inputs)
 
 
 def test_a_mechanism_keeps_its_energy_and_stays_closed(tmp_path):
-    system = system_of(FOUR_BAR, tmp_path)
-    robot, (q, v, _) = system.robot, states(system, 1)
+    model = model_of(FOUR_BAR, tmp_path)
+    robot, (q, v, _) = model.robot, states(model, 1)
     zero = torch.zeros_like(v)
-    integrator = integrator_named("projected", system)
+    integrator = integrator_named("projected", model)
     forces = torch.zeros(300, 1, robot.nv).double()
-    motion = integrate(integrator, lambda q, v, u: system.dynamics(q, v, u).acceleration(zero), q, v, forces, 1e-3)
-    c, rate = ConstraintManifold(system).violation(motion.q, motion.v)
+    motion = integrate(integrator, lambda q, v, u: model.dynamics(q, v, u).acceleration(zero), q, v, forces, 1e-3)
+    c, rate = ConstraintManifold(model).violation(motion.q, motion.v)
     assert max(c.abs().max(), rate.abs().max()) < 1e-10
 
     def energy(q, v):
@@ -148,26 +149,27 @@ def test_a_mechanism_keeps_its_energy_and_stays_closed(tmp_path):
     assert (total - total[0]).abs().max() < 1e-4 * (total.abs().max() + 1.0)
 
 
+@pytest.mark.nightly
 def test_baumgarte_pulls_a_loop_together(tmp_path):
-    system = system_of(WELD, tmp_path, baumgarte=Baumgarte(20.0))
-    q, v, _ = states(system, 1)
+    model = model_of(WELD, tmp_path, baumgarte=Baumgarte(20.0))
+    q, v, _ = states(model, 1)
     q = q + 0.01
     zero = torch.zeros_like(v)
-    integrator = integrator_named("rk4", system)
-    forces = torch.zeros(400, 1, system.robot.nv).double()
-    motion = integrate(integrator, lambda q, v, u: system.dynamics(q, v, u).acceleration(zero), q, zero, forces, 2e-3)
-    c, _ = ConstraintManifold(system).violation(motion.q, motion.v)
+    integrator = integrator_named("rk4", model)
+    forces = torch.zeros(400, 1, model.robot.nv).double()
+    motion = integrate(integrator, lambda q, v, u: model.dynamics(q, v, u).acceleration(zero), q, zero, forces, 2e-3)
+    c, _ = ConstraintManifold(model).violation(motion.q, motion.v)
     assert c[0].abs().max() > 1e-3
     assert c[-1].abs().max() < 1e-3 * c[0].abs().max()
 
 
 def test_loops_survive_files_and_act_where_their_switch_is_on(tmp_path):
-    robot = system_of(WELD, tmp_path).robot
-    system = MechanicalSystem(robot, loop_frame("end", "b3", switch="latched"))
-    again = MechanicalSystem.from_json(system.to_json())
-    assert again.contacts == system.contacts
+    robot = model_of(WELD, tmp_path).robot
+    model = Model(robot, loop_frame("end", "b3", switch="latched"))
+    again = Model.from_json(model.to_json())
+    assert again.contacts == model.contacts
     assert again.inputs[-1] == "latched"
-    assert "end and b3" in repr(system)
+    assert "end and b3" in repr(model)
     q = torch.full((2, robot.nv), 0.2).double()
     u = torch.cat([torch.ones(2, robot.nv), torch.tensor([[0.0], [1.0]])], 1).double()
     a = again.dynamics(q, 0 * q, u).acceleration(0 * q)
@@ -179,32 +181,32 @@ def test_loops_survive_files_and_act_where_their_switch_is_on(tmp_path):
 
 
 def test_states_that_do_not_fit_and_frames_of_one_body_are_refused(tmp_path):
-    system = system_of(FOUR_BAR, tmp_path)
-    system.check_states(*states(system))
+    model = model_of(FOUR_BAR, tmp_path)
+    model.check_states(*states(model))
     with pytest.raises(ContactError, match="do not move against each other"):
-        MechanicalSystem(system.robot, loop_point("crank", (0, 0, 0), "crank", (0, 0, 1)))
+        Model(model.robot, loop_point("crank", (0, 0, 0), "crank", (0, 0, 1)))
     with pytest.raises(InvalidInput, match="use loop_point"):
         LoopClosure("crank", (0.0, 0.0, 0.0), Plane((0, 0, 1), 0.0), None, "rocker")
     with pytest.raises(InvalidInput, match="second_point"):
         LoopClosure("crank", (0.0, 0.0, 0.0), Held((0, 0, 1)), None, "rocker", (0, 0))  # type: ignore[arg-type]
-    assert system.touching == ()
-    assert len(system.with_contacts([*system.contacts, Contact("crank", (0, 0, 1), Plane((0, 0, 1), 0))]).loops) == 3
+    assert model.touching == ()
+    assert len(model.with_contacts([*model.contacts, Contact("crank", (0, 0, 1), Plane((0, 0, 1), 0))]).loops) == 3
 
 
 def test_motors_at_sites_of_a_free_body_are_inputs(tmp_path):
     """A quadrotor whose second rotor sits on an arm of its own, tilted."""
     tilted = '<body pos="-.1 .1 0" euler="20 5 0"><site name="r2"/></body>'
     text = QUADROTOR.replace('<site name="r2" pos="-.1 .1 0"/>', tilted)
-    system, model = system_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
-    robot, oracle = system.robot, MujocoOracle(model)
-    assert (system.inputs, robot.nv) == (("1", "2", "3", "4"), 6)
+    model, plain = model_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
+    robot, oracle = model.robot, MujocoOracle(plain)
+    assert (model.inputs, robot.nv) == (("1", "2", "3", "4"), 6)
     generator = torch.Generator().manual_seed(0)
     q, v = robot.random(generator, 1), torch.randn(1, 6, dtype=torch.float64, generator=generator)
     u = torch.tensor([[1.0, 3.0, -2.0, 0.5]], dtype=torch.float64)
     oracle.data.ctrl[:] = u[0].numpy()
     oracle.at(q[0].numpy(), v[0].numpy())
-    np.testing.assert_allclose(system.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
-    assert MechanicalSystem.from_json(system.to_json()).inputs == system.inputs
+    np.testing.assert_allclose(model.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
+    assert Model.from_json(model.to_json()).inputs == model.inputs
 
 
 @pytest.mark.parametrize("gear", ["0 0 1 0 0 .02", "1 2 -3 .4 .5 .6", "0 0 0 .1 .2 -.3", "0 0 0 0 0 0"])
@@ -221,20 +223,20 @@ def test_rotors_on_links_that_move_are_inputs(tmp_path, base, gear):
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        system, model = system_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
+        model, plain = model_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
     names = ("turn", *(("right",) if base else ()), "left")
-    assert system.inputs == names
-    oracle, generator = MujocoOracle(model), torch.Generator().manual_seed(0)
-    q = system.robot.random(generator, 3)
-    v, u = (torch.randn(3, n, dtype=torch.float64, generator=generator) for n in (system.robot.nv, len(names)))
-    delivered = system.state(q, v, u).delivered
+    assert model.inputs == names
+    oracle, generator = MujocoOracle(plain), torch.Generator().manual_seed(0)
+    q = model.robot.random(generator, 3)
+    v, u = (torch.randn(3, n, dtype=torch.float64, generator=generator) for n in (model.robot.nv, len(names)))
+    delivered = model.state(q, v, u).delivered
     for k in range(3):
-        oracle.data.ctrl[[model.actuator(name).id for name in names]] = u[k].numpy()
+        oracle.data.ctrl[[plain.actuator(name).id for name in names]] = u[k].numpy()
         oracle.at(q[k].numpy(), v[k].numpy())
         np.testing.assert_allclose(delivered[k], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-9)
-    assert MechanicalSystem.from_json(system.to_json()).inputs == names
+    assert Model.from_json(model.to_json()).inputs == names
     if base:
-        held = MechanicalSystem.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.3})
+        held = Model.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.3})
         assert held.inputs == ("right", "left")
 
 
@@ -248,17 +250,17 @@ def test_motors_that_turn_a_ball_joint_are_inputs(tmp_path):
         '<motor name="roll" joint="shoulder" gear="2 0 0"/><motor name="yaw" joint="shoulder" gear="0 .5 1"/>'
         '<motor name="bend" joint="elbow"/></actuator></mujoco>'
     )
-    system, model = system_of(arm, tmp_path), mujoco.MjModel.from_xml_string(arm)
-    assert system.inputs == ("push", "roll", "yaw", "bend")
-    oracle = MujocoOracle(model)
+    model, plain = model_of(arm, tmp_path), mujoco.MjModel.from_xml_string(arm)
+    assert model.inputs == ("push", "roll", "yaw", "bend")
+    oracle = MujocoOracle(plain)
     generator = torch.Generator().manual_seed(0)
-    q, v = system.robot.random(generator, 1), torch.zeros(1, 5, dtype=torch.float64)
+    q, v = model.robot.random(generator, 1), torch.zeros(1, 5, dtype=torch.float64)
     u = torch.tensor([[1.0, 3.0, -2.0, 0.5]], dtype=torch.float64)
     oracle.data.ctrl[:] = u[0].numpy()
     oracle.at(q[0].numpy(), v[0].numpy())
-    np.testing.assert_allclose(system.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
+    np.testing.assert_allclose(model.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
     with pytest.warns(RobotFileWarning, match=r"drive no single joint \(yaw\)|drive no single joint \(roll, yaw\)"):
-        other = system_of(arm.replace('"yaw" joint', '"yaw" jointinparent'), tmp_path)
+        other = model_of(arm.replace('"yaw" joint', '"yaw" jointinparent'), tmp_path)
     assert other.inputs == ("rail", "elbow")
 
 
@@ -270,11 +272,11 @@ def test_a_servo_and_a_tendon_leave_the_rotors_of_a_drone(tmp_path):
     text = QUADROTOR.replace('<site name="r2" pos="-.1 .1 0"/>', arm)
     text = text.replace("</actuator>", laws).replace("</mujoco>", tendon)
     with pytest.warns(RobotFileWarning, match=r"drive no single joint \(pull\)"):
-        system = system_of(text, tmp_path)
-    assert system.inputs == ("1", "2", "3", "4", "tilt")
+        model = model_of(text, tmp_path)
+    assert model.inputs == ("1", "2", "3", "4", "tilt")
     u = torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    delivered = system.state(system.robot.neutral(), torch.zeros(7, dtype=torch.float64), u).delivered
+    delivered = model.state(model.robot.neutral(), torch.zeros(7, dtype=torch.float64), u).delivered
     assert delivered.tolist() == [0.0] * 6 + [1.0]
     with pytest.warns(RobotFileWarning):
-        held = MechanicalSystem.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.0})
+        held = Model.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.0})
     assert held.inputs == ("1", "2", "3", "4")

@@ -8,7 +8,9 @@ import torch
 from tests.mechanics.systems import assert_close
 from tests.robots.robot_models import iiwa
 
-from forcegp.mechanics import Baumgarte, Contact, MechanicalSystem, Plane
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.mechanics import Baumgarte, Contact, Plane
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 TOOL = "lbr_iiwa_link_7"
@@ -31,11 +33,11 @@ def paper_robot() -> Robot:
 
 
 @pytest.fixture(scope="module")
-def system() -> MechanicalSystem:
+def model() -> Model:
     built = paper_robot()
     assert built.link(TOOL).mass == 2.0
     contact = Contact(TOOL, (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), 0.055))
-    return MechanicalSystem(built, (contact,), baumgarte=Baumgarte(10.0, 1.0))
+    return Model(built, (contact,), (Actuation(), RigidBodies()), baumgarte=Baumgarte(10.0, 1.0))
 
 
 both_splits = pytest.mark.parametrize("rows", ["test", "train"], indirect=True)
@@ -52,19 +54,19 @@ def rows(request, shared) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("rows", ["test"], indirect=True)  # only these rows carry M, f and g
-def test_mass_matrix_and_forces(system, rows):
+def test_mass_matrix_and_forces(model, rows):
     q, v, u = rows["q"], rows["v"], rows["u"]
-    dynamics = system.dynamics(q, v, u)
-    gravity = system.robot.gravity_forces(q)
+    dynamics = model.dynamics(q, v, u)
+    gravity = model.robot.gravity_forces(q)
     assert_close(dynamics.M, rows["M"], TOLERANCE)
     assert_close(-gravity, rows["g"], TOLERANCE)
-    assert_close(gravity - system.robot.bias_forces(q, v), rows["f"], TOLERANCE)
+    assert_close(gravity - model.robot.bias_forces(q, v), rows["f"], TOLERANCE)
     assert_close(dynamics.Q_K, rows["f"] + rows["g"] + u, TOLERANCE)
 
 
 @both_splits
-def test_constraint_and_motion(system, rows):
-    dynamics = system.dynamics(rows["q"], rows["v"], rows["u"])
+def test_constraint_and_motion(model, rows):
+    dynamics = model.dynamics(rows["q"], rows["v"], rows["u"])
     assert_close(dynamics.A, rows["A"], TOLERANCE)
     assert_close(dynamics.b, rows["b"], TOLERANCE)
     assert_close(dynamics.multiplier(rows["Q_U"]), rows["lambda"], TOLERANCE)
@@ -72,13 +74,13 @@ def test_constraint_and_motion(system, rows):
 
 
 @both_splits
-def test_the_contact_force_is_normal_to_the_plane(system, rows):
-    dynamics = system.dynamics(rows["q"], rows["v"], rows["u"])
+def test_the_contact_force_is_normal_to_the_plane(model, rows):
+    dynamics = model.dynamics(rows["q"], rows["v"], rows["u"])
     force = dynamics.contact_force_map()(rows["Q_U"])
     upwards = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     assert_close(force, rows["lambda"] * upwards, TOLERANCE)
 
 
 @both_splits
-def test_all_states_can_be_held(system, rows):
-    system.check_states(rows["q"], rows["v"], rows["u"])
+def test_all_states_can_be_held(model, rows):
+    model.check_states(rows["q"], rows["v"], rows["u"])

@@ -9,38 +9,25 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.mechanics.systems import assert_close, normal, robot, states, surfaces, system
+from tests.mechanics.systems import assert_close, model_with, normal, robot, states, surfaces
 from tests.robots.robot_models import CHAIN, FRAMES, TREE
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, NumericalError, UnknownFrame
-from forcegp.mechanics import (
-    Actuation,
-    Armature,
-    Baumgarte,
-    Contact,
-    CoulombJointFriction,
-    Cylinder,
-    ImplicitSurface,
-    MechanicalSystem,
-    Plane,
-    RigidBodyBias,
-    Sphere,
-    State,
-    ViscousJointFriction,
-    fixed_point,
-)
+from forcegp.forces import Actuation, Coulomb, RigidBodies, Rotor, Viscous
+from forcegp.mechanics import Baumgarte, Contact, Cylinder, ImplicitSurface, Plane, Sphere, State, fixed_point
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 FLOOR = Plane((0.0, 0.0, 1.0), 0.055)
 
 
-def complete() -> MechanicalSystem:
+def complete() -> Model:
     """Every kind of part, a robot that is not as its file says."""
     built = Robot.from_urdf_text(TREE, gravity=(0.1, -0.2, -9.7), locked={"left_gripper": 0.013})
     built = built.with_armature({"torso": 0.25})
     parameters = built.inertial_parameters("right_hand")["right_hand"]
     built = built.with_inertials({"right_hand": parameters + 0.1 * normal(10)})
-    return MechanicalSystem(
+    return Model(
         built,
         (
             Contact("right_hand", (0.1, -0.2, 0.3), Plane((0.3, 0.1, 1.0), 0.123)),
@@ -49,16 +36,16 @@ def complete() -> MechanicalSystem:
         ),
         (
             Actuation(),
-            RigidBodyBias(),
-            ViscousJointFriction.from_robot(built),
-            CoulombJointFriction({"torso": 0.3}, 0.02),
-            Armature(0.05),
+            RigidBodies(),
+            Viscous({joint.name: joint.damping for joint in built.joints if joint.name in built.single_joint_names}),
+            Coulomb({"torso": 0.3}, 0.02),
+            Rotor(0.05),
         ),
-        Baumgarte(7.0, 0.8),
+        baumgarte=Baumgarte(7.0, 0.8),
     )
 
 
-def assert_same_dynamics(one: MechanicalSystem, other: MechanicalSystem) -> None:
+def assert_same_dynamics(one: Model, other: Model) -> None:
     arguments, Q_U = states(one.robot.nv, 4), normal(4, one.robot.nv)
     for name in ("M", "A", "b", "H", "Q_b", "Q_K"):
         assert torch.equal(getattr(one.dynamics(*arguments), name), getattr(other.dynamics(*arguments), name)), name
@@ -69,11 +56,11 @@ def assert_same_dynamics(one: MechanicalSystem, other: MechanicalSystem) -> None
 
 
 def test_it_cannot_be_changed():
-    built = system()
+    built = model_with()
     with pytest.raises(FrozenInstanceError):
         built.contacts = ()  # type: ignore[misc]
     assert isinstance(built.contacts, tuple)
-    assert isinstance(MechanicalSystem(robot("iiwa"), list(built.contacts)).contacts, tuple)
+    assert isinstance(Model(robot("iiwa"), list(built.contacts)).contacts, tuple)
 
 
 def test_states_are_compared_by_identity():
@@ -83,7 +70,7 @@ def test_states_are_compared_by_identity():
 
 
 def test_arguments_are_left_alone():
-    built = system("iiwa", "three", baumgarte=Baumgarte(10.0))
+    built = model_with("iiwa", "three", baumgarte=Baumgarte(10.0))
     arguments = states(7, 3)
     kept = [x.clone() for x in arguments]
     built.dynamics(*arguments).acceleration(normal(3, 7))
@@ -117,20 +104,20 @@ def test_other_contacts_and_other_robots():
 )
 def test_contacts_that_do_not_fit_the_robot(contact, error, message):
     with pytest.raises(error, match=message):
-        MechanicalSystem(robot("chain"), (contact,))
+        Model(robot("chain"), (contact,))
 
 
 def test_a_frame_below_a_locked_joint_may_be_fixed_in_the_world():
     locked = Robot.from_urdf_text(CHAIN, locked={"slide": 0.0, "spin": 0.3})
     with pytest.raises(ContactError, match="'bracket' of chain is fixed in the world"):
-        MechanicalSystem(locked, (Contact("bracket", (0.0, 0.0, 0.0), FLOOR),))
-    MechanicalSystem(locked, (Contact("forearm", (0.0, 0.0, 0.0), FLOOR),))
+        Model(locked, (Contact("bracket", (0.0, 0.0, 0.0), FLOOR),))
+    Model(locked, (Contact("forearm", (0.0, 0.0, 0.0), FLOOR),))
 
 
 def test_held_points_need_not_be_unpacked():
     held, floor = fixed_point("tool", (0.0, 0.0, 0.1)), Contact("tool", (0.0, 0.0, 0.0), FLOOR)
-    system = MechanicalSystem(robot("chain"))
-    assert system.with_contacts([held, floor]).contacts == system.with_contacts([*held, floor]).contacts
+    model = Model(robot("chain"))
+    assert model.with_contacts([held, floor]).contacts == model.with_contacts([*held, floor]).contacts
 
 
 @pytest.mark.parametrize(
@@ -139,15 +126,15 @@ def test_held_points_need_not_be_unpacked():
         ({"contacts": (FLOOR,)}, "contacts is .*; give a sequence of Contact objects"),
         ({"contacts": Contact("tool", (0.0, 0.0, 0.0), FLOOR)}, "give a sequence of Contact objects"),
         ({"contacts": None}, "contacts is None"),
-        ({"known_forces": (Actuation,)}, "known_forces is .*; give a sequence of KnownForce objects"),
-        ({"known_forces": Actuation()}, "give a sequence of KnownForce objects"),
-        ({"known_forces": ("actuation",)}, "give a sequence of KnownForce objects"),
+        ({"forces": (Actuation,)}, "forces is .*; give a sequence of Force objects"),
+        ({"forces": Actuation()}, "give a sequence of Force objects"),
+        ({"forces": ("actuation",)}, "give a sequence of Force objects"),
     ],
     ids=str,
 )
 def test_parts_of_the_wrong_kind(parts, message):
     with pytest.raises(InvalidInput, match=message):
-        MechanicalSystem(robot("chain"), **parts)
+        Model(robot("chain"), **parts)
 
 
 @pytest.mark.parametrize(
@@ -164,7 +151,7 @@ def test_parts_of_the_wrong_kind(parts, message):
 )
 def test_states_of_wrong_shape_are_never_stretched(shapes, message):
     with pytest.raises(InvalidInput, match=message):
-        MechanicalSystem(robot("chain")).dynamics(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
+        Model(robot("chain")).dynamics(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
 
 
 def test_states_of_wrong_type():
@@ -174,7 +161,7 @@ def test_states_of_wrong_type():
             arguments = [good] * 3
             arguments[position] = bad
             with pytest.raises(InvalidInput, match=f"^{'qvu'[position]} (is|must be)"):
-                MechanicalSystem(robot("chain")).dynamics(*arguments)
+                Model(robot("chain")).dynamics(*arguments)
 
 
 # ---------------------------------------------------------------- states that contacts cannot hold
@@ -182,8 +169,8 @@ def test_states_of_wrong_type():
 
 def test_states_that_fit_pass():
     for kind in ("none", "one", "three", "same twice", "four corners"):
-        system("iiwa", kind, baumgarte=Baumgarte(10.0)).check_states(*states(7, 20))
-    system("iiwa", "one").check_states(*states(7, 0))
+        model_with("iiwa", kind, baumgarte=Baumgarte(10.0)).check_states(*states(7, 20))
+    model_with("iiwa", "one").check_states(*states(7, 0))
 
 
 def test_a_gradient_that_vanishes_is_named_by_row_and_contact():
@@ -193,7 +180,7 @@ def test_a_gradient_that_vanishes_is_named_by_row_and_contact():
     corner = built.frame_pose(q[3], FRAMES["chain"])[:3, 3]
     bowl = ImplicitSurface(lambda p: (p - corner).square().sum() - 0.1)
     origin = (0.0, 0.0, 0.0)
-    held = MechanicalSystem(built, (Contact("forearm", origin, FLOOR), Contact(FRAMES["chain"], origin, bowl)))
+    held = Model(built, (Contact("forearm", origin, FLOOR), Contact(FRAMES["chain"], origin, bowl)))
     with pytest.raises(ContactError, match=r"contact 1 \(frame 'tool'\) has no direction at row 3"):
         held.check_states(q, v, u)
     held.check_states(q[:3], v[:3], u[:3])
@@ -204,7 +191,7 @@ def test_the_centre_of_a_sphere_and_the_axis_of_a_cylinder():
     q, v, u = states(4, 2)
     center = tuple(built.frame_pose(q[1], FRAMES["chain"])[:3, 3].tolist())
     for surface in (Sphere(center, 0.1), Cylinder(center, (0.0, 0.0, 1.0), 0.1)):
-        held = MechanicalSystem(built, (Contact(FRAMES["chain"], (0.0, 0.0, 0.0), surface),))
+        held = Model(built, (Contact(FRAMES["chain"], (0.0, 0.0, 0.0), surface),))
         with pytest.raises(ContactError, match=r"contact 0 .* row 1"):
             held.check_states(q, v, u)
 
@@ -216,7 +203,7 @@ def test_a_point_that_cannot_move_along_the_normal():
       <joint name="turn" type="continuous">
       <parent link="base"/><child link="table"/><axis xyz="0 0 1"/></joint></robot>"""
     built = Robot.from_urdf_text(lift)
-    held = MechanicalSystem(built, (Contact("table", (0.5, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.0)),))
+    held = Model(built, (Contact("table", (0.5, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.0)),))
     with pytest.raises(ContactError, match="cannot move along it"):
         held.check_states(*states(1, 2))
 
@@ -225,7 +212,7 @@ def test_contradictory_contacts_are_named():
     """The same point on two parallel planes: whichever Baumgarte pulls it to, the other is violated."""
     tool = FRAMES["iiwa"]
     contacts = tuple(Contact(tool, (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), height)) for height in (0.055, 0.065))
-    held = MechanicalSystem(robot("iiwa"), contacts, baumgarte=Baumgarte(10.0))
+    held = Model(robot("iiwa"), contacts, baumgarte=Baumgarte(10.0))
     with pytest.raises(ContactError, match=r"row \d: .* = 5\.00e-01 for contact [01]"):
         held.check_states(*states(7, 3))
 
@@ -237,7 +224,7 @@ def test_contacts_contradict_each_other_from_a_millionth_on():
     height = float((robot("iiwa").frame_pose(q[0], tool) @ point)[2])
     for gap, fits in ((1.6e-8, True), (2.6e-8, False)):
         floors = [Plane((0.0, 0.0, 1.0), height + sign * gap / 2) for sign in (-1, 1)]
-        held = MechanicalSystem(
+        held = Model(
             robot("iiwa"), [Contact(tool, (0.0, 0.0, 0.1), floor) for floor in floors], baumgarte=Baumgarte(10.0)
         )
         with contextlib.nullcontext() if fits else pytest.raises(ContactError, match="contradict"):
@@ -249,7 +236,7 @@ def test_states_that_are_not_finite_are_refused():
         arguments = states(7, 4)
         arguments[position][2, 1] = math.nan
         with pytest.raises((ContactError, NumericalError), match=r"row 2|not positive definite"):
-            system("iiwa", "one").check_states(*arguments)
+            model_with("iiwa", "one").check_states(*arguments)
 
 
 # ---------------------------------------------------------------- files
@@ -257,7 +244,7 @@ def test_states_that_are_not_finite_are_refused():
 
 def test_a_file_changes_nothing():
     built = complete()
-    again = MechanicalSystem.from_json(built.to_json())
+    again = Model.from_json(built.to_json())
     assert again.to_json() == built.to_json()
     assert again.contacts == built.contacts
     assert again.baumgarte == built.baumgarte
@@ -265,25 +252,25 @@ def test_a_file_changes_nothing():
     assert dict(again.robot.locked) == {"left_gripper": 0.013}
     assert torch.equal(again.robot.gravity, built.robot.gravity)
     assert torch.equal(again.robot.armature, built.robot.armature)
-    assert [type(force) for force in again.known_forces] == [type(force) for force in built.known_forces]
+    assert [type(force) for force in again.forces] == [type(force) for force in built.forces]
     assert_same_dynamics(again, built)
 
 
 def test_a_bare_system_too():
-    built = MechanicalSystem(robot("chain"), known_forces=())
-    again = MechanicalSystem.from_json(built.to_json())
-    assert again.contacts == again.known_forces == ()
+    built = Model(robot("chain"), forces=())
+    again = Model.from_json(built.to_json())
+    assert again.contacts == again.forces == ()
     assert again.baumgarte is None
     assert_same_dynamics(again, built)
 
 
 def test_a_surface_that_holds_code_cannot_be_stored_but_given_again():
     waves = (Contact(FRAMES["chain"], (0.0, 0.0, 0.0), surfaces()["waves"]),)
-    built = MechanicalSystem(robot("chain"), waves)
+    built = Model(robot("chain"), waves)
     with pytest.raises(ContactError, match="a Surface of your own with numbers as fields"):
         built.to_json()
     stored = built.with_contacts(()).to_dict()
-    assert_same_dynamics(MechanicalSystem.from_dict(stored, contacts=waves), built)
+    assert_same_dynamics(Model.from_dict(stored, contacts=waves), built)
 
 
 def test_stored_text_is_plain_json():
@@ -297,7 +284,7 @@ def test_stored_text_is_plain_json():
     stored = json.loads(complete().to_json(), parse_constant=pytest.fail)
     assert plain(stored)
     assert stored["format"] == 1  # another layout is another number
-    parts = {"format", "urdf", "gravity", "armature", "locked", "base", "contacts", "known_forces", "baumgarte"}
+    parts = {"format", "urdf", "gravity", "armature", "locked", "base", "contacts", "forces", "noise", "baumgarte"}
     assert set(stored) == parts
 
 
@@ -305,18 +292,16 @@ def test_stored_text_is_plain_json():
     "text", ["", "{", "nothing", "[]", "3", "null", '"text"', "[" * 100_000, "{}", '{"format": 2}']
 )
 def test_text_that_is_no_system(text):
-    with pytest.raises(FileFormatError, match="stored system"):
-        MechanicalSystem.from_json(text)
+    with pytest.raises(FileFormatError, match="stored model"):
+        Model.from_json(text)
 
 
-@pytest.mark.parametrize(
-    "key", ["format", "urdf", "gravity", "armature", "locked", "contacts", "known_forces", "baumgarte"]
-)
+@pytest.mark.parametrize("key", ["format", "urdf", "gravity", "armature", "locked", "contacts", "forces", "baumgarte"])
 def test_every_part_must_be_there(key):
     stored = complete().to_dict()
     del stored[key]
     with pytest.raises(FileFormatError, match=key if key != "format" else "format None"):
-        MechanicalSystem.from_dict(stored)
+        Model.from_dict(stored)
 
 
 def places(value, path=()):
@@ -348,23 +333,23 @@ def damaged(place, rubbish) -> dict:
 @settings(max_examples=150)
 @given(place=st.sampled_from(PLACES), rubbish=st.sampled_from(RUBBISH))
 def test_damage_anywhere_gives_an_error_of_forcegp_or_finite_numbers(place, rubbish):
-    """Never an error of Python or torch, and never a system with numbers that are not finite."""
+    """Never an error of Python or torch, and never a model with numbers that are not finite."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         with contextlib.suppress(ForceGPError):
-            json.loads(MechanicalSystem.from_dict(damaged(place, rubbish)).to_json(), parse_constant=pytest.fail)
+            json.loads(Model.from_dict(damaged(place, rubbish)).to_json(), parse_constant=pytest.fail)
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
 
 
-@pytest.mark.parametrize("part", ["urdf", "gravity", "armature", "locked", "contacts", "known_forces"])
+@pytest.mark.parametrize("part", ["urdf", "gravity", "armature", "locked", "contacts", "forces"])
 @pytest.mark.parametrize("empty", ["", None, 0, False], ids=repr)
 def test_an_emptied_part_is_not_taken_for_none(part, empty):
     with pytest.raises(FileFormatError, match="damaged"):
-        MechanicalSystem.from_dict(damaged((part,), empty))
+        Model.from_dict(damaged((part,), empty))
 
 
 def test_armature_must_be_complete():
     for rubbish in ("DELETE", None):
         with pytest.raises(FileFormatError, match="armature"):
-            MechanicalSystem.from_dict(damaged(("armature", 0), rubbish))
+            Model.from_dict(damaged(("armature", 0), rubbish))

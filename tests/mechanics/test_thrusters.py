@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp import MechanicalSystem, Robot
+from forcegp import Model, Robot
 from forcegp.errors import InvalidInput, UnknownFrame
-from forcegp.mechanics import Actuation, ObservedWind, ObservedWrench, RigidBodyBias, Thrusters
+from forcegp.forces import Actuation, ObservedWind, ObservedWrench, RigidBodies, Thrusters
 
 INERTIA = '<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0.001" ixz="0" iyz="0.002"/>'
 DRONE = f"""<robot name="drone"><link name="body"><inertial><origin xyz="0.01 -0.02 0.03"/><mass value="1.5"/>{INERTIA}
@@ -34,10 +34,10 @@ def states(robot, rows=5):
 @pytest.mark.parametrize("power", [1, 2])
 def test_accelerations_are_those_of_external_forces_in_pinocchio(robot, power):
     pushing = Thrusters("pod", PLACES, (2.0, 3.0), (0.1, -0.2), AXES, power)
-    system = MechanicalSystem(robot, (), (Actuation(), pushing, RigidBodyBias()))
-    assert system.inputs == ("tilt", "rotor_1", "rotor_2")
+    model = Model(robot, (), (Actuation(), pushing, RigidBodies()))
+    assert model.inputs == ("tilt", "rotor_1", "rotor_2")
     q, v, u = states(robot)
-    a = system.dynamics(q, v, u).acceleration_map().offset
+    a = model.dynamics(q, v, u).acceleration_map().offset
     model = pin.buildModelFromXML(DRONE, pin.JointModelFreeFlyer())
     data = model.createData()
     for k in range(len(q)):
@@ -53,25 +53,25 @@ def test_accelerations_are_those_of_external_forces_in_pinocchio(robot, power):
 
 
 def test_an_observed_wrench_acts_along_the_axes_of_the_world(robot):
-    system = MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), ObservedWrench("pod")))
-    assert (system.inputs, system.held_inputs) == (("tilt", "wind_x", "wind_y", "wind_z"), (1, 2, 3))
+    model = Model(robot, (), (Actuation(), RigidBodies(), ObservedWrench("pod")))
+    assert (model.inputs, model.held_inputs) == (("tilt", "wind_x", "wind_y", "wind_z"), (1, 2, 3))
     q, v, u = states(robot)
     u = torch.cat([u[:, :1], torch.ones(5, 3, dtype=torch.float64) * torch.tensor([1.0, -2.0, 0.5])], -1)
-    calm = MechanicalSystem(robot).dynamics(q, v, u[:, :1])
+    calm = Model(robot).dynamics(q, v, u[:, :1])
     push = calm.state.kinematics.frame_jacobian("pod")[:, :3].mT @ u[0, 1:]
-    blown = system.dynamics(q, v, u)
+    blown = model.dynamics(q, v, u)
     torch.testing.assert_close(blown.Q_K - calm.Q_K, push)
-    six = MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), ObservedWrench("pod", tuple("abcdef"))))
+    six = Model(robot, (), (Actuation(), RigidBodies(), ObservedWrench("pod", tuple("abcdef"))))
     turned = six.dynamics(q, v, torch.cat([u, u[:, 1:]], -1)).Q_K - blown.Q_K
     torch.testing.assert_close(turned, calm.state.kinematics.frame_jacobian("pod")[:, 3:].mT @ u[0, 1:])
 
 
 def test_motions_foresee_a_wrench_that_fades_to_what_lasts(robot):
     fading = ObservedWrench("pod", tuple("abcdefghijkl"))
-    system = MechanicalSystem(robot, (), (Actuation(), RigidBodyBias(), ObservedWind(), fading))
-    assert system.held_inputs == tuple(range(1, 16))
+    model = Model(robot, (), (Actuation(), RigidBodies(), ObservedWind(), fading))
+    assert model.held_inputs == tuple(range(1, 16))
     u = torch.randn(3, 5, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    found = system.foreseen(u, 0.1)
+    found = model.foreseen(u, 0.1)
     torch.testing.assert_close(found[..., :1], u[..., :1])  # commanded
     torch.testing.assert_close(
         found[..., [1, 2, 3, *range(10, 16)]], u[:, :1, [1, 2, 3, *range(10, 16)]].expand(3, 5, 9)
@@ -83,27 +83,27 @@ def test_motions_foresee_a_wrench_that_fades_to_what_lasts(robot):
     rows = found[0]
     silent = rows.clone()
     silent[:, 10:] = 0.0
-    torch.testing.assert_close(system.dynamics(q, v, rows).Q_K, system.dynamics(q, v, silent).Q_K)
-    torch.autograd.gradcheck(lambda u: system.foreseen(u, 0.1), u[:1].clone().requires_grad_())
+    torch.testing.assert_close(model.dynamics(q, v, rows).Q_K, model.dynamics(q, v, silent).Q_K)
+    torch.autograd.gradcheck(lambda u: model.foreseen(u, 0.1), u[:1].clone().requires_grad_())
 
 
 def test_gradients(robot):
-    system = MechanicalSystem(robot, (), (Actuation(), Thrusters("pod", PLACES, 2.0, 0.1, AXES, 2), RigidBodyBias()))
+    model = Model(robot, (), (Actuation(), Thrusters("pod", PLACES, 2.0, 0.1, AXES, 2), RigidBodies()))
     q, v, u = states(robot, 1)
-    torch.autograd.gradcheck(lambda u: system.dynamics(q, v, u).Q_K, u[0].clone().requires_grad_())
+    torch.autograd.gradcheck(lambda u: model.dynamics(q, v, u).Q_K, u[0].clone().requires_grad_())
 
 
 def test_files_carry_them(robot):
     pushing = Thrusters("pod", PLACES, (2.0, 3.0), (0.1, -0.2), AXES, 2, ("left", "right"))
-    system = MechanicalSystem(robot, (), (Actuation(), pushing, RigidBodyBias(), ObservedWrench("body")))
-    again = MechanicalSystem.from_json(system.to_json())
+    model = Model(robot, (), (Actuation(), pushing, RigidBodies(), ObservedWrench("body")))
+    again = Model.from_json(model.to_json())
     q, v, u = states(robot)
     u = torch.cat([u, torch.ones(5, 3, dtype=torch.float64)], -1)
-    assert again.inputs == system.inputs == ("tilt", "left", "right", "wind_x", "wind_y", "wind_z")
-    torch.testing.assert_close(again.dynamics(q, v, u).Q_K, system.dynamics(q, v, u).Q_K, rtol=1e-14, atol=1e-15)
-    delivered = system.state(q, v, u).delivered
+    assert again.inputs == model.inputs == ("tilt", "left", "right", "wind_x", "wind_y", "wind_z")
+    torch.testing.assert_close(again.dynamics(q, v, u).Q_K, model.dynamics(q, v, u).Q_K, rtol=1e-14, atol=1e-15)
+    delivered = model.state(q, v, u).delivered
     torch.testing.assert_close(
-        delivered[:, 6:], (pushing.bound_to(robot).force(system.state(q, v, u))[:, 6:] + u[:, :1])
+        delivered[:, 6:], (pushing.bound_to(robot).force(model.state(q, v, u))[:, 6:] + u[:, :1])
     )
 
 
@@ -122,9 +122,9 @@ def test_files_carry_them(robot):
 )
 def test_what_does_not_fit_is_refused(robot, make, words):
     with pytest.raises(InvalidInput, match=words):
-        MechanicalSystem(robot, (), (Actuation(), make(), RigidBodyBias()))
+        Model(robot, (), (Actuation(), make(), RigidBodies()))
 
 
 def test_an_unknown_link_is_named(robot):
     with pytest.raises(UnknownFrame, match="wing"):
-        MechanicalSystem(robot, (), (Actuation(), Thrusters("wing", PLACES)))
+        Model(robot, (), (Actuation(), Thrusters("wing", PLACES)))

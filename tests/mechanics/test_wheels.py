@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.forces import ContactFriction
 from forcegp.integration import ConstraintManifold
-from forcegp.mechanics import Baumgarte, Contact, Held, MechanicalSystem, Plane, RollingContact, Sphere, rolling
-from forcegp.priors import ContactFriction
+from forcegp.mechanics import Baumgarte, Contact, Held, Plane, RollingContact, Sphere, rolling
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 BODY, AHEAD, SPIN = 8.0, 0.05, 0.3  # kg, m, kg m^2 about the centre of mass
@@ -127,7 +128,7 @@ def unicycle(speed, turn, left, right):
 @pytest.mark.parametrize("base", ["floating", "planar"])
 def test_a_differential_drive_is_the_unicycle(base):
     robot = Robot.from_urdf_text(CART, base=base)
-    system = MechanicalSystem(robot, (*WHEELS, CASTER) if base == "floating" else WHEELS)
+    model = Model(robot, (*WHEELS, CASTER) if base == "floating" else WHEELS)
     rng = np.random.default_rng(3)
     for _ in range(4):
         x, y, heading, speed, turn, *rest = rng.normal(size=9)
@@ -144,8 +145,8 @@ def test_a_differential_drive_is_the_unicycle(base):
         q = torch.tensor([*pose, *(angles[name] for name in names)], dtype=torch.float64)
         v = torch.tensor([*twist, *rates], dtype=torch.float64)
         u = torch.tensor([torques[name] for name in names], dtype=torch.float64)
-        system.check_states(q[None], v[None], u[None])
-        dynamics = system.dynamics(q, v, u)
+        model.check_states(q[None], v[None], u[None])
+        dynamics = model.dynamics(q, v, u)
         assert float((dynamics.A @ v).abs().max()) < 1e-12
         a = dynamics.acceleration_map().offset
         along, about = unicycle(speed, turn, torques["left"], torques["right"])
@@ -166,10 +167,10 @@ def test_a_ball_rolls_down_a_slope_with_five_sevenths():
     )
     robot = Robot.from_urdf_text(sphere, base="floating")
     slope = Plane((math.sin(0.3), 0.0, math.cos(0.3)), 0.0)
-    system = MechanicalSystem(robot, rolling("ball", r, None, ground=slope))
+    model = Model(robot, rolling("ball", r, None, ground=slope))
     q = robot.neutral()
     q[:3] = r * torch.tensor(slope.normal)
-    a = system.dynamics(q, torch.zeros(6).double(), torch.zeros(0).double())
+    a = model.dynamics(q, torch.zeros(6).double(), torch.zeros(0).double())
     down = torch.tensor([math.cos(0.3), 0.0, -math.sin(0.3)]).double()
     torch.testing.assert_close(a.acceleration_map().offset[:3], 5.0 / 7.0 * 9.81 * math.sin(0.3) * down)
     assert float(a.multiplier_map().offset[0]) == pytest.approx(m * 9.81 * math.cos(0.3))
@@ -179,10 +180,10 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     """A coin that wobbles: the fourth-order method on the manifold, kinetic and potential energy."""
     robot = Robot.from_urdf_text(DISC, base="floating")
     ground = Plane((0.0, 0.0, 1.0), 0.0)
-    system = MechanicalSystem(robot, rolling("disc", 0.15, ground=ground))
+    model = Model(robot, rolling("disc", 0.15, ground=ground))
     q, v = robot.neutral(), torch.zeros(6, dtype=torch.float64)
     q[2], v[3], v[4], v[5] = 0.15, 0.3, 8.0, 0.5
-    q, v = (x[0] for x in ConstraintManifold(system).project(q[None], v[None]))
+    q, v = (x[0] for x in ConstraintManifold(model).project(q[None], v[None]))
 
     def energy(q, v):
         return float(0.5 * v @ robot.mass_matrix(q) @ v + 2.0 * 9.81 * q[2])
@@ -190,7 +191,7 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     def slope(q, v, step, speed):
         at = robot.integrate(q, step) if step is not None else q
         w = v + speed if speed is not None else v
-        return w, system.dynamics(at, w, v[:0]).acceleration_map().offset
+        return w, model.dynamics(at, w, v[:0]).acceleration_map().offset
 
     start, dt, heights = energy(q, v), 2e-3, []
     for _ in range(250):
@@ -200,7 +201,7 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
         heights.append(float(q[2]))
     assert energy(q, v) == pytest.approx(start, rel=2e-5)
     assert np.ptp(heights) > 1e-3  # it does wobble
-    c, rate = ConstraintManifold(system).violation(q, v)
+    c, rate = ConstraintManifold(model).violation(q, v)
     assert float(c.abs().max()) < 1e-4
     assert float(rate.abs().max()) < 1e-3
 
@@ -208,23 +209,23 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
 def test_files_carry_wheels():
     robot = Robot.from_urdf_text(CART, base="floating")
     wheels = (*rolling("left_wheel", RADIUS, ground=tilted(), switch="down"), *rolling("right_wheel", 0.2, None))
-    system = MechanicalSystem(robot, (*wheels, CASTER), baumgarte=Baumgarte(3.0))
-    again = MechanicalSystem.from_json(system.to_json())
-    assert again.contacts == system.contacts
+    model = Model(robot, (*wheels, CASTER), baumgarte=Baumgarte(3.0))
+    again = Model.from_json(model.to_json())
+    assert again.contacts == model.contacts
     assert again.inputs[-1] == "down"
-    stored = json.loads(system.to_json())
+    stored = json.loads(model.to_json())
     stored["contacts"][0]["radius"] = "wide"
     with pytest.raises(FileFormatError, match="radius"):
-        MechanicalSystem.from_dict(stored)
+        Model.from_dict(stored)
 
 
 def test_a_wheel_off_the_ground_is_free():
     robot = Robot.from_urdf_text(CART, base="floating")
-    lifted = MechanicalSystem(robot, rolling("left_wheel", RADIUS, switch="down"))
+    lifted = Model(robot, rolling("left_wheel", RADIUS, switch="down"))
     q, v, u = states(robot)
     flags = torch.zeros(len(q), 1).double()
     a = lifted.dynamics(q, v, torch.cat([u[:, :2], flags], -1)).acceleration_map().offset
-    free = MechanicalSystem(robot).dynamics(q, v, u[:, :2]).acceleration_map().offset
+    free = Model(robot).dynamics(q, v, u[:, :2]).acceleration_map().offset
     torch.testing.assert_close(a, free)
 
 
@@ -237,10 +238,10 @@ def test_what_is_no_wheel_is_refused():
     ):
         with pytest.raises(InvalidInput, match=message):
             wrong()
-    system = MechanicalSystem(Robot.from_urdf_text(CART, base="planar"), WHEELS)
+    model = Model(Robot.from_urdf_text(CART, base="planar"), WHEELS)
     with pytest.raises(InvalidInput, match="no contact with a surface"):
-        ContactFriction(contact=0).check(system)
-    flat = MechanicalSystem(Robot.from_urdf_text(DISC, base="floating"), rolling("disc", 0.1))
+        ContactFriction(contact=0).check(model.robot, model.contacts)
+    flat = Model(Robot.from_urdf_text(DISC, base="floating"), rolling("disc", 0.1))
     q = flat.robot.neutral()
     q[3], q[6] = math.sqrt(0.5), math.sqrt(0.5)  # its axis is vertical
     with pytest.raises(ContactError, match="contact 0"):

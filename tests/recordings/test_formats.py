@@ -290,7 +290,7 @@ def test_options_of_other_formats_are_refused(tmp_path):
 
 
 def test_a_dataset_of_our_own_is_not_a_log(tmp_path):
-    from tests.models.arm import arm_data
+    from tests.posterior.arm import arm_data
 
     arm_data(20, seed=0).save(tmp_path / "arm.h5")
     with pytest.raises(FileFormatError, match="a dataset of forcegp already"):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.recordings.log_files import EPOCH
 
-from forcegp import MechanicalSystem, Robot
+from forcegp import Model, Robot
 from forcegp.data import Dataset
 from forcegp.errors import DatasetError
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings, open_source
@@ -100,7 +100,7 @@ POSE = ColumnMapping(q=("/odom:pose",), v=("/odom:twist",), u=("/rotors:data",),
 
 def imported(path, flight, mapping=POSE, **options):
     out = path.parent / "out.h5"
-    done = import_recordings([path], out, mapping, system=flight.system, options=ImportOptions(**options))
+    done = import_recordings([path], out, mapping, model=flight.model, options=ImportOptions(**options))
     return Dataset.load(out), done
 
 
@@ -182,8 +182,8 @@ def test_joints_of_another_topic_are_interpolated_and_their_torques_held(tmp_pat
         v=("/odom:twist", "/joints:velocity.{joints}"),
         u=("/joints:effort.{joints}",),
     )
-    system = MechanicalSystem(Robot.from_urdf_text(HOPPER, base="floating"))
-    done = import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, system=system)
+    model = Model(Robot.from_urdf_text(HOPPER, base="floating"))
+    done = import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, model=model)
     found = Dataset.load(tmp_path / "out.h5")
     np.testing.assert_allclose(found.time, base, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.q[:, 7], 0.3 * base, rtol=0, atol=1e-8)
@@ -203,10 +203,10 @@ def test_angles_that_wrap_are_not_interpolated_across(tmp_path):
         messages.append(("/joints", stamp, joint_state(stamp, angle)))
     path = written(tmp_path, messages)
     mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), unit={"q": ("deg",)})
-    system = MechanicalSystem(Robot.from_urdf_text(HOPPER.replace("revolute", "continuous"), base="floating"))
+    model = Model(Robot.from_urdf_text(HOPPER.replace("revolute", "continuous"), base="floating"))
     with pytest.raises(DatasetError, match="jumps by more than half a turn"):
-        import_recordings([path], tmp_path / "out.h5", mapping, system=system)
-    import_recordings([path], tmp_path / "out.h5", mapping, system=system, options=ImportOptions(unwrap=True))
+        import_recordings([path], tmp_path / "out.h5", mapping, model=model)
+    import_recordings([path], tmp_path / "out.h5", mapping, model=model, options=ImportOptions(unwrap=True))
     off = np.abs(Dataset.load(tmp_path / "out.h5").q[:, 7] - 3.0 * base)
     assert np.sort(off)[-4] < 1e-6
     assert off.max() < 3.0 / 70
@@ -254,8 +254,8 @@ def test_rows_at_the_clock_of_another_topic_have_turns_in_between(tmp_path):
     messages = [("/odom", s + LATE, odometry(s, each, np.zeros(6))) for s, each in stamped]
     messages += [("/joints", s, joint_state(s, 0.1)) for s in nanoseconds(rows).tolist()]
     mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), time="/joints:header.stamp")
-    system = MechanicalSystem(Robot.from_urdf_text(HOPPER, base="floating"))
-    import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, system=system)
+    model = Model(Robot.from_urdf_text(HOPPER, base="floating"))
+    import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, model=model)
     found = Dataset.load(tmp_path / "out.h5")
     assert len(found) == len(rows)
     error = Rotation.from_quat(found.q[:, 3:7]).inv() * Rotation.from_rotvec(np.outer(rows, rate))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.recordings.log_files import JOINTS, motion, table, write_text
 
-from forcegp import MechanicalSystem, Robot
+from forcegp import Model, Robot
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings import ColumnMapping, mapping_text, open_source, read_mapping
 from forcegp.recordings.column_names import expanded, guessed_columns, guessed_time, listed, parse_expression
@@ -230,8 +230,8 @@ def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
     columns = {"time": np.arange(3.0), "pos_shoulder": np.zeros(3), "eff_shoulder": np.zeros(3)}
     source = open_source(write_text(tmp_path / "log.csv", columns))
     with pytest.raises(InvalidInput, match=r"no columns for q .*named after finger \(`locked`"):
-        signal_plan(ColumnMapping(), source, MechanicalSystem(Robot.from_urdf_text(ARM)))
-    held = MechanicalSystem(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
+        signal_plan(ColumnMapping(), source, Model(Robot.from_urdf_text(ARM)))
+    held = Model(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
     assert signal_plan(ColumnMapping(), source, held).guessed[1] == "u = eff_shoulder"  # as ROS abbreviates effort
 
 
@@ -239,6 +239,4 @@ def test_the_order_of_columns_of_a_base_is_stated(tmp_path):
     columns = {name: np.zeros(3) for name in ("time", "x", "y", "yaw", "q_shoulder", "q_finger")}
     source = open_source(write_text(tmp_path / "log.csv", columns))
     with pytest.raises(InvalidInput, match=r"in the order base.x, base.y, base.yaw, shoulder, finger"):
-        signal_plan(
-            ColumnMapping(orientation="angles"), source, MechanicalSystem(Robot.from_urdf_text(ARM, base="planar"))
-        )
+        signal_plan(ColumnMapping(orientation="angles"), source, Model(Robot.from_urdf_text(ARM, base="planar")))

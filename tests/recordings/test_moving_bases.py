@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from tests.recordings.log_files import write_text
 
-from forcegp import MechanicalSystem, Robot
+from forcegp import Model, Robot
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import rolling
@@ -21,9 +21,9 @@ PLAIN = ColumnMapping(time="time", q=("q{0..6}",), v=("v{0..5}",), u=("u{0..3}",
 RPM = 30.0 / np.pi
 
 
-def system_of(dataset: Dataset) -> MechanicalSystem:
-    assert dataset.system is not None
-    return dataset.system
+def model_of(dataset: Dataset) -> Model:
+    assert dataset.model is not None
+    return dataset.model
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def turn(flight: Dataset) -> Rotation:
 
 def classical(flight: Dataset, frame: pin.ReferenceFrame) -> np.ndarray:
     """The acceleration of the base's origin, as a point of the world sees it."""
-    model = pin.buildModelFromXML(system_of(flight).robot.urdf_text, pin.JointModelFreeFlyer())
+    model = pin.buildModelFromXML(model_of(flight).robot.urdf_text, pin.JointModelFreeFlyer())
     data, found = model.createData(), []
     for q, v, a in zip(flight.q, flight.v, flight.a, strict=True):
         pin.forwardKinematics(model, data, q, v, a)
@@ -112,10 +112,10 @@ CONVENTIONS = (
 )
 
 
-def imported(folder, flight, changes=None, mapping=PLAIN, system=None, **options) -> Dataset:
+def imported(folder, flight, changes=None, mapping=PLAIN, model=None, **options) -> Dataset:
     path = write_text(folder / "log.csv", columns(flight, **(changes or {})))
-    system = system or flight.system
-    import_recordings([path], folder / "out.h5", mapping, system=system, options=ImportOptions(**options))
+    model = model or flight.model
+    import_recordings([path], folder / "out.h5", mapping, model=model, options=ImportOptions(**options))
     return Dataset.load(folder / "out.h5")
 
 
@@ -130,12 +130,12 @@ def test_every_convention_is_the_same_dataset(tmp_path, flight, convention):
     same = np.sign((found.q[:, 3:] * flight.q[:, 3:]).sum(axis=1))
     np.testing.assert_allclose(found.q[:, 3:], same[:, None] * flight.q[:, 3:], rtol=0, atol=1e-14)
     assert (same == same[0]).all()
-    assert system_of(found).inputs == ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
+    assert model_of(found).inputs == ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
 
 
 def test_what_lacks_is_differentiated_on_the_manifold(tmp_path, flight):
     """Poses alone; then with a gyroscope, whose values stay as they are."""
-    space = system_of(flight).robot.space
+    space = model_of(flight).robot.space
     found = imported(tmp_path, flight, mapping=replace(PLAIN, v=None, a=None))
     expected = differentiate(flight.q, flight.time, space)
     np.testing.assert_allclose(found.v, expected, rtol=0, atol=1e-10)
@@ -152,7 +152,7 @@ def test_a_spline_passes_signs_that_flip(tmp_path):
     random = np.random.default_rng(2)
     rows, rate = 2000, 200.0
     time = (np.arange(rows) + random.uniform(-0.2, 0.2, rows)) / rate
-    system = MechanicalSystem(Robot.from_urdf_text(BODY, base="floating"))
+    model = Model(Robot.from_urdf_text(BODY, base="floating"))
 
     def motion(t):
         spin = Rotation.from_rotvec(np.outer(t, [3.0, -1.0, 2.0])) * Rotation.from_euler("x", 0.3)
@@ -162,7 +162,7 @@ def test_a_spline_passes_signs_that_flip(tmp_path):
     q[:, 3:] *= random.choice([-1.0, 1.0], rows)[:, None]
     table = {"time": time} | {f"q{k}": q[:, k] for k in range(7)}
     path = write_text(tmp_path / "log.csv", table)
-    import_recordings([path], tmp_path / "out.h5", ColumnMapping(time="time", q=("q{0..6}",)), system=system)
+    import_recordings([path], tmp_path / "out.h5", ColumnMapping(time="time", q=("q{0..6}",)), model=model)
     found = Dataset.load(tmp_path / "out.h5")
     assert found.u.shape == (len(found), 0)
     expected = motion(found.time + time[0])
@@ -193,8 +193,8 @@ def test_other_bases(tmp_path, base, q, stated, ned):
     table = {"time": time} | {f"q{k}": column for k, column in enumerate(q(time).T)}
     path = write_text(tmp_path / "log.csv", table)
     mapping = ColumnMapping(time="time", q=(f"q{{0..{len(table) - 2}}}",), ned=ned, **stated)
-    system = MechanicalSystem(Robot.from_urdf_text(BODY, base=base))
-    import_recordings([path], tmp_path / "out.h5", mapping, system=system)
+    model = Model(Robot.from_urdf_text(BODY, base=base))
+    import_recordings([path], tmp_path / "out.h5", mapping, model=model)
     found = Dataset.load(tmp_path / "out.h5")
     side = -1.0 if ned else 1.0
     np.testing.assert_allclose(found.v[:, -1], 0.4 * side, rtol=1e-9)
@@ -244,9 +244,9 @@ def test_motors_of_an_mjcf_file_are_the_inputs(tmp_path, flight):
         f'<mujoco model="d"><worldbody><body name="body"><freejoint name="free"/><geom size=".1" mass="1"/>{sites}'
         f"</body></worldbody><actuator>{motors}</actuator></mujoco>"
     )
-    system = MechanicalSystem.from_file(tmp_path / "drone.xml", base="floating")
-    found = imported(tmp_path, flight, mapping=replace(PLAIN, unit={"u": ("1",)}), system=system)
-    assert system_of(found).inputs == ("m0", "m1", "m2", "m3")
+    model = Model.from_file(tmp_path / "drone.xml", base="floating")
+    found = imported(tmp_path, flight, mapping=replace(PLAIN, unit={"u": ("1",)}), model=model)
+    assert model_of(found).inputs == ("m0", "m1", "m2", "m3")
     np.testing.assert_array_equal(found.u, flight.u)
 
 
@@ -281,15 +281,15 @@ def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
     names = ["time", *(f"q{k}" for k in range(7)), *(f"v{k}" for k in range(6)), *(f"a{k}" for k in range(6))]
     path = write_text(tmp_path / "log.csv", dict(zip(names, np.array(rows).T, strict=True)))
     (tmp_path / "box.xml").write_text(text)
-    system = MechanicalSystem.from_file(tmp_path / "box.xml", base="floating")
+    model = Model.from_file(tmp_path / "box.xml", base="floating")
     axes = {"v": ("world", "body"), "a": ("world", "body")}
-    import_recordings([path], tmp_path / "out.h5", replace(PLAIN, u=None, orientation="wxyz", axes=axes), system=system)
+    import_recordings([path], tmp_path / "out.h5", replace(PLAIN, u=None, orientation="wxyz", axes=axes), model=model)
     found = Dataset.load(tmp_path / "out.h5")
-    moved = differentiate(found.q, found.time, system.robot.space)
+    moved = differentiate(found.q, found.time, model.robot.space)
     np.testing.assert_allclose(found.v[1:-1], moved[1:-1], rtol=0, atol=1e-4)
     q, v, u = (torch.tensor(x) for x in (found.q, found.v, found.u))
     np.testing.assert_allclose(
-        found.a, system.dynamics(q, v, u).acceleration(torch.zeros_like(v)).numpy(), rtol=0, atol=1e-9
+        found.a, model.dynamics(q, v, u).acceleration(torch.zeros_like(v)).numpy(), rtol=0, atol=1e-9
     )
 
 
@@ -307,8 +307,8 @@ MIDDLE = """<robot name="rail"><link name="rail"/><link name="cart"><inertial><m
 @pytest.mark.parametrize("orientation", ["xyzw", "wxyz", "angles"])
 def test_turning_joints_stand_where_the_robot_has_them(tmp_path, orientation):
     """Joints of one degree of freedom before and behind, named in another order in the log."""
-    system = MechanicalSystem(Robot.from_urdf_text(MIDDLE, base="fixed"))
-    assert system.robot.position_names == ("slide", "ball.qx", "ball.qy", "ball.qz", "ball.qw", "turn")
+    model = Model(Robot.from_urdf_text(MIDDLE, base="fixed"))
+    assert model.robot.position_names == ("slide", "ball.qx", "ball.qy", "ball.qz", "ball.qw", "turn")
     angle = np.random.default_rng(5).uniform(-0.5, 0.5, 3) * np.linspace(0, 1, 50)[:, None]
     quaternion, slide, turned = (
         Rotation.from_euler("xyz", angle).as_quat(),
@@ -321,7 +321,7 @@ def test_turning_joints_stand_where_the_robot_has_them(tmp_path, orientation):
         time="time", q=(f"q{{0..{len(table) - 2}}}",), u=("0",), joints=("turn", "slide"), orientation=orientation
     )
     mapping = replace(mapping, ned=True)  # no base: nothing to turn
-    import_recordings([write_text(tmp_path / "log.csv", table)], tmp_path / "out.h5", mapping, system=system)
+    import_recordings([write_text(tmp_path / "log.csv", table)], tmp_path / "out.h5", mapping, model=model)
     expected = np.column_stack([slide, quaternion, turned])
     np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q, expected, rtol=0, atol=1e-14)
 
@@ -337,11 +337,11 @@ def walking_log(tmp_path, u: np.ndarray):
 def test_flags_that_a_log_lacks_are_open(tmp_path):
     walk, mapping = walking_log(tmp_path, lambda walk: 1e3 * walk.u[:, :12])
     mapping = replace(mapping, unit={"u": ("mNm",)}, sign={"u": (-1.0,)})
-    given = {"paths": [tmp_path / "walk.csv"], "out": tmp_path / "walk.h5", "system": walk.system}
+    given = {"paths": [tmp_path / "walk.csv"], "out": tmp_path / "walk.h5", "model": walk.model}
     with pytest.raises(InvalidInput, match=r"u has 12 columns for 16 inputs .* 0 for a joint that nothing drives"):
         import_recordings(mapping=mapping, **given)
     done = import_recordings(mapping=mapping, options=ImportOptions(stance="auto"), **given)
-    assert done["open_switches"] == list(walk.system.inputs[12:])
+    assert done["open_switches"] == list(walk.model.inputs[12:])
     assert done["columns"]["u"] == [f"u{k}" for k in range(12)]
     u = Dataset.load(tmp_path / "walk.h5").u
     np.testing.assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
@@ -354,7 +354,7 @@ def test_signs_and_scales_of_the_actuators_leave_flags_alone(tmp_path):
     for change in ({"sign": {"u": (-1.0,)}}, {"sign": {"u": signs}}, {"scale": {"u": (0.5,)}}):
         options = ImportOptions(stance="auto")
         done = import_recordings([tmp_path / "walk.csv"], tmp_path / "walk.h5", replace(mapping, **change),
-                                 system=walk.system, options=options)  # fmt: skip
+                                 model=walk.model, options=options)  # fmt: skip
         u = Dataset.load(tmp_path / "walk.h5").u
         assert done["open_switches"] == []
         np.testing.assert_array_equal(u[:, 12:], walk.u[:, 12:])
@@ -368,7 +368,7 @@ def test_a_wheel_may_turn_often(tmp_path):
     part += "</inertial></link>"
     text = f'<robot name="cart">{part.format("base")}{part.format("wheel")}<joint name="axle" type="continuous">'
     text += '<parent link="base"/><child link="wheel"/><axis xyz="0 1 0"/></joint></robot>'
-    cart = MechanicalSystem(Robot.from_urdf_text(text, base="planar"))
+    cart = Model(Robot.from_urdf_text(text, base="planar"))
     turn = np.linspace(0.0, 60.0, 200)
     table = {
         "time": 0.01 * np.arange(200),
@@ -380,7 +380,7 @@ def test_a_wheel_may_turn_often(tmp_path):
     }
     path = write_text(tmp_path / "log.csv", table)
     mapping = ColumnMapping(time="time", q=("x", "y", "c", "s", "axle"), u=("0",))
-    import_recordings([path], tmp_path / "out.h5", mapping, system=cart.with_contacts(rolling("wheel", 0.1)))
+    import_recordings([path], tmp_path / "out.h5", mapping, model=cart.with_contacts(rolling("wheel", 0.1)))
     np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q[:, -1], turn)
     with pytest.raises(DatasetError, match="more than two turns"):
-        import_recordings([path], tmp_path / "no.h5", mapping, system=cart)
+        import_recordings([path], tmp_path / "no.h5", mapping, model=cart)

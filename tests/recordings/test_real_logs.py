@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from forcegp.data import Dataset, Preparation
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 from forcegp.robots import Robot
 
@@ -13,9 +13,9 @@ from forcegp.robots import Robot
 def test_eight_runs_of_a_double_pendulum(shared, tmp_path):
     folder = shared("realdata/dfki_double_pendulum")
     mapping = ColumnMapping(time="time", q=("pos_meas{1..2}",), v=("vel_meas{1..2}",), u=("tau_meas{1..2}",))
-    system = MechanicalSystem(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
+    model = Model(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
     runs = sorted((folder / "raw").glob("*.csv.gz"))
-    done = import_recordings(runs, tmp_path / "log.h5", mapping, system=system)
+    done = import_recordings(runs, tmp_path / "log.h5", mapping, model=model)
     data = Dataset.load(tmp_path / "log.h5")
     assert data.episodes == tuple(range(8))
     assert data.joint_names == ("joint1", "joint2")
@@ -44,7 +44,7 @@ def test_a_panda_whose_signals_lie_in_four_files(shared, tmp_path):
     )
     robot = Robot.from_urdf(folder / "model" / "panda_gaz2019_nomesh.urdf")
     paths = [folder / "raw" / f"{prefix}{name}.txt.gz" for name in names]
-    import_recordings(paths, tmp_path / "log.h5", mapping, system=MechanicalSystem(robot))
+    import_recordings(paths, tmp_path / "log.h5", mapping, model=Model(robot))
     raw = Dataset.load(tmp_path / "log.h5")
     assert raw.episodes == (0,)
     data = Preparation(cutoff=5.0, every=20, trim=0.25).apply(raw).dataset

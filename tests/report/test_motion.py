@@ -4,10 +4,10 @@ import numpy as np
 import pinocchio
 import pytest
 import torch
-from tests.analytical.test_moving_bases import FEET, recorded
+from tests.fit.test_identified_moving_bases import FEET, recorded
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp import Dataset, JointFriction, MechanicalSystem, Robot, StructuredGP
+from forcegp import Dataset, JointFriction, Model, Robot, fit
 from forcegp.errors import InvalidInput
 from forcegp.report import recorded_scene, scene_notes
 from forcegp.report.motion import LONGEST_ARROW
@@ -15,7 +15,7 @@ from forcegp.report.motion import LONGEST_ARROW
 
 def test_poses_are_pinocchios(swinging):
     scene = recorded_scene(swinging, seconds=1.0)
-    model = pinocchio.buildModelFromXML(swinging.system.robot.urdf_text)
+    model = pinocchio.buildModelFromXML(swinging.model.robot.urdf_text)
     data = model.createData()
     for row in (0, len(scene.time) - 1):
         pinocchio.forwardKinematics(model, data, scene.q[row])
@@ -48,7 +48,7 @@ def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):
     total = friction.components(q, v, u).total
     np.testing.assert_allclose(arrows.mean, (total.mean - 0.1 * v).numpy(), atol=1e-10)
     np.testing.assert_allclose(arrows.half, 1.959963984540054 * total.std.numpy(), rtol=1e-9)
-    robot = swinging.system.robot
+    robot = swinging.model.robot
     pose = robot.frame_pose(q, robot.joints[1].child).numpy()
     np.testing.assert_allclose(arrows.start[:, 1], pose[:, :3, 3], atol=1e-12)
     np.testing.assert_allclose(arrows.direction[:, 1], pose[:, :3, :3] @ robot.joints[1].axis, atol=1e-12)
@@ -56,7 +56,7 @@ def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):
 
 def test_contact_arrows_are_the_predicted_force(on_plane):
     q, v, u = (on_plane.training.q[:4], on_plane.training.v[:4], on_plane.training.u[:4])
-    data = Dataset(q=q, v=v, u=u, a=np.zeros((4, 3)), time=0.01 * np.arange(4), system=on_plane.system)
+    data = Dataset(q=q, v=v, u=u, a=np.zeros((4, 3)), time=0.01 * np.arange(4), model=on_plane.model)
     scene = recorded_scene(data, on_plane)
     contact = next(arrows for arrows in scene.arrows if arrows.title.startswith("contact force"))
     chosen = [int(np.flatnonzero((q.numpy() == row).all(1))[0]) for row in scene.q]
@@ -67,7 +67,7 @@ def test_contact_arrows_are_the_predicted_force(on_plane):
     d = torch.tensor(contact.direction[:, 0])
     std = (d[:, None, :] @ predicted.covariance[chosen] @ d[..., None])[:, 0, 0].sqrt()
     np.testing.assert_allclose(contact.half[:, 0], 1.959963984540054 * std.numpy(), rtol=1e-6)
-    position = on_plane.system.contacts[0].position(on_plane.system.robot.kinematics(q[chosen])).numpy()
+    position = on_plane.model.contacts[0].position(on_plane.model.robot.kinematics(q[chosen])).numpy()
     np.testing.assert_allclose(contact.start[:, 0], position, atol=1e-12)
     np.testing.assert_allclose(scene.paths[0], position, atol=1e-12)
 
@@ -101,9 +101,9 @@ def test_a_dataset_without_robot_is_refused(swinging):
 
 def test_a_foot_that_stands_has_one_arrow():
     """Its three constraints are one force, that of the multipliers in world axes; a foot that swings has none."""
-    walker = MechanicalSystem(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
+    walker = Model(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
     rows = recorded(walker, 40)
-    model = StructuredGP(rows.system, JointFriction(), noise=0.1).fit(rows, points=20, restarts=1)
+    model = fit(rows.model.with_forces(JointFriction(), noise=0.1), rows, points=20, restarts=1)
     scene = recorded_scene(rows, model)
     feet = {arrows.title: arrows for arrows in scene.arrows if arrows.title.startswith("contact force")}
     assert sorted(feet) == ["contact force at a_foot", "contact force at b_foot"]

@@ -146,5 +146,5 @@ def test_a_log_for_rerun_holds_the_motion(swinging, friction, tmp_path):
 
 
 def test_a_dataset_alone_has_a_page(swinging):
-    bare = Dataset(q=swinging.q, v=swinging.v, u=swinging.u, a=swinging.a, system=swinging.system, time=swinging.time)
+    bare = Dataset(q=swinging.q, v=swinging.v, u=swinging.u, a=swinging.a, model=swinging.model, time=swinging.time)
     assert recorded_scene(bare, seconds=0.2).arrows[0].title == "recorded u"

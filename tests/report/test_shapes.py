@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from tests.models.arm import URDF
+from tests.posterior.arm import URDF
 
 from forcegp import Robot
 from forcegp.errors import InvalidInput

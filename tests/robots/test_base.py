@@ -6,7 +6,7 @@ import torch
 from tests.robots.robot_models import CHAIN, MODELS, TREE
 
 from forcegp.errors import InvalidInput, RobotModelError, UnstatedBase
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.base import BaseChoice
 
@@ -54,7 +54,7 @@ def test_robots_that_walk_drive_or_fly_are_asked(name):
     bolted = Robot.from_urdf_text(LOOSE[name], base="fixed")
     for each in (robot, bolted):
         again = each.with_armature([0.1] * each.nv)  # and nobody asks again
-        assert MechanicalSystem.from_json(MechanicalSystem(again).to_json()).robot.base == each.base
+        assert Model.from_json(Model(again).to_json()).robot.base == each.base
 
 
 @pytest.mark.parametrize("name", BOLTED)

@@ -78,7 +78,7 @@ def test_stored_robots_and_urdf_files_are_the_same_robot(name, tmp_path):
 def test_limits_names_and_losses():
     with pytest.warns(RobotFileWarning) as caught:
         chain = Robot.from_mjcf_text(FOUR_BAR)
-    assert "left out: closed loops (MechanicalSystem.from_mjcf has them) (pin)" in str(caught[0].message)
+    assert "left out: closed loops (Model.from_mjcf has them) (pin)" in str(caught[0].message)
     assert chain.joint_names == ("crank", "coupler", "rocker")
     arm = Robot.from_mjcf_text(ARM)
     assert arm.joint_names == ("shoulder", "roll", "elbow", "body_4_slide")
@@ -108,7 +108,7 @@ def test_sites_are_frames():
 HINGE = '<mujoco><worldbody><body name="a"><joint name="j" {0}/>{1}</body></worldbody>{2}</mujoco>'
 BALL = '<geom size=".1"/>'
 LOSSES = {
-    "springs (j)": ('stiffness="2"', BALL, ""),
+    "springs (Model.from_mjcf has them) (j)": ('stiffness="2"', BALL, ""),
     "tendons (t)": ("", BALL, '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
     "laws of actuators (u holds joint forces) (servo)": (
         "",

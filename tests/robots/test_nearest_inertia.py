@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotFileWarning
-from forcegp.mechanics import MechanicalSystem
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import lay_out
@@ -68,7 +68,7 @@ def test_the_repaired_robot_says_so_and_can_be_stored():
     with pytest.warns(RobotFileWarning, match=r"link 'arm'.*triangle.* \d+(\.\d+)? %"):
         robot = Robot.from_urdf_text(BROKEN, inertias="nearest")
     assert "<!-- rounded to death -->" in robot.to_urdf()
-    again = MechanicalSystem.from_json(MechanicalSystem(robot).to_json()).robot
+    again = Model.from_json(Model(robot).to_json()).robot
     q = torch.zeros(1).double()
     assert again.mass_matrix(q).equal(robot.mass_matrix(q))
     robot.inertial_parameters("arm")  # log-Cholesky parameters exist

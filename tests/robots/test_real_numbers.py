@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 from tests.data.samples import LINK, TWO_JOINTS, columns, dataset
-from tests.models.arm import arm_data
+from tests.posterior.arm import arm_data
 
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
-from forcegp.models import IndependentGP, StructuredGP
+from forcegp.fit import fit
+from forcegp.forces import JointForces
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
@@ -23,7 +25,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def posterior(data):
-    return StructuredGP(data.system).fit(data, restarts=1)
+    return fit(data.model.with_forces(JointForces()), data, restarts=1)
 
 
 @pytest.fixture(scope="module")
@@ -85,12 +87,12 @@ def test_numbers_of_any_precision_are_converted_exactly_everywhere(posterior, da
     given = tuple(x.astype(kind) for x in state)
     exact = tuple(torch.tensor(x.astype(np.float64)) for x in given)
     tensors = tuple(torch.tensor(x) for x in given)
-    robot, predictor = data.system.robot, posterior.predictor(compile=False)
+    robot, predictor = data.model.robot, posterior.predictor(compile=False)
     expected = posterior.predict(*exact, covariance=False).mean
     for same in (given, tensors):
         assert torch.equal(posterior.predict(*same, covariance=False).mean, expected)
         assert torch.equal(predictor.mean(*same), predictor.mean(*exact))
-    assert torch.equal(data.system.dynamics(*tensors).H, data.system.dynamics(*exact).H)
+    assert torch.equal(data.model.dynamics(*tensors).H, data.model.dynamics(*exact).H)
     assert torch.equal(robot.inverse_dynamics(*tensors), robot.inverse_dynamics(*exact))
     assert torch.equal(robot.forward_dynamics(*tensors), robot.forward_dynamics(*exact))
     held = dataset(q=columns()["q"].astype(kind)).q
@@ -123,10 +125,10 @@ def test_text_and_truth_values_are_no_vector(given):
         ("seed", 10**30),
     ],
 )
-@pytest.mark.parametrize("kind", [StructuredGP, IndependentGP])
+@pytest.mark.parametrize("kind", [lambda model: model.with_forces(JointForces()), Model.black_box])
 def test_numbers_of_a_fit_are_integers_in_their_range(data, kind, argument, given):
     with pytest.raises(InvalidInput, match=rf"`{argument}=.*` must be an integer"):
-        kind(data.system).fit(data, **{argument: given})
+        fit(kind(data.model), data, **{argument: given})
 
 
 def test_integers_of_numpy_are_integers():

@@ -7,14 +7,7 @@ import pytest
 import torch
 from tests.robots.robot_models import CHAIN, TREE
 
-from forcegp.errors import (
-    InvalidInput,
-    NonPhysicalInertia,
-    NumericalError,
-    UnknownFrame,
-    UnknownJoint,
-    UnknownLink,
-)
+from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError, UnknownFrame, UnknownJoint, UnknownLink
 from forcegp.robots import Robot, physical_from_parameters
 
 

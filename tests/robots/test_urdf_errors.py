@@ -11,7 +11,7 @@ from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN
 
 from forcegp import errors
-from forcegp.analytical.bodies import thickened
+from forcegp.evidence.bodies import thickened
 from forcegp.robots import Robot
 
 SMALL = """<robot name="small">

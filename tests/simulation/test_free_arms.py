@@ -25,10 +25,10 @@ def simulated(arm, **options):
 @pytest.mark.parametrize("arm", TEXTS)
 def test_rows_satisfy_pinocchios_inverse_dynamics(arm):
     data = simulated(arm, seconds=2.0, seed=3)
-    oracle = Oracle(TEXTS[arm], data.system.robot)  # with the rotors as armature
+    oracle = Oracle(TEXTS[arm], data.model.robot)  # with the rotors as armature
     forces = np.array([oracle.inverse_dynamics(*row) for row in zip(data.q, data.v, data.a, strict=True)])
     np.testing.assert_allclose(forces, data.u + data.truth["Q_U"], rtol=1e-9, atol=1e-9)
-    assert abs(data.truth["Q_U"]).max() > 0.02 * max(joint.effort_limit for joint in data.system.robot.joints)
+    assert abs(data.truth["Q_U"]).max() > 0.02 * max(joint.effort_limit for joint in data.model.robot.joints)
 
 
 @pytest.mark.parametrize("arm", TEXTS)
@@ -77,7 +77,7 @@ def test_seeds_and_noise_have_streams_of_their_own():
     np.testing.assert_array_equal(both.q[:240], plain.q)
     assert abs(both.q[240:] - plain.q).max() > 0.1
     assert abs(simulated("ur5-free", seed=1).q - plain.q).max() > 0.1
-    limits = [joint.effort_limit for joint in plain.system.robot.joints]
+    limits = [joint.effort_limit for joint in plain.model.robot.joints]
     assert (abs(both.u) <= limits).all()
 
 

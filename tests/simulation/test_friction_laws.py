@@ -1,3 +1,6 @@
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -5,17 +8,27 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from forcegp.errors import SimulationError
+from forcegp import Robot
+from forcegp.errors import InvalidInput, SimulationError
+from forcegp.forces.force import JointLaw
+from forcegp.forces.parameters import Coefficient
+from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.contact_forces import (
-    DryFriction,
-    RoughPatch,
-    ViscousFriction,
-    multiplier_with_friction,
-)
-from forcegp.simulation.joint_friction import OF_VELOCITY, JointFrictionLaw
+from forcegp.simulation.contact_forces import DryFriction, RoughPatch, ViscousFriction, multiplier_with_friction
+from forcegp.simulation.joint_friction import JointFrictionLaw, LawsOfJoints
+from forcegp.simulation.scenarios import OF_PLANTS
 
-STRIBECK = DryFriction(coulomb=0.3, static=0.5, stribeck_velocity=0.1, smoothing=1e-6)
+STRIBECK = DryFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
+ROBOT = Robot.from_urdf_text(
+    "<robot name='seven'><link name='l0'/>"
+    + "".join(
+        f"<link name='l{k}'><inertial><mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' "
+        f"iyz='0'/></inertial></link><joint name='j{k}' type='continuous'><parent link='l{k - 1}'/>"
+        f"<child link='l{k}'/></joint>"
+        for k in range(1, 8)
+    )
+    + "</robot>"
+)
 UP = np.array([0.0, 0.0, 1.0])
 numbers = st.floats(-3.0, 3.0)
 vectors = st.tuples(numbers, numbers, numbers).map(np.array)
@@ -24,7 +37,7 @@ vectors = st.tuples(numbers, numbers, numbers).map(np.array)
 def test_dry_friction_at_speeds_known_by_hand():
     expected = [0.0, 0.5, 0.3 + 0.2 / np.e, 0.3]
     np.testing.assert_allclose(STRIBECK.coefficient(np.array([0.0, 1e-3, 0.1, 5.0])), expected, atol=3e-5)
-    coulomb = DryFriction(coulomb=0.3, static=0.3, stribeck_velocity=0.1, smoothing=0.04)
+    coulomb = DryFriction(coulomb=0.3, static=0.3, breakaway_velocity=0.1, smoothing=0.04)
     assert coulomb.coefficient(np.array(0.03)) == pytest.approx(0.3 * 0.6)  # 3-4-5
     np.testing.assert_allclose(coulomb.force(np.array([0.03, 0.0, 7.0]), UP), [-0.18, 0.0, 0.0], atol=1e-15)
 
@@ -34,7 +47,7 @@ def test_joint_friction_and_the_patch_at_values_known_by_hand():
     np.testing.assert_allclose(law.curve(v := np.full(7, 0.2)), C + (S - C) / np.e + D * v, atol=1e-12)
     np.testing.assert_allclose(law.curve(np.full((1, 7), -10.0)), [-C - 10.0 * D], atol=1e-12)
     np.testing.assert_array_equal(law.step(v, U, INERTIA, 3.0), -law.curve(v))
-    law = joint_law("exponential", joint_smoothing=1e-6, joint_stribeck_velocity=0.5)
+    law = joint_law("exponential", joint_smoothing=1e-6, joint_breakaway_velocity=0.5)
     np.testing.assert_allclose(law.curve(np.full(7, -1.0)), -(C + (S - C) * np.exp(-2.0) + D), atol=1e-12)
     patch = RoughPatch(0.0, 0.25, factor=4.0)
     np.testing.assert_allclose([patch.scale(x) for x in (-0.1, 0.0, 0.1, 0.25, 0.4)], [1, 2.5, 4, 2.5, 1], atol=1e-12)
@@ -52,16 +65,39 @@ def test_friction_takes_energy_and_dry_friction_is_tangential_with_its_coefficie
     speed = np.linalg.norm(velocity - (velocity @ normal) * normal)
     assert np.linalg.norm(force) == pytest.approx(float(dry.coefficient(np.array(speed))), abs=1e-11)
     v = np.resize(velocity, 7)
-    for name in (*OF_VELOCITY, "load", "drift"):
+    for name in ("coulomb", "stribeck", *OF_PLANTS[:3], "drift"):
         assert (joint_law(name, joint_smoothing=smoothing).step(v, U, INERTIA, 1.0) * v <= 0.0).all()
 
 
 def joint_law(name: str, **changes) -> JointFrictionLaw:
-    return JointFrictionLaw(KukaSurfaceConfig(joint_friction=name, **changes))
+    return JointFrictionLaw(KukaSurfaceConfig(joint_friction=name, **changes), ROBOT)
 
 
 C, S, D = (np.array(getattr(KukaSurfaceConfig(), f"joint_{name}")) for name in ("coulomb", "static", "viscous"))
 U, INERTIA, DT = np.linspace(-30.0, 40.0, 7), np.diag(np.linspace(2.0, 0.1, 7)), KukaSurfaceConfig().time_step
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic(JointLaw):
+    """A law of somebody else: -k |v| v."""
+
+    drag: float | None = None
+    coefficients: ClassVar = {"drag": Coefficient("force/velocity^2", 0.3)}
+
+    def amplitude(self, features, parameters):
+        return -parameters["drag"] * features[0].abs() * features[0]
+
+
+def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
+    monkeypatch.setitem(FORCES, "quadratic", Quadratic)
+    v = np.linspace(-1.0, 1.0, 7)
+    np.testing.assert_allclose(joint_law("quadratic").step(v, U, INERTIA, 0.0), -0.3 * np.abs(v) * v - D * v)
+    twice = joint_law("quadratic:drag=0.6,viscous:0")
+    np.testing.assert_allclose(twice.step(v, U, INERTIA, 0.0), -0.6 * np.abs(v) * v, atol=1e-14)
+    free = LawsOfJoints.named("quadratic", ROBOT, {"damping": 0.0})
+    np.testing.assert_allclose(free.slope(v), 0.6 * np.abs(v), atol=1e-5)
+    with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give one of none"):
+        joint_law("payload:l7")
 
 
 def test_a_hard_sign_differs_by_direction_and_stops_a_joint_without_turning_it_round():
@@ -123,8 +159,8 @@ def test_multiplier_and_acceleration_solve_the_equations_that_hold_together(seed
 
     assert found == pytest.approx(brentq(residual, -1e4, 1e4, xtol=1e-12), rel=1e-9)
     # the saddle-point system in one piece, with the sign that was found
-    system = np.block([[mass, -(row + np.sign(found) * per_load)[:, None]], [row[None], np.zeros((1, 1))]])
-    assert np.linalg.solve(system, np.append(force, b))[7] == pytest.approx(found, rel=1e-9)
+    model = np.block([[mass, -(row + np.sign(found) * per_load)[:, None]], [row[None], np.zeros((1, 1))]])
+    assert np.linalg.solve(model, np.append(force, b))[7] == pytest.approx(found, rel=1e-9)
 
 
 def test_a_normal_force_that_is_not_determined_is_refused():

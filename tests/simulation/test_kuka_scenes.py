@@ -42,7 +42,7 @@ def tensors(data: Dataset, *names: str) -> list[torch.Tensor]:
 def tool_motion(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian, velocity, normal and place of the tool point in every row."""
     q, v, u = tensors(data, "q", "v", "u")
-    dynamics, (contact,) = data.system.dynamics(q, v, u), data.system.contacts
+    dynamics, (contact,) = data.model.dynamics(q, v, u), data.model.contacts
     jacobian = dynamics.state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
     place = contact.position(dynamics.state.kinematics)
     velocity = (jacobian @ v[..., None])[..., 0]
@@ -53,12 +53,12 @@ def tool_motion(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 def test_the_equations_of_motion_hold_in_every_row(scenes, name):
     data = scenes[name]
     q, v, u, a, unknown = tensors(data, "q", "v", "u", "a", "Q_U")
-    dynamics = data.system.dynamics(q, v, u)
+    dynamics = data.model.dynamics(q, v, u)
     force = u + unknown
-    if data.system.contacts:
+    if data.model.contacts:
         (multiplier,) = tensors(data, "lambda")
         force = force + (dynamics.A.mT @ multiplier[..., None])[..., 0]
-    np.testing.assert_allclose(data.system.robot.inverse_dynamics(q, v, a), force, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(data.model.robot.inverse_dynamics(q, v, a), force, rtol=0, atol=1e-10)
     if not name.startswith(("bullet", "none")):
         np.testing.assert_allclose((dynamics.A @ a[..., None])[..., 0], dynamics.b, rtol=0, atol=1e-10)
 
@@ -72,7 +72,7 @@ def test_parts_of_the_unknown_force_exist_where_the_force_does_and_add_up(scenes
     assert parts == expected
     assert ("in_contact" in data.truth) == (made.contact == "bullet")
     assert ("lambda" in data.truth) == ("force.tool-friction" in data.truth) == (made.surface != "none")
-    assert len(data.system.contacts) == (made.surface != "none")
+    assert len(data.model.contacts) == (made.surface != "none")
     np.testing.assert_allclose(sum(data.truth[part] for part in parts), data.truth["Q_U"], atol=1e-13)
     assert KukaSurfaceConfig(**data.metadata["config"]) == made
 
@@ -83,7 +83,7 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
     jacobian, velocity, normal, _ = tool_motion(data)
     force, load = data.truth["force.tool-friction"], np.abs(data.truth["lambda"][:, 0])
     static = made.static_coefficient if made.friction == "stribeck" else made.coulomb_coefficient
-    law = DryFriction(made.coulomb_coefficient, static, made.stribeck_velocity, made.friction_smoothing)
+    law = DryFriction(made.coulomb_coefficient, static, made.breakaway_velocity, made.friction_smoothing)
     tangential = velocity - (velocity * normal).sum(1)[:, None] * normal
     speed = np.linalg.norm(tangential, axis=1)
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), law.coefficient(speed) * load, atol=1e-9)
@@ -97,7 +97,9 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
 @pytest.mark.parametrize("scene", ["none", "coulomb-joints"])
 def test_joint_friction_is_its_law(scenes, scene):
     data = scenes[scene]
-    np.testing.assert_array_equal(data.truth["Q_U.joint-friction"], -JointFrictionLaw(config(scene)).curve(data.v))
+    np.testing.assert_array_equal(
+        data.truth["Q_U.joint-friction"], -JointFrictionLaw(config(scene), data.model.robot).curve(data.v)
+    )
 
 
 def test_the_patch_multiplies_viscous_friction_where_it_lies(scenes):
@@ -111,10 +113,10 @@ def test_the_patch_multiplies_viscous_friction_where_it_lies(scenes):
 
 def test_free_motion_stays_above_the_table(scenes):
     data = scenes["none"]
-    pose = data.system.robot.frame_pose(torch.tensor(data.q), "lbr_iiwa_link_7").numpy()
+    pose = data.model.robot.frame_pose(torch.tensor(data.q), "lbr_iiwa_link_7").numpy()
     height = (pose[:, :3, :3] @ [0.0, 0.0, 0.1] + pose[:, :3, 3])[:, 2]
     np.testing.assert_allclose(height, 0.055 + 0.05, atol=5e-3)
-    assert data.system.contacts == ()
+    assert data.model.contacts == ()
 
 
 @pytest.mark.parametrize("name", ["bullet", "bullet-sphere"])
@@ -151,7 +153,7 @@ def test_equal_seeds_give_equal_data(scenes, name):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"friction": "wet"}, "one of viscous, coulomb, stribeck"),
+        ({"friction": "wet"}, "no friction .wet. in the tool"),
         ({"surface": "cone"}, "one of plane, tilted, sphere, none"),
         ({"contact": "bullet", "surface": "none"}, "needs a surface"),
         ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),

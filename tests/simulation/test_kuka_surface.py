@@ -40,22 +40,22 @@ def tensors(data: Dataset, *names: str) -> list[torch.Tensor]:
 
 def test_rigid_body_dynamics_holds_in_every_row(data):
     q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
-    dynamics = data.system.dynamics(q, v, u)
+    dynamics = data.model.dynamics(q, v, u)
     force = u + unknown + (dynamics.A.mT @ multiplier[..., None])[..., 0]
-    found = data.system.robot.inverse_dynamics(q, v, a)
+    found = data.model.robot.inverse_dynamics(q, v, a)
     np.testing.assert_allclose(found, force, rtol=0, atol=1e-10)
 
 
 def test_the_constraint_with_baumgarte_holds_in_every_row(data):
     q, v, u, a = tensors(data, "q", "v", "u", "a")
-    dynamics = data.system.dynamics(q, v, u)
+    dynamics = data.model.dynamics(q, v, u)
     residual = (dynamics.A @ a[..., None])[..., 0] - dynamics.b
     assert float(residual.abs().max()) < 1e-10
 
 
 def test_gauss_principle_gives_acceleration_and_multiplier_from_the_true_force(data):
     q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
-    dynamics = data.system.dynamics(q, v, u)
+    dynamics = data.model.dynamics(q, v, u)
     np.testing.assert_allclose(dynamics.acceleration(unknown), a, rtol=0, atol=1e-8)
     np.testing.assert_allclose(dynamics.multiplier(unknown), multiplier, rtol=0, atol=1e-8)
 
@@ -63,14 +63,14 @@ def test_gauss_principle_gives_acceleration_and_multiplier_from_the_true_force(d
 def test_the_unknown_force_is_viscous_friction_at_the_tool_point(data):
     q, v, unknown = tensors(data, "q", "v", "Q_U")
     point = torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
-    jacobian = data.system.robot.frame_jacobian(q, TOOL_LINK, point)[:, :3]
+    jacobian = data.model.robot.frame_jacobian(q, TOOL_LINK, point)[:, :3]
     friction = -1.0 * (jacobian @ v[..., None])
     np.testing.assert_allclose(unknown, (jacobian.mT @ friction)[..., 0], atol=1e-12)
 
 
 def test_the_tool_stays_on_the_plane_and_points_down(data):
     (q,) = tensors(data, "q")
-    pose = data.system.robot.frame_pose(q, TOOL_LINK).numpy()
+    pose = data.model.robot.frame_pose(q, TOOL_LINK).numpy()
     tool = pose[:, :3, :3] @ [0.0, 0.0, 0.1] + pose[:, :3, 3]
     assert np.abs(tool[:, 2] - 0.055).max() < 1e-3
     np.testing.assert_allclose(pose[:, 2, 2], -1.0, atol=1e-4)
@@ -99,10 +99,10 @@ def test_it_describes_itself(data):
     assert data.episodes == (0,)
     assert data.time_ordered
     np.testing.assert_array_equal(data.noise_std, np.full(7, 0.1))
-    (contact,) = data.system.contacts
+    (contact,) = data.model.contacts
     assert (contact.frame, tuple(contact.point)) == (TOOL_LINK, (0.0, 0.0, 0.1))
     assert contact.surface == Plane((0.0, 0.0, 1.0), 0.055)
-    assert (data.system.baumgarte.omega, data.system.baumgarte.zeta) == (10.0, 1.0)
+    assert (data.model.baumgarte.omega, data.model.baumgarte.zeta) == (10.0, 1.0)
     assert data.metadata["scenario"] == "kuka-surface"
     assert KukaSurfaceConfig(**data.metadata["config"]) == KukaSurfaceConfig(seconds=5.0, seed=3)
 
@@ -111,9 +111,9 @@ def test_it_comes_back_from_a_file_with_its_robot(short, tmp_path):
     short.save(tmp_path / "log.h5")
     loaded = Dataset.load(tmp_path / "log.h5")
     assert_equal(loaded, short)
-    assert loaded.system.to_json() == short.system.to_json()
+    assert loaded.model.to_json() == short.model.to_json()
     q, v, u = tensors(short, "q", "v", "u")
-    np.testing.assert_array_equal(loaded.system.dynamics(q, v, u).M, short.system.dynamics(q, v, u).M)
+    np.testing.assert_array_equal(loaded.model.dynamics(q, v, u).M, short.model.dynamics(q, v, u).M)
 
 
 def test_noise_has_the_stated_distribution(data):
@@ -257,7 +257,7 @@ def test_the_robot_of_the_scenario_is_the_papers(paper, data):
     q, v, u = (torch.tensor(paper[f"test_{name}"]) for name in "qvu")
     np.testing.assert_allclose(robot.mass_matrix(q), paper["test_M"], atol=1e-9)
     np.testing.assert_allclose(robot.bias_forces(q, v), -paper["test_f"] - paper["test_g"], atol=1e-9)
-    dynamics = data.system.dynamics(q, v, u)
+    dynamics = data.model.dynamics(q, v, u)
     np.testing.assert_allclose(dynamics.A, paper["test_A"], atol=1e-9)
     np.testing.assert_allclose(dynamics.b, paper["test_b"], atol=1e-9)
     unknown = torch.tensor(paper["test_Q_U"])

@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import AerodynamicForce, Dataset, MechanicalSystem, Robot, StructuredGP
-from forcegp.cli.fit import fit_summary
+from forcegp import AerodynamicForce, Dataset, Model, Robot, calibrated, fit
 from forcegp.data import estimate_thruster_lag, recorded_motions
 from forcegp.data.delay import lagged
-from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
+from forcegp.errors import InvalidInput
 from forcegp.evaluation.predicted_rows import predict_rows
-from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Actuation, RigidBodyBias
-from forcegp.models import export_c, load_posterior, observing, save_posterior
-from forcegp.models.observed_wrench import _lasting
-from forcegp.priors import JointAccelerations, JointForces
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.posterior import export_c, load_posterior, observing, save_posterior
+from forcegp.posterior.observed_wrench import _lasting
 from forcegp.report.motion import recorded_scene
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -42,13 +39,13 @@ def acting(dataset, lag=0.06):
 def posterior(train):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return StructuredGP(train.system, AerodynamicForce()).fit(acting(train), points=80, restarts=1)
+        return fit(train.model.with_forces(AerodynamicForce()), acting(train), points=80, restarts=1)
 
 
 def test_velocities_and_accelerations_are_derivatives(test):
     inside = np.arange(1, 400)
     q = torch.tensor(test.q)
-    slope = 120.0 * test.system.robot.difference(q[inside - 1], q[inside + 1])
+    slope = 120.0 * test.model.robot.difference(q[inside - 1], q[inside + 1])
     np.testing.assert_allclose(slope, test.v[inside], atol=1e-3)
     speed = 120.0 * (test.v[inside + 1] - test.v[inside - 1])
     np.testing.assert_allclose(speed, test.truth["a"][inside], atol=0.2)
@@ -58,7 +55,7 @@ def test_without_wind_at_rest_only_thrust_and_lag_are_unknown():
     calm = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1, wind=0.0, noise=0.0))
     windy = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1, wind=12.0, noise=0.0))
     assert np.abs(calm.truth["Q_U"][:, :2]).max() < 0.25 * np.abs(windy.truth["Q_U"][:, :2]).max()
-    known = calm.system.dynamics(*(torch.tensor(x) for x in (calm.q, calm.v, calm.u)))
+    known = calm.model.dynamics(*(torch.tensor(x) for x in (calm.q, calm.v, calm.u)))
     a = known.acceleration(torch.tensor(calm.truth["Q_U"]))
     np.testing.assert_allclose(a, calm.truth["a"], atol=1e-9)
 
@@ -78,13 +75,13 @@ def test_the_lag_of_the_rotors_is_found(lag):
 
 def test_the_lag_of_actuators_that_push_a_base_is_found(train):
     """As MJCF has rotors: u are thrusts, and the columns of a matrix the wrenches of the base."""
-    rotors = train.system.known_forces[1]
+    rotors = train.model.forces[1]
     q, v = (torch.zeros(4, size, dtype=torch.float64) for size in (7, 6))
     q[:, 6] = 1.0
-    wrenches = rotors.force(train.system.state(q, v, torch.eye(4, dtype=torch.float64))) / rotors.thrust[0]
-    system = replace(train.system, known_forces=(Actuation(wrenches.mT, rotors.names), RigidBodyBias()))
+    wrenches = rotors.force(train.model.state(q, v, torch.eye(4, dtype=torch.float64))) / rotors.thrust[0]
+    model = replace(train.model, forces=(Actuation(wrenches.mT, rotors.names), RigidBodies()))
     thrusts = train.u**2 * float(rotors.thrust[0])
-    found, _ = estimate_thruster_lag(replace(train, system=system, u=thrusts, truth={}))
+    found, _ = estimate_thruster_lag(replace(train, model=model, u=thrusts, truth={}))
     assert found == pytest.approx(0.06, rel=0.25)
 
 
@@ -115,17 +112,17 @@ def test_a_load_on_an_arm_beneath_is_no_lag(lag):
         q.append(known.integrate(q[-1], step))
     late = loaded.inverse_dynamics(torch.stack(q), torch.tensor(v.T), torch.tensor(a.T)).numpy()
     u = late + lag * np.gradient(late, time, axis=0)
-    system = MechanicalSystem(known, (), (Actuation(np.eye(7), tuple("abcdefg")), RigidBodyBias()))
+    model = Model(known, (), (Actuation(np.eye(7), tuple("abcdefg")), RigidBodies()))
     rows = {"q": torch.stack(q).numpy(), "v": v.T, "a": a.T, "u": u, "time": time}
-    found, _ = estimate_thruster_lag(Dataset(**rows, system=system))
+    found, _ = estimate_thruster_lag(Dataset(**rows, model=model))
     assert found == pytest.approx(lag, abs=0.01)
 
 
 def test_a_lag_needs_thrusters(train):
     joints = Actuation(torch.zeros(6, 4, dtype=torch.float64), ("a", "b", "c", "d"))
-    system = replace(train.system, known_forces=(joints, RigidBodyBias()))
+    model = replace(train.model, forces=(joints, RigidBodies()))
     with pytest.raises(InvalidInput, match="Thrusters"):
-        estimate_thruster_lag(replace(train, system=system, truth={}))
+        estimate_thruster_lag(replace(train, model=model, truth={}))
 
 
 def test_new_wind_is_observed_from_the_past(posterior, test):
@@ -137,7 +134,7 @@ def test_new_wind_is_observed_from_the_past(posterior, test):
     blind = a - posterior.predict(seen.q, seen.v, seen.u[:, :4], covariance=False).mean.numpy()
     left = a - seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.numpy()
     assert np.all(np.square(left).mean(0) < 0.05 * np.square(blind).mean(0))
-    assert seen.system.held_inputs == tuple(range(4, 13))  # wind, then a wrench
+    assert seen.model.held_inputs == tuple(range(4, 13))  # wind, then a wrench
     assert "Q_U" not in seen.truth
 
 
@@ -169,8 +166,8 @@ def test_motions_fade_to_what_lasts_where_no_wind_is_observed(posterior, test):
     still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
     seeing, seen = observing(still, acting(test))
     usual, held = observing(still, acting(test), seconds=0.02)
-    assert [len(each.system.inputs) for each in (seen, held)] == [16, 10]
-    assert len(observing(posterior, acting(test))[1].system.inputs) == 13
+    assert [len(each.model.inputs) for each in (seen, held)] == [16, 10]
+    assert len(observing(posterior, acting(test))[1].model.inputs) == 13
     u = torch.tensor(seen.u[300:330])
     moved = seeing.rollout(seen.q[300], seen.v[300], u, 1 / 240).q
     other = u.clone()
@@ -203,10 +200,10 @@ def test_what_lasts_is_foreseen_from_the_past():
 def test_what_cannot_be_observed_is_refused(posterior, test):
     with pytest.raises(InvalidInput, match="looks back"):
         observing(posterior, acting(test), seconds=-1.0)
-    calm = StructuredGP(test.system, AerodynamicForce(observe=0.0, kernel="linear"))
+    calm = test.model.with_forces(AerodynamicForce(observe=0.0, kernel="linear"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        fitted = calm.fit(acting(test), points=30, restarts=1)
+        fitted = fit(calm, acting(test), points=30, restarts=1)
     assert observing(fitted, test) == (fitted, test)
 
 
@@ -216,7 +213,7 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
     save_posterior(posterior, tmp_path / "drone")
     loaded = load_posterior(tmp_path / "drone")
     more = [each.update(rows.rows(np.arange(300))) for each in (posterior, loaded)]
-    assert more[0].system.inputs == posterior.system.inputs
+    assert more[0].model.inputs == posterior.model.inputs
     assert len(more[0].training) == len(posterior.training) + 275  # those with .1 s before them
     means = [each.predict(rows.q[:5], rows.v[:5], rows.u[:5], covariance=False).mean for each in more]
     torch.testing.assert_close(*means, rtol=1e-9, atol=1e-9)
@@ -227,8 +224,10 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
 
 
 def test_a_fit_reports_that_no_wind_was_found(posterior):
+    from forcegp.cli.fit import fit_summary
+
     still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
-    unasked = replace(still, model=replace(still.model, prior=AerodynamicForce(observe=0.0)))
+    unasked = replace(still, target=still.model.known.with_forces(AerodynamicForce(observe=0.0)))
     found = [fit_summary(each, 1.0)["wind_not_found"] for each in (posterior, still, unasked)]
     assert found == [False, True, False]
     assert fit_summary(posterior, 1.0)["wind"] == posterior.settings["air"]["wind"]
@@ -250,30 +249,6 @@ def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.filterwarnings("ignore:.*never changes in the training rows")  # thrust along x and y
-@pytest.mark.parametrize("prior", [AerodynamicForce(), JointForces(), JointAccelerations()])
-def test_a_mass_beside_unknown_thrust_is_warned_of(train, prior):
-    rows, body = acting(train).rows(np.arange(0, 4000, 100)), train.system.robot.link("body").inertial("mass")
-    quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
-    with pytest.warns(DataWarning, match="a heavier robot with as much more thrust moves the same"):
-        found = StructuredGP(train.system, prior).identify(rows, body, **quick).identification
-    with pytest.warns(NumericalWarning, match="not ended at a minimum"):
-        assert found.standard_errors == {"body.mass": np.inf}
-    assert "The data do not identify body.mass: forces of the prior do the same." in found.verdict
-    assert "every" not in found.verdict
-
-
-@pytest.mark.parametrize("inputs", [("velocity", "drag", "angular-velocity", "attitude"), ("height",)])
-def test_a_mass_beside_forces_that_are_not_in_proportion_to_thrust_is_not(train, inputs):
-    rows, body = acting(train).rows(np.arange(0, 4000, 100)), train.system.robot.link("body").inertial("mass")
-    quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
-    known = AerodynamicForce(inputs=inputs)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        StructuredGP(train.system, known).identify(rows, body, **quick)
-    assert not [each for each in caught if "heavier" in str(each.message)]
-
-
 def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
     """Wind and wrench as inputs, at the rate of a controller; the program of it in C as well."""
     seeing, seen = observing(posterior, acting(test))
@@ -285,22 +260,23 @@ def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
     assert export_c(seeing, tmp_path / "c").differences
 
 
+@pytest.mark.nightly
 def test_intervals_of_motions_are_those_of_observed_wind(posterior, train):
     """They are found, and used, where wind is observed; the model alone, in whatever wind, has none."""
     rows = acting(train).rows(np.arange(480))
-    calibrated = posterior.calibrated_on_motions(rows, (0.1,))
-    assert calibrated.motion_intervals is None
-    seeing, seen = observing(calibrated, acting(train).rows(np.arange(2400, 3200)))
-    assert seeing.motion_intervals.inputs == seen.system.inputs
+    widened = calibrated(posterior, rows, (0.1,))
+    assert widened.motion_intervals is None
+    seeing, seen = observing(widened, acting(train).rows(np.arange(2400, 3200)))
+    assert seeing.motion_intervals.inputs == seen.model.inputs
     moved = recorded_motions(seen, 30, 0.1)
     found = seeing.rollout(moved.q[:, 0], moved.v[:, 0], moved.u, moved.dt, integrator="rk4")
     low, high = found.interval()
-    off = seen.system.robot.difference(found.q, torch.tensor(moved.q))
+    off = seen.model.robot.difference(found.q, torch.tensor(moved.q))
     assert float(((low <= off) & (off <= high))[:, -1].double().mean()) > 0.8
-    other, _ = observing(calibrated, rows, seconds=0.05)
+    other, _ = observing(widened, rows, seconds=0.05)
     assert other.motion_intervals is None
     with pytest.raises(InvalidInput, match="before `observing`"):
-        seeing.calibrated_on_motions(seen, (0.05,))
+        calibrated(seeing, seen, (0.05,))
 
 
 def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
@@ -308,11 +284,11 @@ def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
     rows = acting(train).rows(np.arange(0, 4000, 20))
     a = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy()
     assert np.sqrt(np.square(a - rows.a).mean()) < 0.5 * np.sqrt(np.square(rows.a).mean())
-    assert posterior.model.prior.wind == posterior.settings["air"]["wind"]
+    assert posterior.model.unknown_forces[0].wind == posterior.settings["air"]["wind"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        again = posterior.model.fit(rows, restarts=1)  # too few rows to show their wind
-    assert again.system.inputs == train.system.inputs
+        again = fit(posterior.model, rows, restarts=1)  # too few rows to show their wind
+    assert again.model.inputs == train.model.inputs
 
 
 def test_a_report_shows_the_air_forces_at_the_body(posterior, test):

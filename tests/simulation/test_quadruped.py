@@ -5,11 +5,10 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp import CoulombJointFriction, JointFriction, StructuredGP, ViscousJointFriction
+from forcegp import Accelerations, Body, Coulomb, Normal, Stribeck, Torques, Viscous, fit
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
-from forcegp.models import Coefficients
-from forcegp.priors import NoForces
+from forcegp.forces import Actuation, RigidBodies
+from forcegp.model import Model
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -19,9 +18,9 @@ def clean():
 
 
 def test_rows_obey_the_equations_of_motion(clean):
-    model = pin.buildModelFromXML(clean.system.robot.urdf_text, pin.JointModelFreeFlyer())
+    model = pin.buildModelFromXML(clean.model.robot.urdf_text, pin.JointModelFreeFlyer())
     data = model.createData()
-    order = [model.joints[model.getJointId(name)].idx_v for name in clean.system.robot.joint_names[6:]]
+    order = [model.joints[model.getJointId(name)].idx_v for name in clean.model.robot.joint_names[6:]]
     feet = [model.getFrameId(f"{leg}_foot") for leg in ("front_left", "front_right", "rear_left", "rear_right")]
     for k in range(0, len(clean), 97):
         q, v, a, tau = pin.neutral(model), *np.zeros((3, model.nv))
@@ -45,7 +44,7 @@ def test_rows_obey_the_equations_of_motion(clean):
 def test_velocities_and_accelerations_are_derivatives(clean):
     inside = np.arange(1, 200)
     q = torch.tensor(clean.q)
-    slope = 120.0 * clean.system.robot.difference(q[inside - 1], q[inside + 1])
+    slope = 120.0 * clean.model.robot.difference(q[inside - 1], q[inside + 1])
     np.testing.assert_allclose(slope, clean.v[inside], atol=2e-3)
     np.testing.assert_allclose(120.0 * (clean.v[inside + 1] - clean.v[inside - 1]), clean.a[inside], atol=0.1)
 
@@ -57,12 +56,13 @@ def test_feet_push_and_never_pull(clean):
 def test_payload_friction_and_foot_forces_are_found():
     train = simulate_quadruped(QuadrupedConfig(seconds=8.0, seed=1))
     test = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=2))
-    trunk = train.system.robot.link("trunk")
-    model = StructuredGP(train.system, JointFriction())
-    posterior = model.identify(train, [trunk.inertial("mass", "com")], points=60, restarts=1)
-    assert posterior.identification.values["trunk.mass"] - trunk.mass == pytest.approx(2.0, rel=0.02)
+    trunk = train.model.robot.link("trunk")
+    learned = RigidBodies({"trunk": Body(0.01, ("mass", "center_of_mass"))})
+    model = train.model.with_forces(learned, Viscous(), Stribeck())
+    posterior = fit(model, train, Accelerations(), rows=200)
+    assert posterior.parameters["trunk.mass"].value - trunk.mass == pytest.approx(2.0, rel=0.02)
     prediction = posterior.predict(test.q, test.v, test.u)
-    urdf = train.system.dynamics(*(torch.tensor(x) for x in (test.q, test.v, test.u)))
+    urdf = train.model.dynamics(*(torch.tensor(x) for x in (test.q, test.v, test.u)))
     known = urdf.acceleration(torch.zeros_like(urdf.Q_K)).numpy()
     error, before = (np.square(a - test.truth["a"]).mean(0) ** 0.5 for a in (prediction.mean.numpy(), known))
     assert np.linalg.norm(error[:6]) < 0.1 * np.linalg.norm(before[:6])
@@ -79,11 +79,9 @@ def test_other_numbers_are_refused(wrong):
 
 def test_coefficients_of_friction_are_those_of_joints_and_not_of_the_base():
     train = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=1, joint_friction="coulomb", payload=0.0))
-    known = (Actuation(), RigidBodyBias(), ViscousJointFriction(0.05), CoulombJointFriction(0.5, 0.02))
-    model = StructuredGP(MechanicalSystem(train.system.robot, train.system.contacts, known), NoForces())
-    learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
-    values = model.identify(train, learn, points=60, restarts=1).identification.values
-    assert len(values) == 24
-    assert not [name for name in values if "base" in name]
-    coulomb = [value for name, value in values.items() if "coulomb" in name]
-    np.testing.assert_allclose(coulomb, 0.8, rtol=0.05)
+    laws = (Actuation(), RigidBodies(), Viscous(Normal(0.05)), Coulomb(Normal(0.5), 0.02))
+    found = fit(Model(train.model.robot, train.model.contacts, laws), train, Torques(), rows=200).parameters
+    assert len(found) == 24
+    assert not [name for name in found if "base" in name]
+    levels = [estimate.value for estimate in found.of("coulomb.level").values()]
+    np.testing.assert_allclose(levels, 0.8, rtol=0.05)

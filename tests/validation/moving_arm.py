@@ -11,42 +11,36 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tests.models.arm import URDF
+from tests.posterior.arm import URDF
 
 from forcegp.data import Dataset, units_for
+from forcegp.forces import Actuation, Coulomb, RigidBodies, Stribeck, Viscous
 from forcegp.integration import integrator_named
-from forcegp.mechanics import (
-    Actuation,
-    CoulombJointFriction,
-    MechanicalSystem,
-    RigidBodyBias,
-    StribeckJointFriction,
-    ViscousJointFriction,
-)
+from forcegp.model import Model
 from forcegp.robots import Robot
 
 NOISE = 0.2
 STEP = 0.01
 
 
-def given_system() -> MechanicalSystem:
-    """What the model is told: the URDF alone."""
-    return MechanicalSystem(Robot.from_urdf_text(URDF))
+def given_system() -> Model:
+    """What the model is told: the URDF alone, without its friction."""
+    return Model(Robot.from_urdf_text(URDF), (), (Actuation(), RigidBodies()))
 
 
-def true_system(stribeck: bool = False) -> MechanicalSystem:
+def true_system(stribeck: bool = False) -> Model:
     """What really moves: other masses, viscous and dry friction; with `stribeck` more of it near rest."""
     heavier = URDF.replace('mass value="1.2"', 'mass value="1.5"').replace('mass value="0.6"', 'mass value="0.8"')
-    dry = CoulombJointFriction((0.5, 0.5, 0.1), 0.1)
+    dry = Coulomb((0.5, 0.5, 0.1), 0.1)
     if stribeck:
-        dry = StribeckJointFriction((0.4, 0.4, 0.06), (1.0, 1.0, 0.15), 0.5, 0.1)
-    friction = (ViscousJointFriction((0.3, 0.3, 0.05)), dry)
-    return MechanicalSystem(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodyBias(), *friction))
+        dry = Stribeck((0.4, 0.4, 0.06), (1.0, 1.0, 0.15), 0.5, 0.1)
+    friction = (Viscous((0.3, 0.3, 0.05)), dry)
+    return Model(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodies(), *friction))
 
 
 def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck: bool = False) -> Dataset:
     """Episodes of a controlled motion at 100 Hz; u[k] acts from row k to row k + 1, a has noise of known level."""
-    system, generator = true_system(stribeck), np.random.default_rng(seed)
+    model, generator = true_system(stribeck), np.random.default_rng(seed)
     rows = round(seconds / STEP)
     time = STEP * np.arange(rows)
     shape = (3, 1, episodes, 3)  # sines, times, episodes, joints
@@ -56,14 +50,14 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
     wanted = (size * np.sin(angle)).sum(0) + np.array([0.0, 0.7, 0.7])
     speed = (size * rate * np.cos(angle)).sum(0)
     q, v = torch.tensor(wanted[0]), torch.tensor(speed[0])
-    integrator = integrator_named("rk4", system)
+    integrator = integrator_named("rk4", model)
     found: dict[str, list[np.ndarray]] = {"q": [], "v": [], "u": [], "a": []}
     for k in range(rows):
-        u = system.robot.bias_forces(q, v) + torch.tensor([20.0, 20.0, 3.0]) * (torch.tensor(wanted[k]) - q)
+        u = model.robot.bias_forces(q, v) + torch.tensor([20.0, 20.0, 3.0]) * (torch.tensor(wanted[k]) - q)
         u = u + torch.tensor([2.0, 2.0, 0.3]) * (torch.tensor(speed[k]) - v)
 
         def acceleration(q, v, u=u):
-            return system.dynamics(q, v, u).acceleration_map().offset
+            return model.dynamics(q, v, u).acceleration_map().offset
 
         for name, values in (("q", q), ("v", v), ("u", u), ("a", acceleration(q, v))):
             found[name].append(values.numpy())
@@ -77,7 +71,7 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
         episode=np.repeat(np.arange(episodes), rows),
         joint_names=given.robot.joint_names,
         units=units_for(given.robot),
-        system=given,
+        model=given,
         noise_std=np.full(3, NOISE),
     )
 

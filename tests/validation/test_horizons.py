@@ -7,9 +7,8 @@ import pytest
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.mechanics import MechanicalSystem
-from forcegp.models import StructuredGP
-from forcegp.priors import NoForces
+from forcegp.fit import fit
+from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.validation.scores import held_out_motions, motion_scores
 
@@ -20,8 +19,8 @@ SLEDGE = """<robot name="sledge"><link name="base"/><link name="sledge"><inertia
 FORCE, TRUE_MASS, STEP = 3.0, 2.0, 0.01
 
 
-def sledge(mass: float) -> MechanicalSystem:
-    return MechanicalSystem(Robot.from_urdf_text(SLEDGE.format(mass=mass)))
+def sledge(mass: float) -> Model:
+    return Model(Robot.from_urdf_text(SLEDGE.format(mass=mass)))
 
 
 def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Dataset:
@@ -30,17 +29,17 @@ def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Datas
     v = 0.1 + a * time[:, None]
     q = 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
     arrays = {"q": q, "v": v, "u": np.full((rows, 1), force), "a": a}
-    system = sledge(TRUE_MASS)
+    model = sledge(TRUE_MASS)
     return Dataset(
         **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()},
         time=np.tile(time, episodes),
         episode=np.repeat(np.arange(episodes), rows),
-        system=system,
+        model=model,
     )
 
 
 def posterior(mass: float, data: Dataset):
-    return StructuredGP(sledge(mass), NoForces(), "analytical", 1.0).fit(data, points=5)
+    return fit(sledge(mass).with_forces(noise=1.0), data.select_episodes([0]), points=5)
 
 
 @pytest.mark.parametrize("mass", [1.0, 2.5])
@@ -90,7 +89,7 @@ def test_what_cannot_be_predicted_is_said():
     assert motion_scores(posterior(1.0, data), none) is None
     times = data.time.copy()
     times[1::2] += 0.002
-    uneven = Dataset(q=data.q, v=data.v, u=data.u, a=data.a, time=times, episode=data.episode, system=data.system)
+    uneven = Dataset(q=data.q, v=data.v, u=data.u, a=data.a, time=times, episode=data.episode, model=data.model)
     found = held_out_motions(uneven, data.episode == 0, (0.5,))
     assert found.motions is None
     assert "uneven" in found.notes[0]
@@ -121,14 +120,14 @@ def test_wrong_horizons_are_refused(horizons):
 def test_a_base_that_turns_is_off_by_the_angle_whatever_the_sign_of_its_quaternion():
     """A body thrown in space turns at a constant rate: a recording that began 0.2 rad ahead stays that far ahead."""
     text = SLEDGE.split("<joint")[0].format(mass=2.0).replace('<link name="base"/>', "") + "</robot>"
-    system = MechanicalSystem(Robot.from_urdf_text(text, base="floating", gravity=(0.0, 0.0, 0.0)))
+    model = Model(Robot.from_urdf_text(text, base="floating", gravity=(0.0, 0.0, 0.0)))
     time = STEP * np.arange(51)
     half = 0.5 * (3.0 * time + 0.4)
     q = np.zeros((51, 7))
     q[:, 0], q[:, 5], q[:, 6] = 1.0, np.sin(half), np.cos(half)
     v = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 3.0], (51, 1))
-    data = Dataset(q=q, v=v, u=np.zeros((51, 0)), a=0.0 * v, time=time, system=system)
-    model = StructuredGP(system, NoForces(), "analytical", 1.0).fit(data, points=5)
+    data = Dataset(q=q, v=v, u=np.zeros((51, 0)), a=0.0 * v, time=time, model=model)
+    model = fit(model.with_forces(noise=1.0), data, points=5)
     motions = held_out_motions(data, np.ones(51, dtype=bool), (0.2,), starts=2)
     right = motion_scores(model, motions)
     assert np.array(right["rms_per_joint"]).shape == (1, 6)

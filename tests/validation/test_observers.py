@@ -8,8 +8,8 @@ import pytest
 import torch
 from tests.data.test_wind import pushed
 
-from forcegp import AerodynamicForce, StructuredGP
-from forcegp.models import observing
+from forcegp import AerodynamicForce, fit
+from forcegp.posterior import observing
 from forcegp.validation.scores import OBSERVED, acceleration_scores, held_out_motions, mass_matrices, motion_scores
 
 
@@ -18,9 +18,7 @@ def posterior():
     train = pushed([(0.0, 0.0, 0.0)], rows=200, noise=0.02)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return StructuredGP(train.system, AerodynamicForce(kernel="linear"), noise=0.02).fit(
-            train, points=60, restarts=1
-        )
+        return fit(train.model.with_forces(AerodynamicForce(kernel="linear"), noise=0.02), train, points=60, restarts=1)
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +28,12 @@ def log():
 
 
 def unobserved(posterior):
-    return replace(posterior, model=replace(posterior.model, prior=AerodynamicForce(kernel="linear", observe=0.0)))
+    blind = AerodynamicForce(kernel="linear", observe=0.0)
+    return replace(posterior, trained=replace(posterior.trained, forces=(*posterior.trained.laws, blind)))
 
 
 def test_rows_are_predicted_with_what_was_observed_before_them(posterior, log):
-    mass = mass_matrices(log, log.system)
+    mass = mass_matrices(log, log.model)
     (seen, notes), (blind, without) = (
         acceleration_scores(each, log, mass) for each in (posterior, unobserved(posterior))
     )
@@ -51,8 +50,8 @@ def test_motions_begin_with_what_was_observed_before_them(posterior, log):
     part = log.select_episodes([1])
     _, seen = observing(posterior, part, whole=True)
     np.testing.assert_allclose(motions.u[4:, 0], seen.u[list(motions.rows[4:])], rtol=1e-12, atol=1e-12)
-    assert seeing.system.inputs == seen.system.inputs
+    assert seeing.model.inputs == seen.model.inputs
     assert held_out.of(unobserved(posterior))[1] is held_out.motions
     rollout = seeing.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator="rk4")
-    away = log.system.robot.difference(torch.tensor(motions.q[:, -1]), rollout.q[:, -1]).square().mean(-1)
+    away = log.model.robot.difference(torch.tensor(motions.q[:, -1]), rollout.q[:, -1]).square().mean(-1)
     np.testing.assert_allclose(motion_scores(posterior, held_out)["squared"][1], away, rtol=1e-9)

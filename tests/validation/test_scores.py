@@ -8,9 +8,9 @@ import torch
 from scipy.stats import norm
 from tests.validation.moving_arm import given_system, moving_arm
 
-from forcegp.mechanics import Armature, MechanicalSystem
-from forcegp.models import StructuredGP
-from forcegp.priors import NoForces
+from forcegp.fit import fit
+from forcegp.forces import Rotor
+from forcegp.model import Model
 from forcegp.validation.page import _at_rest
 from forcegp.validation.scores import (
     LEVELS,
@@ -33,9 +33,9 @@ def test_rows():
 @pytest.fixture(scope="module")
 def scores(test_rows):
     """Of the URDF alone with a given noise: its prediction and its density are known in closed form."""
-    system = given_system()
-    posterior = StructuredGP(system, NoForces(), "analytical", tuple(SIGMA)).fit(test_rows, points=5)
-    return acceleration_scores(posterior, test_rows, mass_matrices(test_rows, system))[0]
+    model = given_system()
+    posterior = fit(model.with_forces(noise=tuple(SIGMA)), test_rows, points=5)
+    return acceleration_scores(posterior, test_rows, mass_matrices(test_rows, model))[0]
 
 
 def predicted(test_rows) -> np.ndarray:
@@ -94,9 +94,9 @@ def test_stretches_of_time_make_up_the_whole(scores, test_rows):
 
 
 def test_the_mass_matrix_counts_rotors(test_rows):
-    system = given_system()
-    with_rotors = MechanicalSystem(system.robot, (), (*system.known_forces, Armature((0.1, 0.2, 0.3))))
-    added = mass_matrices(test_rows, with_rotors) - mass_matrices(test_rows, system)
+    model = given_system()
+    with_rotors = Model(model.robot, (), (*model.forces, Rotor((0.1, 0.2, 0.3))))
+    added = mass_matrices(test_rows, with_rotors) - mass_matrices(test_rows, model)
     assert np.allclose(added, np.diag([0.1, 0.2, 0.3]))
     change = force_errors(np.ones((len(test_rows), 3)), np.zeros((len(test_rows), 3)), added)
     assert np.allclose(change, [0.1, 0.2, 0.3])
@@ -138,16 +138,16 @@ def test_the_page_names_joints_where_the_score_says_nothing(best, said):
 
 
 def test_what_a_reader_has_to_know_comes_with_the_scores(test_rows):
-    system = given_system()
-    sure = StructuredGP(system, NoForces(), "analytical", 1e-3).fit(test_rows, points=5)
-    scores, doubted = acceleration_scores(sure, test_rows, mass_matrices(test_rows, system))
+    model = given_system()
+    sure = fit(model.with_forces(noise=1e-3), test_rows, points=5)
+    scores, doubted = acceleration_scores(sure, test_rows, mass_matrices(test_rows, model))
     inside = np.mean(scores["coverage"][LEVELS.index(0.95)])
     assert inside < 0.9
     assert any(f"the 95 % intervals hold {inside:.0%} of the measurements" in sentence for sentence in doubted)
 
 
 def test_rows_outside_the_training_range_are_scored_apart(test_rows):
-    system, train = given_system(), test_rows.rows(slice(0, 20))
+    model, train = given_system(), test_rows.rows(slice(0, 20))
     outside = outside_range(train, test_rows)
     assert not outside[:20].any()
     for row in range(20, 40):
@@ -157,8 +157,8 @@ def test_rows_outside_the_training_range_are_scored_apart(test_rows):
             for joint, seen in enumerate(getattr(train, name).T)
         ]
         assert outside[row] == any(beyond)
-    model = StructuredGP(system, NoForces(), "analytical", tuple(SIGMA)).fit(test_rows, points=5)
-    found = acceleration_scores(model, test_rows, mass_matrices(test_rows, system), outside)[0]["range"]
+    posterior = fit(model.with_forces(noise=tuple(SIGMA)), test_rows, points=5)
+    found = acceleration_scores(posterior, test_rows, mass_matrices(test_rows, model), outside)[0]["range"]
     error, spread = predicted(test_rows) - test_rows.a, test_rows.a.std(axis=0)
     for side, rows in (("inside", ~outside), ("outside", outside)):
         assert found[side]["rows"] == rows.sum() > 0

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.models.arm import arm_data
+from tests.posterior.arm import arm_data
 
 from forcegp.errors import InvalidInput
 from forcegp.validation import training_subset

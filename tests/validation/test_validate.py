@@ -7,22 +7,20 @@ import pytest
 from tests.validation.moving_arm import given_system, moving_arm
 
 from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
+from forcegp.fit import fit as fit_model
 from forcegp.jobs import JobStore, code_digest
-from forcegp.models import StructuredGP
-from forcegp.priors import NoForces
 from forcegp.validation import (
     CANDIDATES,
-    IDENTIFICATIONS,
     Candidate,
     Comparison,
-    Identification,
     Training,
     split_named,
     validate,
 )
 from forcegp.validation.run import KIND
 
-MODELS = ("analytical", "joint-friction", "broken")
+MODELS = ("given", "gp:joint-friction", "broken")
+USUAL = "bodies+viscous+coulomb+rotor@accelerations"
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +38,8 @@ def model_of_somebody_else(monkeypatch):
     def fit_broken(training: Training):
         if training.seed == 1:
             raise ZeroDivisionError("nothing left")
-        model = StructuredGP(training.given, NoForces(), "analytical", 5.0)
-        return model.fit(training.rows, restarts=1)
+        model = training.given.with_forces(noise=5.0)
+        return fit_model(model, training.rows, restarts=1)
 
     monkeypatch.setitem(CANDIDATES, "broken", Candidate("fails with seed 1", "given", fit_broken))
 
@@ -56,17 +54,17 @@ def test_a_run_goes_on_where_it_was_and_grows(data, tmp_path):
     assert notes[-1][0] == notes[-1][1]
     kept = changed(folder)
     assert set(kept) == {  # the identification for the mass matrix, and the model
-        "episodes-1-seed0-identification-acceleration-all",
-        "episodes-1-seed0-analytical",
+        f"episodes-1-seed0-identification-{USUAL}",
+        "episodes-1-seed0-given",
     }
-    assert set(first.document["models"]) == {"analytical"}
+    assert set(first.document["models"]) == {"given"}
     grown = validate(comparison(data), folder, models=MODELS, seeds=2)
     assert {name: changed(folder)[name] for name in kept} == kept, "finished pieces are not computed again"
     assert len(changed(folder)) == 2 * len(MODELS), "an identification, and one seed of what uses all rows"
     before = changed(folder)
-    lost = folder / "jobs" / "episodes-1-seed0-joint-friction"
+    (lost,) = (folder / "jobs").glob("episodes-1-seed0-gp_joint-friction*")
     shutil.rmtree(lost)
-    (folder / "jobs" / ".episodes-1-seed0-joint-friction.abc.tmp").mkdir()  # of a killed run
+    (folder / "jobs" / f".{lost.name}.abc.tmp").mkdir()  # of a killed run
     again = validate(comparison(data), folder, models=MODELS, seeds=2)
     after = changed(folder)
     assert {name for name in before if before[name] != after[name]} == {lost.name}
@@ -90,14 +88,13 @@ def test_a_model_that_fails_is_a_row_that_says_why(data, tmp_path):
         assert f"({name}.png)" in page
 
 
-def test_processes_find_the_same_as_this_one_also_what_somebody_has_added(data, tmp_path, monkeypatch):
-    def leave(system, rows, friction):
-        return system
-
-    monkeypatch.setitem(IDENTIFICATIONS, "mine", Identification("leaving it as it is", leave, all_rows=True))
-    models = ("identified-mine", "joint-friction@mine")
+@pytest.mark.nightly
+def test_processes_find_the_same_as_this_one(data, tmp_path):
+    models = ("bodies+viscous@torques", "identified+gp:joint-friction")
     one, two = (validate(comparison(data), tmp_path / str(jobs), models=models, seeds=2, jobs=jobs) for jobs in (1, 2))
-    assert len(list((tmp_path / "2" / "jobs").glob("*identification-mine*"))) == 1, "of all rows, so once"
+    assert len(list((tmp_path / "2" / "jobs").glob("*identification-bodies+viscous@torques"))) == 1, (
+        "of all rows, so once"
+    )
     for name in models:
         assert two.document["models"][name]["runs"] == 2
         for score in ("nrmse", "force_rms", "nlpd", "motions"):
@@ -126,56 +123,60 @@ def test_all_that_failed_still_makes_a_page(data, tmp_path):
 
 def test_another_configuration_is_refused_and_overwritten_on_demand(data, tmp_path):
     folder = tmp_path / "out"
-    validate(comparison(data), folder, models=("analytical",), seeds=1)
+    validate(comparison(data), folder, models=("given",), seeds=1)
     with pytest.raises(InvalidInput, match=r"points \(15, not 16\), restarts \(1, not 2\).*`folder`"):
-        validate(comparison(data, points=16, restarts=2), folder, models=("analytical",), seeds=1)
+        validate(comparison(data, points=16, restarts=2), folder, models=("given",), seeds=1)
     shorter = moving_arm(0.5, 2)
     with pytest.raises(InvalidInput, match=r"another recording_sha256.*, rows_sha256"):
-        validate(comparison(shorter), folder, models=("analytical",), seeds=1)
+        validate(comparison(shorter), folder, models=("given",), seeds=1)
     with JobStore(folder, KIND).locked(), pytest.raises(InvalidInput, match="another `forcegp validate` is at work"):
-        validate(comparison(data), folder, models=("analytical",), seeds=1)
-    found = validate(comparison(data, points=16), folder, models=("analytical",), seeds=1, overwrite=True)
+        validate(comparison(data), folder, models=("given",), seeds=1)
+    found = validate(comparison(data, points=16), folder, models=("given",), seeds=1, overwrite=True)
     assert found.document["points"] == 16
-    (folder / "jobs" / "episodes-1-seed0-analytical" / "job.json").write_text('{"name": ')
+    (folder / "jobs" / "episodes-1-seed0-given" / "job.json").write_text('{"name": ')
     with pytest.raises(FileFormatError, match="half written or damaged"):
-        validate(comparison(data, points=16), folder, models=("analytical",), seeds=1)
+        validate(comparison(data, points=16), folder, models=("given",), seeds=1)
 
 
 def test_folders_of_others_are_not_touched(data, tmp_path):
     (tmp_path / "mine.txt").write_text("precious")
     for overwrite in (False, True):
         with pytest.raises(InvalidInput, match="was not written by `forcegp validate`"):
-            validate(comparison(data), tmp_path, models=("analytical",), seeds=1, overwrite=overwrite)
+            validate(comparison(data), tmp_path, models=("given",), seeds=1, overwrite=overwrite)
     (tmp_path / "configuration.json").write_text("{}")
     with pytest.raises(InvalidInput, match="was not written by `forcegp validate`"):
-        validate(comparison(data), tmp_path, models=("analytical",), seeds=1, overwrite=True)
+        validate(comparison(data), tmp_path, models=("given",), seeds=1, overwrite=True)
     assert (tmp_path / "mine.txt").read_text() == "precious"
 
 
 def test_an_identification_that_fails_leaves_the_mass_matrix_as_given_and_its_models_without_a_mean(
     data, tmp_path, monkeypatch
 ):
-    def fail(system, rows, friction):
+    def fail(name, model, rows):
         raise InvalidInput("too still")
 
-    monkeypatch.setitem(IDENTIFICATIONS, "mine", Identification("my own way", fail))
-    models = ("analytical", "identified-mine", "joint-friction@mine", "joint-friction@identified")
-    found = validate(comparison(data, identification="mine"), tmp_path / "out", models=models, seeds=1)
+    monkeypatch.setattr("forcegp.validation.jobs.identified_model", fail)
+    models = ("given", "identified", "identified+gp:joint-friction")
+    found = validate(comparison(data), tmp_path / "out", models=models, seeds=1)
     told = found.document["mass_matrix"]
-    assert told == ["the system as given, because its identification failed (too still)"]
+    assert told == ["the model as given, because its identification failed (too still)"]
     for name in models[1:]:
-        (failure,) = found.document["models"][name]["failures"]
-        assert failure["error"] == "the mine identification that it rests on failed: too still"
-    assert found.document["models"]["analytical"]["runs"] == 1
-    assert "the mine identification failed (episodes-1, seed 0): too still" in (tmp_path / "out/report.md").read_text()
+        failure = found.document["models"][name]["failures"][0]
+        assert failure["error"] == "the identification that it rests on failed: too still"
+    assert found.document["models"]["given"]["runs"] == 1
+    assert (
+        f"the {USUAL} identification failed (episodes-1, seed 0): too still" in (tmp_path / "out/report.md").read_text()
+    )
 
 
 WRONG = [
     ({"models": ()}, "no model is named"),
-    ({"models": ("analytical", "analytical")}, "named twice"),
-    ({"models": ("analytcal",)}, "did you mean 'analytical'"),
-    ({"models": ("joint@measured",)}, "takes its mean from 'measured'"),
-    ({"models": ("joint:colour=red",)}, "cannot take 'colour=red'"),
+    ({"models": ("given", "given")}, "named twice"),
+    ({"models": ("identifed",)}, "did you mean 'identified'"),
+    ({"models": ("gp:joint@measured",)}, "no evidence 'measured'"),
+    ({"models": ("gp:joint:colour=red",)}, "cannot take 'colour=red'"),
+    ({"models": ("identified+viscous",)}, "`identified` has its laws already"),
+    ({"models": ("given@motions:1",)}, "nothing to refine on motions"),
     ({"seeds": 0}, "number of seeds is 0"),
 ]
 
@@ -183,7 +184,7 @@ WRONG = [
 @pytest.mark.parametrize(("changes", "message"), WRONG, ids=[message for _, message in WRONG])
 def test_wrong_arguments_are_refused_before_anything_is_written(data, tmp_path, changes, message):
     with pytest.raises(InvalidInput, match=message):
-        validate(comparison(data), tmp_path / "out", **{"models": ("analytical",), "seeds": 1, **changes})
+        validate(comparison(data), tmp_path / "out", **{"models": ("given",), "seeds": 1, **changes})
     assert not (tmp_path / "out").exists()
 
 
@@ -195,8 +196,9 @@ def test_wrong_arguments_are_refused_before_anything_is_written(data, tmp_path, 
         ({"starts": 0}, "number of starts"),
         ({"restarts": 0}, "restarts is 0"),
         ({"integrator": "euler"}, "euler"),
-        ({"force_noise": -1.0}, "force"),
-        ({"identification": "guessing"}, "no identification is called 'guessing'"),
+        ({"identification": "guessing"}, "no force 'guessing'"),
+        ({"identification": "gp:joint"}, "nothing to identify, or unknown forces"),
+        ({"identification": "viscous@windows:.1"}, "from windows; give accelerations or torques"),
     ],
 )
 def test_a_comparison_that_cannot_be_made_is_refused(data, changes, message):
@@ -205,7 +207,7 @@ def test_a_comparison_that_cannot_be_made_is_refused(data, changes, message):
 
 
 def test_only_what_depends_on_a_changed_model_of_somebody_else_is_computed_anew(data, tmp_path, monkeypatch):
-    models = ("analytical", "broken")
+    models = ("given", "broken")
     validate(comparison(data), tmp_path / "out", models=models, seeds=1)
     before = changed(tmp_path / "out")
     digest = code_digest

@@ -1,0 +1,186 @@
+"""`forcegp fit`: forces and evidence by name, what is written and printed, and what is refused."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from tests.cli.one_line import assert_refused
+from tests.fit.test_motion_fit import line, recording
+from tests.posterior.arm import URDF, arm_data
+from tests.posterior.raw_log import motion
+
+from forcegp import Dataset, JointFriction, Model, Robot, Viscous, load_posterior
+from forcegp.evidence import motion_residuals
+from forcegp.simulation import FreeArmConfig
+from forcegp.simulation.free_arms import simulate_free_arm
+
+JOINTS = ("upper_hinge", "lower_hinge")
+QUICK = ("--points", 12, "--iterations", 5, "--restarts", 1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """pendulum.h5 and test.h5 with dry friction of 0.4 Nm and viscous friction of 0.2 Nms; raw.h5; arm.h5."""
+    place = tmp_path_factory.mktemp("fit")
+    for name, seed, seconds in (("pendulum", 1, 10.0), ("test", 2, 3.0)):
+        data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=seconds, seed=seed, noise=0.05))
+        data.rows(slice(None, None, 4)).save(place / f"{name}.h5")
+    motion().save(place / "raw.h5")
+    arm_data(40, seed=0).save(place / "arm.h5")
+    friction = '<dynamics damping="0.2" friction="0.4"/></joint>'
+    (place / "damped.urdf").write_text(URDF.replace("</joint>", friction, 1))
+    return place
+
+
+@pytest.fixture(scope="module")
+def identified(forcegp, folder):
+    """What fit prints of laws and bodies, which it wrote into `found`."""
+    words = ("fit", "pendulum.h5", "--forces", "bodies,viscous,coulomb,offset", "--evidence", "torques")
+    done = forcegp(*words, "--out", "found", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_laws_and_bodies_are_estimated(identified, folder):
+    kept = json.loads((folder / "found" / "estimates.json").read_text())
+    for joint in JOINTS:
+        assert kept["parameters"][f"coulomb.level.{joint}"]["value"] == pytest.approx(0.4, rel=0.2)
+        assert kept["parameters"][f"viscous.{joint}"]["value"] == pytest.approx(0.2, abs=0.1)
+    assert kept["evidence"] == "torques"
+    assert kept["settled"]
+    posterior = load_posterior(folder / "found")
+    assert posterior.parameters["viscous.upper_hinge"].value == kept["parameters"]["viscous.upper_hinge"]["value"]
+    model = Model.from_json((folder / "found" / "system.json").read_text())
+    test = Dataset.load(folder / "test.h5")
+    before, after = (np.sqrt((motion_residuals(test, each)[0] ** 2).mean(0)) for each in (test.model, model))
+    assert (after < 0.3 * before).all()
+    robot = Robot.from_urdf(folder / "found" / "identified.urdf")
+    q = torch.zeros(2).double()
+    torch.testing.assert_close(robot.mass_matrix(q), model.robot.mass_matrix(q))
+    assert robot.joint("upper_hinge").friction == kept["parameters"]["coulomb.level.upper_hinge"]["value"]
+    config = json.loads((folder / "found" / "config.json").read_text())
+    assert sorted(config["files"]) == sorted(file.name for file in (folder / "found").iterdir())
+    assert config["kind"] == "forcegp fit"
+    assert config["options"]["forces"] == ["bodies", "viscous", "coulomb", "offset"]
+    assert config["resolved"]["evidence"] == "torques"
+
+
+def test_the_table_of_estimates_is_for_people(identified):
+    rows = identified.stdout.splitlines()
+    pattern = r"\s+(level\.)?upper_hinge\s+-?\d+\.\d+\s+(-?\d+\.\d+)\s+-?\d+\.\d+ … -?\d+\.\d+\s+\S.*(log|prior)\s*"
+    values = [float(found[2]) for row in rows if (found := re.fullmatch(pattern, row))]
+    assert any(value == pytest.approx(0.4, rel=0.2) for value in values), identified.stdout
+    text = " ".join(identified.stdout.split())
+    assert "base parameters, condition number" in text
+    assert "Next: forcegp evaluate found TEST.h5" in text
+    assert re.search(r"residuals of \d+ rows", text)
+
+
+def test_functions_beside_what_was_identified(forcegp, folder, identified):
+    words = ("fit", "pendulum.h5", "--identified", "found", "--forces", "gp:joint-friction", "--noise", "learned")
+    done = forcegp(*words, *QUICK, "--out", "beside", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["points"] == 12
+    assert "forces: actuation, rigid-bodies, viscous, coulomb, offset" in done.stderr
+    posterior = load_posterior(folder / "beside")
+    assert isinstance(posterior.model.unknown_forces[0], JointFriction)
+    assert any(isinstance(law, Viscous) for law in posterior.model.laws)
+
+
+def test_numbers_and_functions_together(forcegp, folder):
+    words = ("fit", "pendulum.h5", "--forces", "viscous,gp:joint", "--noise", 0.05, *QUICK)
+    done = forcegp(*words, "--out", "both", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert set(json.loads(done.stdout)["estimates"]) == {f"viscous.{joint}" for joint in JOINTS}
+    assert (folder / "both" / "identified.urdf").exists()
+
+
+def test_friction_of_a_file_is_among_the_forces(forcegp, folder):
+    words = ("fit", "arm.h5", "--robot", "damped.urdf", "--forces", "none", "--noise", 0.1, "--no-checks", *QUICK)
+    done = forcegp(*words, "--out", "damped", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "forces: actuation, rigid-bodies, viscous, coulomb" in done.stderr
+    titles = [law.title for law in load_posterior(folder / "damped").model.laws]
+    assert titles == ["actuation", "rigid-bodies", "viscous", "coulomb"]
+
+
+@pytest.mark.parametrize(
+    ("forces", "description"),
+    [
+        ("gp:joint", "analytical mean"),
+        ("only,gp:joint", "zero mean"),
+        ("only,gp:joint-accelerations", "unconstrained accelerations, zero mean"),
+        ("none", "analytical model"),
+        ("gp:independent", "independent"),
+    ],
+)
+def test_models_by_name(forcegp, folder, forces, description):
+    out = re.sub(r"\W", "-", forces)
+    done = forcegp("fit", "arm.h5", "--forces", forces, *QUICK, "--out", out, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert description in json.loads(done.stdout)["model"].lower()
+    scored = forcegp("evaluate", out, "arm.h5", "--every", 4, "--json", folder=folder)
+    assert scored.returncode == 0, scored.stderr
+    black_box = forces == "gp:independent"
+    assert (json.loads(scored.stdout)["constraint_error"] > 1e-6) == black_box
+
+
+def test_a_raw_log_teaches_without_accelerations(forcegp, folder):
+    words = ("fit", "raw.h5", "--forces", "gp:joint-friction", "--evidence", "windows:.1", *QUICK)
+    done = forcegp(*words, "--out", "windows", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "12 windows of 6 nodes" in " ".join(done.stdout.split())
+    posterior = load_posterior(folder / "windows")
+    assert posterior.settings["observe"]["seconds"] == 0.1
+    scored = forcegp("evaluate", "windows", "raw.h5", folder=folder)
+    assert scored.returncode == 0, scored.stderr
+
+
+def test_motions_refine_what_was_found(forcegp, folder):
+    """A cart with friction of 3 Ns/m and 4 N, whose model has 1 and 1."""
+    recording(line, 1, seconds=4.0).save(folder / "cart.h5")
+    words = ("fit", "cart.h5", "--forces", "viscous,coulomb", "--evidence", "torques,motions:.5:bodies=false")
+    done = forcegp(*words, "--out", "moved", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "7 windows of 0.5 s, whose initial states" in " ".join(done.stdout.split())
+    posterior = load_posterior(folder / "moved")
+    assert posterior.settings["motions"]["seconds"] == 0.5
+    assert posterior.parameters["coulomb.level.x"].value == pytest.approx(4.0, rel=0.05)
+
+
+def test_measured_torques_are_stored_with_the_model(forcegp, folder):
+    words = ("fit", "arm.h5", "--measured-torque", "--force-noise", 0.3, "--forces", "gp:joint", *QUICK)
+    done = forcegp(*words, "--out", "measured", folder=folder)
+    assert done.returncode == 0, done.stderr
+    noise = load_posterior(folder / "measured").model.noise
+    assert (noise.measured_torque, noise.force) == (True, 0.3)
+
+
+WRONG = [
+    ("--forces jont", "no force 'jont' in 'jont'"),
+    ("--forces joint", "write gp:joint"),
+    ("--forces gp:viscous", "write viscous"),
+    ("--forces viscous:colour=red", "force 'viscous' cannot take 'colour=red'"),
+    ("--forces none,viscous", "forces are none and viscous; leave one of both out"),
+    ("--forces gp:independent,viscous", "no other force can stand beside it"),
+    ("--forces payload:hnd", "no link 'hnd' in arm; did you mean 'hand'?"),
+    ("--forces rigid-bodies:learn=base", "'base' does not move"),
+    ("--forces gp:joint --evidence torques", "functions are learned from accelerations"),
+    ("--forces viscous --evidence acceleration", "did you mean 'accelerations'?"),
+    ("--evidence torques,accelerations --forces viscous", "the same rows twice"),
+    ("--evidence windows:-1", "Windows seconds is -1.0; it must be positive"),
+    ("--evidence motions:0", "Motions seconds is 0.0; give the length of windows in s"),
+    ("--evidence torques:loud", "Torques noisy is 'loud'"),
+    ("--forces gp:independent --evidence motions:1", "motions refine physics, and gp:independent has none"),
+    ("--measured-torque", "--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA."),
+    ("--forces gp:joint --baseline arm.h5", "a baseline is for payloads"),
+    ("--forces gp:joint --learning-points 1", "learning_points is 1"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG)
+def test_what_makes_no_sense_is_one_line(folder, monkeypatch, capfd, words, message):
+    monkeypatch.chdir(folder)
+    assert_refused(f"fit arm.h5 {words} --noise 0.1 --no-checks --out new", message, folder, capfd)

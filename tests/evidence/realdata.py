@@ -1,0 +1,90 @@
+"""The recordings of real robots in the optional folder ../shared/realdata, prepared by the protocols of its README."""
+
+import gzip
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from forcegp.data import Dataset, Preparation, resample, units_for
+from forcegp.errors import DataWarning
+from forcegp.forces import Actuation, CoupledRotors, Law, RigidBodies
+from forcegp.model import Model
+from forcegp.robots import Robot
+
+PENDULUM_LINK = """<link name="{name}"><inertial><origin xyz="0 0 {com}"/><mass value="{mass}"/>
+<inertia ixx="{inertia}" iyy="{inertia}" izz="{thin}" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{name}_joint" type="continuous"><parent link="{parent}"/><child link="{name}"/><origin xyz="0 0 {length}"/>
+<axis xyz="0 1 0"/></joint>"""
+
+
+def dataset(model: Model, time, q, u, episode) -> Dataset:
+    """A raw log: q and u as recorded; v and a are for `Preparation` to compute."""
+    names, nothing = model.robot.joint_names, np.zeros_like(q)
+    return Dataset(
+        q=q, v=nothing, u=u, a=nothing, time=time, joint_names=names, units=units_for(model.robot),
+        model=model, episode=episode,
+    )  # fmt: skip
+
+
+def multiarm_system(*more: Law) -> Model:
+    """The passive double pendulum with its published numbers, standing upright at q = 0."""
+    names = ("name", "parent", "mass", "com", "length", "inertia")
+    first = ("first", "base", 0.0938439748, 0.108565215, 0.0, 4.37529430e-4)
+    second = ("second", "first", 0.137595970, 0.116779018, 0.172719204, 1.26882939e-3)
+    links = [dict(zip(names, values, strict=True)) for values in (first, second)]
+    parts = [PENDULUM_LINK.format(thin=0.1 * float(link["inertia"]), **link) for link in links]
+    text = f'<robot name="multiarm"><link name="base"/>{"".join(parts)}</robot>'
+    return Model(Robot.from_urdf_text(text, gravity=(0.0, 0.0, -9.80858023)), (), (RigidBodies(), *more))
+
+
+def multiarm(folder: Path, model: Model) -> Dataset:
+    """All pieces: 25 Hz, 0.1 s trimmed at both ends; the angles there are absolute."""
+    with np.load(folder / "multiarm_pendulum/double_id.npz") as data:
+        step = float(data["dt"])
+        pieces = [data[name] for name in sorted(data.files) if name.startswith("piece")]
+    q = np.concatenate([np.stack([p[:, 0], p[:, 1] - p[:, 0]], axis=1) for p in pieces])
+    time = np.concatenate([step * np.arange(len(p)) for p in pieces])
+    episode = np.repeat(np.arange(len(pieces)), [len(p) for p in pieces])
+    return Preparation(cutoff=25.0, trim=100 * step).apply(dataset(model, time, q, np.zeros_like(q), episode)).dataset
+
+
+def dfki_system(folder: Path) -> Model:
+    """The double pendulum of DFKI with rotors at a ratio of 6 on the first link."""
+    robot = Robot.from_urdf(folder / "dfki_double_pendulum/model/double_pendulum_C1.urdf")
+    return Model(robot, (), (Actuation(), RigidBodies(), CoupledRotors(1e-5, [[6.0, 0.0], [-1.0, 6.0]])))
+
+
+def dfki(folder: Path, model: Model, *runs: int) -> Dataset:
+    """Runs at 500 Hz, 20 Hz, 60 samples trimmed at both ends."""
+    parts = []
+    for run in runs:
+        with gzip.open(folder / f"dfki_double_pendulum/raw/20230629-{run}.csv.gz", "rt") as file:
+            log = np.genfromtxt(file, delimiter=",", names=True)
+        log = log[np.concatenate([[True], np.diff(log["time"]) > 0.0])]
+        q, u = (np.stack([log[f"{name}1"], log[f"{name}2"]], axis=1) for name in ("pos_meas", "tau_meas"))
+        parts.append((log["time"] - log["time"][0], q, u, np.full(len(log), run)))
+    raw = dataset(model, *(np.concatenate(x) for x in zip(*parts, strict=True)))
+    return Preparation(cutoff=20.0, trim=0.12).apply(resample(raw, 0.002)).dataset
+
+
+def panda_system(folder: Path) -> Model:
+    """The manufacturer's Panda, one link of which breaks the triangle inequality."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        robot = Robot.from_urdf(folder / "panda_gaz2019/model/fer_franka_description.urdf", inertias="nearest")
+    return Model(robot)
+
+
+def panda(folder: Path, model: Model) -> tuple[Dataset, Dataset]:
+    """5 Hz, every 20th sample; five blocks of time, the third and fifth held out, 0.25 s guard."""
+    names = ("time", "positions", "torques")
+    time, q, u = (np.loadtxt(folder / f"panda_gaz2019/raw/exciting_traj_{name}.txt.gz") for name in names)
+    q, u = q.reshape(-1, 7), u.reshape(-1, 7)
+    fresh = np.concatenate([[True], (np.diff(time) > 0.0) & (np.diff(q, axis=0) != 0.0).any(1)])
+    raw = dataset(model, time[fresh] - time[0], q[fresh], u[fresh], np.zeros(fresh.sum(), int))
+    rows = Preparation(cutoff=5.0, every=20).apply(resample(raw, 0.001)).dataset
+    block = rows.time[-1] / 5.0
+    test = np.isin(np.minimum((rows.time / block).astype(int), 4), (2, 4))
+    near = (abs(rows.time[:, None] - block * np.array([2, 3, 4])) <= 0.25).any(1)
+    return rows.rows(~test & ~near), rows.rows(test)

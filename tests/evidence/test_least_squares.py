@@ -1,0 +1,95 @@
+"""The weighted search against scipy's, its weights against the definition, and correlation times against theory."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from forcegp.evidence.least_squares import BEND, MAD, correlation_time, weighted_least_squares
+
+TRUTH = np.array([1.0, -0.5, 0.3])
+
+
+def problem(rows=200, seed=0, outliers=0):
+    """Two columns of different noise: y = [exp(x0 t) + x1, x2 t + x1 t^2]."""
+    generator = np.random.default_rng(seed)
+    t = generator.uniform(0.0, 1.0, rows)
+
+    def model(x):
+        return np.stack([np.exp(x[0] * t) + x[1], x[2] * t + x[1] * t**2], axis=1)
+
+    y = model(TRUTH) + generator.normal(size=(rows, 2)) * [0.01, 0.5]
+    y[:outliers, 0] += 3.0
+
+    def residual(x):
+        zero = np.zeros_like(t)
+        jacobian = [[t * np.exp(x[0] * t), zero + 1.0, zero], [zero, t**2, t]]
+        return y - model(x), -np.array(jacobian).transpose(2, 0, 1)
+
+    return residual
+
+
+def no_prior(x):
+    return np.zeros(0), np.zeros((0, len(x)))
+
+
+FREE = (np.full(3, -np.inf), np.full(3, np.inf))
+
+
+@pytest.mark.parametrize("bounds", [FREE, (np.array([-9.0, -0.49, 0.0]), np.array([9.0, 9.0, 9.0]))])
+@pytest.mark.parametrize("robust", [False, True])
+def test_the_minimum_is_that_of_scipy_at_the_same_weights(bounds, robust):
+    residual = problem(outliers=4 if robust else 0)
+    fit = weighted_least_squares(residual, no_prior, np.ones(3), bounds, robust=robust)
+    assert fit.settled
+    theirs = least_squares(
+        lambda x: (residual(x)[0] / fit.noise).ravel(),
+        np.clip(TRUTH, *bounds) + 1e-3,
+        bounds=bounds,
+        loss="soft_l1" if robust else "linear",
+        f_scale=BEND if robust else 1.0,
+        xtol=1e-12,
+    )
+    spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+    np.testing.assert_allclose((fit.x - theirs.x) / spread, 0.0, atol=0.05)
+    scale = np.sqrt((fit.residual**2).mean(0)) if not robust else MAD * np.median(abs(fit.residual), axis=0)
+    np.testing.assert_allclose(fit.noise, scale, rtol=0.05)
+
+
+def test_the_noise_of_every_column_is_found_and_decides_the_weights():
+    fit = weighted_least_squares(problem(2000), no_prior, np.zeros(3), FREE)
+    np.testing.assert_allclose(fit.noise, [0.01, 0.5], rtol=0.1)
+    errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+    assert (abs(fit.x - TRUTH) < 4.0 * errors).all()
+
+
+def test_outliers_hardly_move_a_robust_fit():
+    plain, robust = (
+        weighted_least_squares(problem(outliers=10), no_prior, np.ones(3), FREE, robust=robust).x[1] - TRUTH[1]
+        for robust in (False, True)
+    )
+    assert abs(robust) < 0.02 < abs(plain)
+
+
+def test_the_prior_decides_what_the_data_do_not():
+    def blind(x):
+        r, jacobian = problem()(np.append(x[:2], TRUTH[2]))
+        return r, np.concatenate([jacobian[..., :2], np.zeros((*r.shape, 1))], axis=-1)
+
+    def prior(x):
+        return np.array([0.1 * (x[2] - 7.0)]), np.array([[0.0, 0.0, 0.1]])
+
+    fit = weighted_least_squares(blind, prior, np.zeros(3), FREE)
+    assert fit.x[2] == pytest.approx(7.0, abs=1e-6)
+
+
+def test_correlation_time_of_an_autoregressive_process():
+    """(1 + rho) / (1 - rho) for r_n = rho r_(n-1) + e; 1 for independent residuals, episodes kept apart."""
+    generator = np.random.default_rng(1)
+    noise = generator.normal(size=(20_000, 2))
+    series = noise.copy()
+    for row in range(1, len(series)):
+        series[row, 0] += 0.8 * series[row - 1, 0]
+    times = correlation_time(series, np.zeros(len(series), dtype=int))
+    np.testing.assert_allclose(times, [9.0, 1.0], rtol=0.2)
+    alone = correlation_time(series, np.arange(len(series)))
+    np.testing.assert_allclose(alone, 1.0)

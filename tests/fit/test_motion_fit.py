@@ -1,0 +1,231 @@
+"""Models refined on recorded positions: derivatives, what is recovered, what is stored, what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp import Dataset, JointFriction, Model, Robot, load_posterior, save_posterior
+from forcegp.data.motion_records import all_motions, recorded_motions
+from forcegp.errors import InvalidInput, NumericalError
+from forcegp.evidence import Motions
+from forcegp.fit import fit as fit_model
+from forcegp.fit.motion_fit import MotionFit
+from forcegp.fit.motion_unknowns import Unknowns
+from forcegp.forces import Actuation, Coulomb, JointForces, RigidBodies, Rotor, Viscous
+from forcegp.noise import Noise
+
+URDF = """<robot name="slide"><link name="base"/><link name="cart"><inertial><mass value="5"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="x" type="prismatic">
+<parent link="base"/><child link="cart"/><axis xyz="1 0 0"/><limit lower="-5" upper="5" effort="99" velocity="9"/>
+</joint></robot>"""
+DT = 0.01
+QUIET = Noise(0.5)
+
+
+def slide(viscous: float, coulomb: float) -> Model:
+    friction = Viscous(viscous), Coulomb(coulomb, 0.02)
+    return Model(Robot.from_urdf_text(URDF), (), (Actuation(), RigidBodies(), *friction))
+
+
+def line(v: float) -> float:
+    """Friction that the laws describe [N]."""
+    return 3.0 * v + 4.0 * np.tanh(v / 0.02)
+
+
+def bump(v: float) -> float:
+    """The same with a force at speeds near .3 m/s that no law has."""
+    return line(v) + 5.0 * np.exp(-(((v - 0.3) / 0.12) ** 2))
+
+
+def recording(friction, seed: int, seconds: float = 12.0) -> Dataset:
+    """The cart of 5 kg under forces that excite it and hold the middle; positions of .01 mm, bad accelerations."""
+    generator, rows = np.random.default_rng(seed), int(seconds / DT)
+    time, phase = DT * np.arange(rows), generator.uniform(0.0, 6.0, 3)
+    force = sum(9.0 * np.sin(w * time + p) for w, p in zip((1.3, 2.9, 5.1), phase, strict=True))
+    q, v, u = np.zeros((3, rows, 1))
+    for k in range(rows):
+        u[k] = force[k] - 12.0 * q[k]
+        if k + 1 < rows:
+            q[k + 1], v[k + 1] = pushed(friction, float(q[k, 0]), float(v[k, 0]), float(u[k, 0]))
+    a = np.gradient(v, DT, axis=0) + 0.5 * generator.standard_normal((rows, 1))
+    q = q + 1e-5 * generator.standard_normal((rows, 1))
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=slide(1.0, 1.0), noise_std=np.array([0.5]))
+
+
+def pushed(friction, q: float, v: float, u: float, parts: int = 20) -> tuple[float, float]:
+    """The state a row later, by Heun's method of `parts` steps."""
+    h = DT / parts
+    for _ in range(parts):
+        first = (u - friction(v)) / 5.0
+        second = (u - friction(v + h * first)) / 5.0
+        q, v = q + h * v + 0.5 * h * h * first, v + 0.5 * h * (first + second)
+    return q, v
+
+
+@pytest.fixture(scope="module")
+def along_the_law() -> Dataset:
+    return recording(line, 1)
+
+
+@pytest.fixture(scope="module")
+def beyond_the_law() -> tuple[Dataset, Dataset]:
+    return recording(bump, 2), recording(bump, 3)
+
+
+def analytical(data: Dataset):
+    return fit_model(slide(1.0, 1.0).with_forces(noise=QUIET), data, points=50, restarts=1)
+
+
+def refined(posterior, data: Dataset, seconds: float = 0.5, bodies: bool = True):
+    return fit_model(posterior.model, data, Motions(seconds, bodies), start=posterior)
+
+
+def motion_error(posterior, data: Dataset, seconds: float = 1.0) -> float:
+    """Root mean square of q after so long, from recorded states."""
+    recorded = recorded_motions(data, 10, seconds)
+    made = posterior.predictor(covariance="none", compile=False).rollouts(
+        recorded.q[:, 0], recorded.v[:, 0], recorded.u, recorded.dt, integrator="implicit-midpoint"
+    )
+    return float(np.sqrt(np.mean((made.q[:, -1].numpy() - recorded.q[:, -1]) ** 2)))
+
+
+def test_friction_is_recovered_from_positions(along_the_law):
+    before = analytical(along_the_law)
+    after = refined(before, along_the_law, 1.0, bodies=False)
+    found = after.parameters
+    for name, truth in (("viscous.x", 3.0), ("coulomb.level.x", 4.0)):
+        error = found[name].std
+        assert found[name].value == pytest.approx(truth, abs=max(4.0 * error, 0.02 * truth))
+        assert 0.0 < error < 0.1 * truth
+    assert motion_error(after, along_the_law) < 1e-3 < 0.05 * motion_error(before, along_the_law)
+    named = {type(force): force for force in after.model.forces}
+    assert float(named[Viscous].damping) == found["viscous.x"].value
+    assert after.model.robot.link("cart").mass == 5.0
+    assert float(before.model.forces[2].damping) == 1.0  # the one that was given stays as it is
+
+
+def test_inertias_are_found_as_well(along_the_law):
+    light = slide(3.0, 4.0)
+    light = light.with_robot(Robot.from_urdf_text(URDF.replace('mass value="5"', 'mass value="4"')))
+    posterior = fit_model(light.with_forces(noise=QUIET), along_the_law, points=50, restarts=1)
+    after = refined(posterior, along_the_law, 1.0)
+    assert after.model.robot.link("cart").mass == pytest.approx(5.0, rel=0.01)
+
+
+def test_processes_learn_from_motions_what_no_law_has(beyond_the_law):
+    train, test = beyond_the_law
+    parametric = refined(analytical(train), train, 1.0)
+    rough = fit_model(parametric.model.with_forces(JointFriction(), noise=QUIET), train, points=60, restarts=1)
+    better = refined(rough, train, 1.0)
+    errors = [motion_error(p, test) for p in (parametric, rough, better)]
+    assert errors[2] < 0.1 * min(errors[:2])
+    curve = better.curve(better.latent_names[0], np.array([0.3]))
+    assert 0.0 < float(curve.std[0]) < 2.0
+
+
+def test_functions_that_motions_do_not_support_cost_nothing(along_the_law):
+    train, test = along_the_law, recording(line, 4)
+    parametric = refined(analytical(train), train, 1.0)
+    rough = fit_model(slide(1.0, 1.0).with_forces(JointFriction(), noise=QUIET), train, points=60, restarts=1)
+    better = refined(rough, train, 1.0)
+    assert better.settings["motions"]["not_told"][-1] == "x"
+    assert motion_error(better, test) < 1.3 * motion_error(parametric, test) < 0.1 * motion_error(rough, test)
+
+
+def test_support_of_a_function_is_its_evidence_over_none(along_the_law):
+    """Of a linear model y = B x + e, as log densities of y with the function and without it."""
+    rough = fit_model(slide(1.0, 1.0).with_forces(JointFriction(), noise=QUIET), along_the_law, points=30, restarts=1)
+    unknowns = replace(Unknowns.of(rough, along_the_law, False), scales=torch.tensor([0.7], dtype=torch.float64))
+    size, count = sum(unknowns.sizes), unknowns.weights.count
+    generator = torch.Generator().manual_seed(0)
+    B, y = (torch.randn(40, n, generator=generator, dtype=torch.float64) for n in (size, 1))
+    prior = torch.cat([torch.full((size - count,), 3.0), torch.full((count,), 0.7)]).double()
+    N = B.mT @ B + torch.diag(prior**-2)
+    (found,) = unknowns.support(torch.linalg.solve(N, B.mT @ y)[:, 0], N)
+
+    def density(columns):
+        covariance = torch.eye(40).double() + (B[:, columns] * prior[columns] ** 2) @ B[:, columns].mT
+        return torch.distributions.MultivariateNormal(torch.zeros(40).double(), covariance).log_prob(y[:, 0])
+
+    expected = density(slice(None)) - density(slice(size - count))
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0.0)
+
+
+def test_what_is_stored_predicts_the_same(beyond_the_law, tmp_path):
+    train, _ = beyond_the_law
+    rough = fit_model(
+        slide(3.0, 4.0).with_forces(JointFriction(kernel="matern-3/2"), noise=QUIET), train, points=30, restarts=1
+    )
+    better = refined(rough, train, 0.5)
+    save_posterior(better, tmp_path / "run")
+    again = load_posterior(tmp_path / "run")
+    assert again.engine == better.engine
+    rows = train.q[:50], train.v[:50], train.u[:50]
+    here, there = better.predict(*rows), again.predict(*rows)
+    torch.testing.assert_close(there.mean, here.mean, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(there.variance, here.variance, rtol=1e-8, atol=1e-12)
+    assert again.settings["motions"]["windows"] == better.settings["motions"]["windows"]
+    assert json.loads((tmp_path / "run" / "model.json").read_text())["engine"]["name"] == "inducing-weights"
+    predictor = better.predictor(compile=False)
+    torch.testing.assert_close(predictor.mean(*rows), here.mean, rtol=1e-9, atol=1e-9)
+    with pytest.raises(InvalidInput, match="fit again, and refine again"):
+        again.engine.condition(again.kernels, again.likelihood.terms(again.hyperparameters))
+
+
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_derivatives_in_every_unknown(contacts):
+    friction = Viscous(0.3), Coulomb(0.2, 0.3), Rotor(0.01)
+    model = arm_model(contacts, forces=(Actuation(), RigidBodies(), *friction))
+    data = arm_data(24, 5, model)
+    posterior = fit_model(model.with_forces(JointFriction()), data, points=24, restarts=1)
+    data = replace(data, v=0.2 * data.v, u=0.3 * data.u, truth={})
+    unknowns = Unknowns.of(posterior, data, True)
+    recorded, stride = all_motions(replace(data, q=data.q[:1].repeat(24, 0)), 0.05, 0.01)
+    fit = MotionFit(recorded, stride, unknowns)
+    generator = torch.Generator().manual_seed(0)
+    x = unknowns.first + 0.05 * torch.rand(len(unknowns.first), generator=generator, dtype=torch.float64)
+    one, small = torch.ones(3, dtype=torch.float64), 1e-5
+    here = fit.at(x, fit.start, one, one, None)
+    assert bool(here.motions.found.all())
+    scale = float(here.motions.in_parameters.abs().max())
+    for k in (*range(0, len(x), 7), len(x) - 1):
+        step = torch.zeros_like(x)
+        step[k] = small
+        ends = [fit.at(x + sign * step, fit.start, one, one, here.motions).motions.q for sign in (1.0, -1.0)]
+        expected = (ends[0] - ends[1]) / (2.0 * small)
+        torch.testing.assert_close(here.motions.in_parameters[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
+
+
+def test_what_cannot_be_refined_is_refused(along_the_law):
+    posterior, short = analytical(along_the_law), along_the_law.rows(slice(40))
+    for seconds in (0.0, -1.0, np.inf, True, "1"):
+        with pytest.raises(InvalidInput, match=r"seconds is .*; give"):
+            refined(posterior, along_the_law, seconds)
+    with pytest.raises(InvalidInput, match=r"no stretch of 1 s has equal steps"):
+        refined(posterior, short, 1.0)
+    uneven = replace(along_the_law, time=along_the_law.time + 4e-3 * np.sin(np.arange(len(along_the_law))))
+    with pytest.raises(InvalidInput, match="resample the recording"):
+        refined(posterior, uneven, 1.0)
+    zero = fit_model(
+        slide(1.0, 1.0).with_forces(JointForces(), noise=QUIET).without_mean(), short, points=20, restarts=1
+    )
+    with pytest.raises(InvalidInput, match=r"give it RigidBodies\(\)"):
+        refined(zero, along_the_law)
+    black_box = fit_model(slide(1.0, 1.0).black_box(), short, points=20, restarts=1)
+    with pytest.raises(InvalidInput, match=r"no forces that motions could refine|start is"):
+        refined(black_box, along_the_law)
+
+
+def test_a_model_without_motions_near_the_recorded_ones_is_refused(along_the_law):
+    class Wild(Viscous):
+        def amplitude(self, features, parameters):
+            return 1e6 * features[0] * features[0].abs()
+
+    model = Model(Robot.from_urdf_text(URDF), (), (Actuation(), RigidBodies(), Wild(1.0)))
+    posterior = fit_model(model.with_forces(noise=QUIET), along_the_law, points=20, restarts=1)
+    with pytest.raises(NumericalError, match="give fewer seconds"):
+        refined(posterior, along_the_law, 1.0)

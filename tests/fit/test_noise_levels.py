@@ -1,0 +1,50 @@
+"""Levels of noise that residuals were drawn with are found again, and whiten them."""
+
+import numpy as np
+import pytest
+
+from forcegp.evidence.least_squares import NoiseLevels
+
+ACCELERATION, FORCE = np.array([0.5, 2.0]), np.array([0.3, 0.1])
+
+
+def drawn(rows: int, acceleration, force, seed: int = 0):
+    generator = np.random.default_rng(seed)
+    factors = generator.normal(0.0, 0.5, (rows, 2, 2))
+    M = factors @ factors.swapaxes(-1, -2) + np.diag([0.3, 0.01])
+    noise = generator.normal(0.0, 1.0, (rows, 2)) * force
+    residual = np.linalg.solve(M, noise[..., None])[..., 0] + generator.normal(0.0, 1.0, (rows, 2)) * acceleration
+    return residual, M
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_levels_are_found_again(seed):
+    found = NoiseLevels.of(*drawn(2000, ACCELERATION, FORCE, seed))
+    np.testing.assert_allclose(found.acceleration, ACCELERATION, rtol=0.25)
+    np.testing.assert_allclose(found.force, FORCE, rtol=0.25)
+
+
+def test_no_levels_are_likelier():
+    """The negative log likelihood, written with determinants, is smaller than at levels a little off."""
+    residual, M = drawn(400, ACCELERATION, FORCE)
+    found = NoiseLevels.of(residual, M)
+
+    def cost(levels: NoiseLevels) -> float:
+        inverse = np.linalg.inv(M)
+        S = np.diag(levels.acceleration**2) + inverse @ np.diag(levels.force**2) @ inverse
+        quadratic = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(S), residual)
+        return float(0.5 * (quadratic + np.log(np.linalg.det(S))).sum())
+
+    least = cost(found)
+    for joint in range(2):
+        for factor in (0.7, 1.4):
+            off = np.ones(2)
+            off[joint] = factor
+            assert cost(NoiseLevels(found.acceleration * off, found.force)) > least
+            assert cost(NoiseLevels(found.acceleration, found.force * off)) > least
+
+
+def test_whitened_residuals_are_white():
+    residual, M = drawn(4000, ACCELERATION, FORCE)
+    white = (NoiseLevels(ACCELERATION, FORCE).whitening(np.linalg.inv(M)) @ residual[..., None])[..., 0]
+    np.testing.assert_allclose(np.cov(white.T), np.eye(2), atol=0.08)

@@ -1,0 +1,210 @@
+"""A `Payload` that is estimated, against payloads that Pinocchio's inverse dynamics carries."""
+
+from contextlib import nullcontext
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from tests.robots.pinocchio_oracle import Oracle
+
+from forcegp.data import Dataset
+from forcegp.errors import DatasetError, DataWarning, ForceGPError
+from forcegp.evidence import Torques, body_names, motion_residuals
+from forcegp.fit import fit
+from forcegp.forces import Body, Offset, Payload, RigidBodies, Rotor, Stribeck, Viscous
+from forcegp.model import Model
+from forcegp.robots import Robot
+from forcegp.robots.urdf_file import replace_inertial
+from forcegp.simulation import FreeArmConfig
+from forcegp.simulation.free_arms import ARMS, simulate_free_arm
+
+TEXT = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=0.1)).model.robot.urdf_text
+ROBOT = Robot.from_urdf_text(TEXT)
+MASS, CENTER, INERTIA = 1.3, np.array([0.03, -0.02, 0.06]), np.diag([2e-3, 3e-3, 1e-3])
+ROTORS = 0.01 * np.array([joint.effort_limit for joint in ROBOT.joints])
+
+
+def log(text, seed, *, seconds=30.0, noise=0.0, friction=1.0):
+    """A smooth motion of a UR5 with this URDF, and the torques that it needs."""
+    rng, time = np.random.default_rng(seed), np.arange(0.0, seconds, 0.02)
+    size, w, phase = rng.uniform(0.2, 0.5, (3, 6)), rng.uniform(0.5, 3.0, (3, 6)), rng.uniform(0, 6.3, (3, 6))
+    at = w * time[:, None, None] + phase
+    q = np.array(ARMS["ur5-free"][1]) + (size * np.sin(at)).sum(1)
+    v, a = (size * w * np.cos(at)).sum(1), -(size * w**2 * np.sin(at)).sum(1)
+    oracle = Oracle(text, ROBOT)
+    dry = 2.0 * ROTORS * (1.0 + 0.5 * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02)
+    u = np.array([oracle.inverse_dynamics(*row) for row in zip(q, v, a, strict=True)])
+    u += ROTORS * a + friction * (dry + ROTORS * v) + noise * rng.standard_normal(u.shape)
+    return Dataset(q=q, v=v, u=u, a=a, time=time, joint_names=ROBOT.joint_names, model=Model(ROBOT))
+
+
+def loaded(mass=MASS, text=TEXT):
+    return replace_inertial(text, "tool0", mass, CENTER, INERTIA, source="a test")
+
+
+LAWS = Viscous(), Stribeck(), Rotor()
+
+
+class Found:
+    """What people ask of a payload."""
+
+    def __init__(self, data, link=None, laws=LAWS, **options):
+        self.posterior = fit(data.model.with_forces(*laws, Payload(link)), data, Torques(mean=0.4), **options)
+        self.estimates = self.posterior.parameters
+        (payload,) = (law for law in self.posterior.model.laws if isinstance(law, Payload))
+        self.link, self.mass, self.center_of_mass = payload.link, payload.mass, np.array(payload.center_of_mass)
+
+    @property
+    def intervals(self):
+        names = ["mass", *(f"center_of_mass.{axis}" for axis in "xyz")]
+        return [self.estimates[f"payload.{name}"].interval for name in names]
+
+
+@pytest.fixture(scope="module")
+def found() -> Found:
+    return Found(log(loaded(), 1, noise=0.05))
+
+
+FINGER = """<joint name="{0}" type="revolute"><parent link="tool0"/><child link="{0}_link"/><axis xyz="0 0 1"/>{1}
+<limit lower="-1" upper="1" effort="9" velocity="9"/></joint><link name="{0}_link"><inertial><origin xyz=".04 0 0"/>
+<mass value=".05"/><inertia ixx="5e-5" iyy="5e-5" izz="4e-5" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+def test_the_hand_carries_the_payload_of_fingers_that_follow_each_other():
+    """On a finger, it would be inertia of the joint that drives both, and the rotor would have none."""
+    fingers = FINGER.format("left", "") + FINGER.format("right", '<mimic joint="left" multiplier="-1"/>')
+    robot = Robot.from_urdf_text(TEXT.replace("</robot>", f"{fingers}</robot>"))
+    holding = robot.with_text(loaded(text=robot.urdf_text)).with_armature([0.1] * 6 + [0.0055])
+    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 400, 7))
+    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy()
+    rows = Dataset(q=q, v=v, u=u, a=a, time=0.02 * np.arange(400), model=Model(robot))
+    estimate = Found(rows, laws=(Viscous(), Rotor()))
+    assert estimate.link == "tool0"
+    assert estimate.mass == pytest.approx(MASS, rel=0.01)
+    assert estimate.estimates["rotor.left"].value == pytest.approx(0.0055, rel=0.05)
+
+
+@pytest.mark.parametrize(("pace", "friction", "warned"), [(0.5, (Viscous(), Offset()), True),
+                         (0.5, (Viscous(),), False), (10.0, (Viscous(), Offset()), False)], ids=str)  # fmt: skip
+def test_offsets_that_look_like_weight_are_warned_of(pace, friction, warned):
+    """A lift, whose weight is as constant as an offset: the mass is that which its accelerations show."""
+    lift = FINGER.format("lift", "").replace("tool0", "pole").replace("revolute", "prismatic")
+    arm = f'<robot name="lift"><link name="pole"/>{lift}</robot>'
+    robot = Robot.from_urdf_text(arm)
+    holding = robot.with_text(replace_inertial(arm, "lift_link", 1.0, np.array([0.2, 0, 0]), INERTIA, source="a test"))
+    draw = np.random.default_rng(0)
+    q, v, a = pace * draw.normal(size=(3, 400, 1))
+    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + 0.01 * draw.normal(size=(400, 1))
+    rows = Dataset(q=q, v=v, u=u, a=a, time=0.5 * np.arange(400), model=Model(robot))
+    with pytest.warns(DataWarning, match="'offset'.* times as unsure") if warned else nullcontext():
+        Found(rows, laws=friction)
+
+
+def test_the_payload_is_found_with_friction_and_rotors(found):
+    assert found.link == "tool0"
+    assert found.mass == pytest.approx(MASS, rel=0.005)
+    np.testing.assert_allclose(found.center_of_mass, CENTER, atol=1e-3)
+    assert found.estimates.settled
+    for joint, rotor in zip(ROBOT.joint_names, ROTORS, strict=True):
+        assert found.estimates[f"rotor.{joint}"].value == pytest.approx(rotor, rel=0.03)
+        assert found.estimates[f"stribeck.level.{joint}"].value == pytest.approx(2.0 * rotor, rel=0.05)
+
+
+def test_the_system_moves_as_the_loaded_robot(found):
+    rows = log(loaded(), 2, friction=0.0)
+    q, v, a = (torch.tensor(x[::50]) for x in (rows.q, rows.v, rows.a))
+    robot = found.posterior.model.loaded_robot
+    np.testing.assert_allclose(robot.inverse_dynamics(q, v, a).numpy() + a.numpy() * ROTORS, rows.u[::50], atol=0.1)
+    assert pin.computeTotalMass(pin.buildModelFromXML(robot.to_urdf())) == pytest.approx(16.9939 + MASS, rel=1e-3)
+
+
+def test_intervals_hold():
+    """95 % intervals of mass and place over payloads and noise that no test has seen: 32 numbers, 28 at least."""
+    held = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        mass, center = rng.uniform(0.3, 3.0), rng.uniform(-0.08, 0.08, 3)
+        text = replace_inertial(TEXT, "tool0", mass, center, INERTIA, source="a test")
+        estimate = Found(log(text, seed, noise=0.3), rows=800)
+        ends = estimate.intervals
+        held += sum(low <= true <= high for (low, high), true in zip(ends, [mass, *center], strict=True))
+    assert held >= 28
+
+
+def test_a_baseline_takes_errors_of_the_urdf_away():
+    """A forearm that is 20 % heavier than its URDF is no payload."""
+    link = ROBOT.link("elbow_link")
+    heavier = replace_inertial(
+        TEXT, "elbow_link", 1.2 * link.mass, np.array(link.center_of_mass), 1.2 * np.array(link.inertia), source="x"
+    )
+    with_payload, without = log(loaded(text=heavier), 3, noise=0.05), log(heavier, 4, noise=0.05)
+    alone = Found(with_payload, rows=800)
+    together = Found(with_payload, laws=(*LAWS, RigidBodies("all")), baseline=without, rows=800)
+    assert abs(alone.mass - MASS) > 0.05
+    assert together.mass == pytest.approx(MASS, rel=0.01)
+    np.testing.assert_allclose(together.center_of_mass, CENTER, atol=3e-3)
+
+
+def test_no_payload_is_none():
+    nothing = Found(log(TEXT, 5, noise=0.05), rows=800)
+    assert nothing.mass < 0.02
+    low, high = nothing.intervals[0]
+    assert low < 0.01
+    assert high < 0.1
+
+
+def test_the_frame_is_that_of_the_link(found):
+    """The same payload in the frame of the wrist, 82.3 mm before the tool."""
+    wrist = Found(log(loaded(), 1, noise=0.05), link="wrist_3_link")
+    assert wrist.mass == pytest.approx(found.mass, rel=1e-3)
+    np.testing.assert_allclose(wrist.center_of_mass, found.center_of_mass + np.array([0.0, 0.0, 0.0823]), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"link": "base"}, "does not move"),
+        ({"link": "tool9"}, "tool9"),
+        ({"baseline": "empty.h5"}, "baseline|dataset"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(change, message):
+    with pytest.raises(ForceGPError, match=message):
+        Found(log(TEXT, 0, seconds=10.0), **change)
+
+
+def test_a_short_log_is_refused():
+    short = log(TEXT, 0, seconds=2.0)
+    with pytest.raises(DatasetError, match="100 rows; a payload needs 200"):
+        Found(short)
+
+
+UNIVERSAL = """<mujoco><compiler angle="radian"/><worldbody><body name="upper"><joint name="x" axis="1 0 0"/>
+<joint name="y" axis="0 1 0"/><inertial pos="0 0 .2" mass="2" diaginertia=".03 .03 .01"/><body name="fore" pos="0 0 .4">
+<joint name="elbow" axis="0 1 0"/><inertial pos="{0} 0 .15" mass="{1}" diaginertia=".02 .02 .01"/>
+</body></body></worldbody></mujoco>"""
+
+
+def test_two_joints_in_one_body_have_no_mass_between_them():
+    """MuJoCo's inverse dynamics of a forearm with a payload of 0.5 kg, under a joint with two axes."""
+    mujoco = pytest.importorskip("mujoco")
+    file = UNIVERSAL.format(0, 1)
+    model = mujoco.MjModel.from_xml_string(UNIVERSAL.format(0.05 * 0.5 / 1.5, 1.5))
+    state, time = mujoco.MjData(model), np.arange(0.0, 10.0, 0.01)
+    at = np.array([0.9, 1.3, 1.7]) * time[:, None] + np.arange(3)
+    rows = np.sin(at), np.array([0.9, 1.3, 1.7]) * np.cos(at), -(np.array([0.9, 1.3, 1.7]) ** 2) * np.sin(at)
+    u = np.empty_like(at)
+    for row, (q, v, a) in enumerate(zip(*rows, strict=True)):
+        state.qpos, state.qvel, state.qacc = q, v, a
+        mujoco.mj_inverse(model, state)
+        u[row] = state.qfrc_inverse
+    model = Model(Robot.from_mjcf_text(file))
+    data = Dataset(q=rows[0], v=rows[1], u=u, a=rows[2], time=time, model=model)
+    held = Found(data, link="fore")
+    assert held.mass == pytest.approx(0.5, rel=1e-3)
+    assert held.center_of_mass[:2] == pytest.approx([0.05, 0.0], abs=1e-3)
+    bodies = RigidBodies(dict.fromkeys(("upper", "fore"), Body(1e-6)))
+    identified = fit(model.with_forces(bodies), data, Torques())
+    assert body_names(model.robot) == ("upper", "fore")
+    np.testing.assert_allclose(motion_residuals(data, identified.model)[0], 0.0, atol=1e-3)

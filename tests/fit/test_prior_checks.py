@@ -1,0 +1,263 @@
+"""What no data can teach is said before the fit, with the names of what is concerned and what to do about it."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.errors import DataWarning, InvalidInput, UnknownFrame, UnknownJoint
+from forcegp.fit import fit as fit_model
+from forcegp.forces import (
+    ContactFriction,
+    JointAccelerations,
+    JointForces,
+    JointFriction,
+    PeriodicJointForces,
+    ToolForces,
+)
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, Plane
+from forcegp.noise import Noise
+
+ONCE = OptimizerOptions(iterations=1)
+TIP = (0.0, 0.0, 0.2)
+TABLE = (Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.4)),)
+
+
+class Drive(JointFriction):
+    """The same functions with the other sign."""
+
+    def direction(self, dynamics):
+        return -super().direction(dynamics)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(12, 1)
+
+
+@pytest.fixture(scope="module")
+def on_a_table():
+    return arm_data(12, 1, arm_model().with_contacts(TABLE))
+
+
+def fit(data, *forces, mean=True, noise=None):
+    model = data.model.with_forces(*forces, noise=noise)
+    return fit_model(model if mean else model.without_mean(), data, restarts=1, options=ONCE)
+
+
+def with_columns(data, **columns):
+    return dataclasses.replace(data, truth={}, **columns)
+
+
+@pytest.mark.parametrize("prefix", ["", "tool-friction "], ids=["alone", "in-a-sum"])
+def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
+    prior = ToolForces("hand", TIP, axes="world")
+    forces = (prior, JointFriction()) if prefix else (prior,)
+    with pytest.warns(DataWarning) as caught:
+        posterior = fit(on_a_table, *forces)
+    (message,) = [str(warning.message) for warning in caught]
+    assert message.startswith(f"no data can identify '{prefix}force-z': the contacts take that force")
+    assert "use axes='surface', which leaves out the normal direction" in message
+    force = posterior.components(on_a_table.q, on_a_table.v, on_a_table.u)["tool-friction"].latents
+    states = [torch.tensor(x) for x in (on_a_table.q, on_a_table.v, on_a_table.u)]
+    z = posterior.likelihood.standardization(posterior.model.unknown.features(on_a_table.model.dynamics(*states)))[2]
+    prior_variance = list(posterior.latent.kernels)[2](z, diag=True)
+    torch.testing.assert_close(force.mean[:, 2], torch.zeros(12).double(), rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(
+        force.variance[:, 2], posterior.widening**2 * prior_variance.detach(), rtol=1e-6, atol=0.0
+    )
+
+
+def test_along_the_surface_nothing_is_hidden(on_a_table):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(on_a_table, ToolForces(), JointFriction())
+
+
+def test_all_hidden_is_refused(data):
+    """A point that is held along all three axes holds the whole arm."""
+    robot = data.model.robot
+    q = torch.tensor(data.q[:1]).expand(12, 3).clone()
+    tip = Contact("hand", TIP, TABLE[0].surface).position(robot.kinematics(q))[0]
+    normals = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    walls = [Plane(normal, float(tip[axis])) for axis, normal in enumerate(normals)]
+    held = data.model.with_contacts([Contact("hand", TIP, wall) for wall in walls])
+    rows = with_columns(data, q=q.numpy(), model=held)
+    with pytest.raises(InvalidInput, match="'pan', 'lift', 'bend': the contacts"):
+        fit(rows, JointFriction())
+
+
+class Sideways(JointFriction):
+    """Of the first joint a force that is always zero; with no joint beside it, of nothing."""
+
+    def direction(self, dynamics):
+        return super().direction(dynamics) * (torch.arange(3) > 0)
+
+
+def test_a_force_that_moves_no_joint_is_pointed_out(data):
+    with pytest.warns(DataWarning, match=r"'pan' moves no joint.* postures"):
+        posterior = fit(data, Sideways())
+    latents = posterior.components(data.q, data.v, data.u)["sideways"].latents
+    assert float(latents.mean[:, 0].abs().max()) < 1e-6
+
+
+def test_a_term_that_moves_no_joint_is_refused(data):
+    class Idle(JointFriction):
+        def direction(self, dynamics):
+            return 0.0 * super().direction(dynamics)
+
+    with pytest.raises(InvalidInput, match=r"'idle pan', 'idle lift', .*no force.*frame, point and contact"):
+        fit(data, JointFriction(), Idle())
+
+
+def test_an_input_that_never_changes_is_pointed_out(data):
+    still = with_columns(data, u=np.full((12, 3), 2.0) + data.u * [1.0, 0.0, 1.0])
+    with pytest.warns(DataWarning) as caught:
+        fit(still, JointForces())
+    (message,) = [str(warning.message) for warning in caught]
+    assert message.startswith("u of lift [Nm] never changes in the training rows")
+    assert "how 'pan', 'lift', 'bend' depends on it; leave that input out (inputs=...)" in message
+    with pytest.warns(DataWarning, match=r"u of pan \[Nm\], u of lift \[Nm\], u of bend \[Nm\]"):
+        fit(with_columns(data, u=np.ones((12, 3))), ToolForces(inputs=("velocity", "u")))
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (JointFriction(), r"latent 'lift' depends on velocity of lift \[rad/s\], which is the same in all 12"),
+        (
+            (PeriodicJointForces(), JointForces(("u",))),
+            "latent 'periodic-joint-forces lift' depends on position of",
+        ),
+        ((JointFriction(), ContactFriction()), "latent 'joint-friction lift'"),
+    ],
+    ids=["friction", "ripple", "sum"],
+)
+def test_a_joint_that_never_moves_teaches_nothing_of_its_own(data, prior, message):
+    free = data.model.with_contacts([])
+    moving = np.array([1.0, 0.0, 1.0])
+    stuck = with_columns(data, q=data.q * moving, v=data.v * moving, model=free)
+    if isinstance(prior, tuple) and ContactFriction() in prior:
+        stuck = with_columns(data, v=data.v * moving)
+    with pytest.raises(InvalidInput, match=message) as caught:
+        fit(stuck, prior)
+    assert "give data in which it changes, or leave this prior (or this joint) out" in str(caught.value)
+    others = JointFriction(("pan", "bend"))
+    fit(stuck, others)
+
+
+@pytest.mark.parametrize("prior", [ToolForces(), ContactFriction()], ids=["tool", "contact"])
+def test_a_tool_that_never_moves_has_no_friction(data, prior):
+    with pytest.raises(InvalidInput, match=r"\[m/s\].* all 12 training rows"):
+        fit(with_columns(data, v=np.zeros((12, 3))), prior)
+
+
+@pytest.mark.parametrize(
+    ("prior", "error", "message"),
+    [
+        (
+            ToolForces("base", axes="world"),
+            InvalidInput,
+            "ToolForces acts on frame 'base', which is fixed",
+        ),
+        (ToolForces("tool", axes="tool"), UnknownFrame, "no frame 'tool'"),
+        (JointFriction(("pna",)), UnknownJoint, "did you mean 'pan'"),
+        (PeriodicJointForces(joints=("elbow",)), UnknownJoint, "Valid joints: bend, lift, pan"),
+        (ContactFriction(contact=1), InvalidInput, "contact 1, but the model has only contact 0"),
+        ((JointFriction(), ToolForces(contact=2)), InvalidInput, "acts at contact 2"),
+    ],
+    ids=lambda value: value.title if hasattr(value, "title") else "",
+)
+def test_a_prior_that_does_not_fit_the_system_is_refused_before_any_data(data, prior, error, message):
+    with pytest.raises(error, match=message):
+        data.model.with_forces(prior)
+
+
+@pytest.mark.parametrize(
+    "prior", [ToolForces(), ToolForces("hand", axes="world", inputs=("load",))], ids=["friction", "load"]
+)
+def test_forces_of_a_contact_need_one(prior):
+    with pytest.raises(InvalidInput, match=r"no contact with a surface.*`contacts`"):
+        arm_model(contacts=0).with_forces(prior)
+    arm_model(contacts=0).with_forces(ToolForces("hand", axes="world"))
+
+
+def test_equal_terms_are_refused(data):
+    with pytest.raises(InvalidInput, match="'joint-friction' twice"):
+        data.model.with_forces(JointFriction(), ContactFriction(), JointFriction())
+
+
+@pytest.mark.parametrize(
+    ("prior", "names"),
+    [
+        ((JointFriction(), JointFriction(("lift",))), "'joint-friction-1 lift' and 'joint-friction-2 lift'"),
+        ((JointFriction(("pan",)), JointFriction(("pan",), kernel="linear")), "'joint-friction-1 pan' and"),
+        ((JointForces(("v",)), JointForces(("v",), kernel="deep")), "'joint-forces-1 pan' and 'joint-forces-2 pan'"),
+        ((PeriodicJointForces(1.0), PeriodicJointForces(2.0)), "'periodic-joint-forces-1 pan'"),
+        ((JointFriction(), Drive()), "'joint-friction pan' and 'drive pan'"),
+        (
+            (ContactFriction(axes="two-axis"), ContactFriction(axes="two-axis", kernel="linear")),
+            "'contact-friction-1 tang",
+        ),
+        ((ToolForces(torque=True), ToolForces()), "'tool-friction-1 force-tangent-1' and 'tool-friction-2 force-tang"),
+    ],
+    ids=["joints", "kernels", "inputs", "periods", "signs", "kernels-of-contacts", "torque"],
+)
+def test_the_same_function_in_two_terms_is_refused(data, prior, names):
+    with pytest.raises(InvalidInput, match=f"{names}.*.* leave one of them out"):
+        fit(data, prior)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        (JointFriction(), JointForces(("v",))),
+        (JointFriction(), JointForces()),
+        (ContactFriction(), ContactFriction(axes="two-axis")),
+        (JointFriction(("pan",)), JointFriction(("lift",))),
+        (JointFriction(), ()),
+        (),
+    ],
+    ids=["inputs", "all", "axes", "joints", "nothing", "none"],
+)
+def test_terms_that_differ_are_fitted_without_a_word(data, prior):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(data, prior)
+
+
+def test_no_residual_at_all_is_refused(data):
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    exact = with_columns(data, a=data.model.dynamics(*states).acceleration_map().offset.numpy())
+    with pytest.raises(InvalidInput, match="accelerations equal the mean"):
+        fit(exact, JointFriction(), noise=Noise(0.1))
+
+
+@pytest.mark.parametrize("prior", [ContactFriction(), JointFriction(("lift",))], ids=["tool", "joint"])
+def test_known_forces_that_no_latent_can_carry_are_pointed_out(data, prior):
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    dynamics = data.model.dynamics(*states)
+    B, Q_K = prior.direction(dynamics).numpy(), dynamics.Q_K.numpy()
+    left, size = 0.0, 0.0
+    for H, b, force in zip(dynamics.H.numpy(), B, Q_K, strict=True):
+        weights, *_ = np.linalg.lstsq(H @ b, H @ force, rcond=1e-9)
+        left += np.sum((H @ force - H @ b @ weights) ** 2)
+        size += np.sum((H @ force) ** 2)
+    with pytest.warns(DataWarning, match="^without laws the unknown forces carry gravity") as caught:
+        fit(data, prior, mean=False)
+    assert len(caught) == 1
+    assert f"but {np.sqrt(left / size):.0%} of the acceleration that these cause" in str(caught[0].message)
+    assert "give the model its laws, or add a force on every joint" in str(caught[0].message)
+
+
+@pytest.mark.parametrize(
+    "prior", [JointForces(), (ContactFriction(), JointForces()), JointAccelerations()], ids=["joints", "sum", "all"]
+)
+def test_priors_that_act_on_every_joint_can_carry_the_known_forces(data, prior):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(data, prior, mean=False)

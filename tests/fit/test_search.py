@@ -1,0 +1,91 @@
+"""Several starts of one search: when they end, which are dropped, and that this is the same on every backend."""
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import arm_data
+
+from forcegp.fit import fit
+from forcegp.fit.search import AT_ONCE, best_value, run_restarts
+from forcegp.forces import JointForces
+from forcegp.inference import OptimizerOptions, minimize_objective
+from forcegp.model import Model
+from forcegp.parallel import Joblib, Serial
+
+UNTIL_CONVERGED = OptimizerOptions(memory=20)
+"""The search as it was: few steps remembered, and all starts to the end."""
+
+
+@pytest.fixture(scope="module")
+def train():
+    return arm_data(40, seed=1)
+
+
+def valley(parameters):
+    """Two basins along x, at 0 and, 40 higher, at 4; narrow and bent across."""
+    x, y = parameters["x"]
+    return 10.0 * x + 5.0 * (x * (x - 4.0)) ** 2 + 50.0 * (y - x**2) ** 2
+
+
+def from_place(index, before=(), progress=None, *, options, places=(0.5, 4.5, 5.0, -0.5, 5.5)):
+    start = {"x": torch.tensor([places[index], 2.0], dtype=torch.float64)}
+    return minimize_objective(valley, start, options, rival=best_value(before))
+
+
+@pytest.mark.parametrize(
+    ("model", "fraction"), [(lambda model: model.with_forces(JointForces()), 0.8), (Model.black_box, 0.7)]
+)
+def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
+    """With 154 parameters of seven joints less than half (docs/benchmarks/performance.md); here there are 30."""
+    fast = fit(model(train.model), train, seed=1)
+    slow = fit(model(train.model), train, seed=1, options=UNTIL_CONVERGED)
+    assert fast.result.evaluations <= fraction * slow.result.evaluations
+    assert fast.result.value < slow.result.value + 0.5
+    assert fast.result.converged
+
+
+def test_starts_behind_those_before_are_dropped_and_say_so():
+    options = OptimizerOptions(patience=5)
+    found = run_restarts(lambda index, **how: from_place(index, **how, options=options), 5, 5, Serial(), None)
+    assert [each.status.startswith("dropped: 5 iterations") for each in found] == [False, False, True, False, True]
+    alone = from_place(2, options=options)
+    assert alone.converged
+    assert not found[2].converged
+    assert found[2].evaluations < alone.evaluations
+    assert found[2].history == alone.history[: len(found[2].history)]
+
+
+def test_a_fit_reports_the_end_of_every_start(train):
+    posterior = fit(
+        train.model.with_forces(JointForces()), train, restarts=4, seed=1, options=OptimizerOptions(patience=1)
+    )
+    statuses, values = posterior.settings["restart_status"], posterior.settings["restart_objective"]
+    assert len(statuses) == len(values) == 4
+    dropped = [status.startswith("dropped") for status in statuses]
+    assert not any(dropped[:AT_ONCE])
+    assert any(dropped[AT_ONCE:])
+    assert f"best of 4 starts, {sum(dropped)} of them dropped" in posterior.result.status
+    assert all(value > posterior.result.value for value, drop in zip(values, dropped, strict=True) if drop)
+
+
+def test_who_is_compared_with_whom_does_not_depend_on_the_backend_or_the_number_of_starts():
+    def seen(index, before, progress):
+        return index, list(before)
+
+    serial = run_restarts(seen, 5, 100, Serial(), None)
+    assert [len(before) for _, before in serial] == [0, 0, 2, 2, 4]
+    assert serial == run_restarts(seen, 5, 100, Joblib(2), None)
+    assert serial[:3] == run_restarts(seen, 3, 100, Serial(), None)
+    assert all(before == [] for _, before in run_restarts(seen, 5, 0, Serial(), None))
+
+
+def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
+    how = {"points": 15, "restarts": 4, "seed": 3, "options": OptimizerOptions(iterations=25, patience=2)}
+    one, two = (fit(train.model.with_forces(JointForces()), train, jobs=jobs, **how) for jobs in (1, 2))
+    assert one.settings["restart_status"] == two.settings["restart_status"]
+    assert "dropped" in str(one.settings["restart_status"])
+    np.testing.assert_allclose(one.settings["restart_objective"], two.settings["restart_objective"], rtol=1e-9)
+
+
+def test_nothing_was_found_before():
+    assert best_value(()) == float("inf")

@@ -1,0 +1,38 @@
+"""Friction under several feet that slide on the ground, each in rows in which it stands."""
+
+import torch
+
+from forcegp import Contact, Model, Plane, Robot
+from forcegp.forces import foot_friction
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
+
+
+def test_feet_that_stand_resist_their_own_sliding_and_no_other():
+    held = simulate_quadruped(QuadrupedConfig(seconds=0.1)).model
+    robot: Robot = held.robot
+    feet = ("front_left", "rear_right")
+    contacts = tuple(
+        Contact(f"{leg}_foot", (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.0), f"{leg}_stands") for leg in feet
+    )
+    model = Model(robot, contacts, held.forces)
+    generator = torch.Generator().manual_seed(0)
+    q = robot.random(generator, 3)
+    v = torch.randn(3, robot.nv, generator=generator, dtype=torch.float64)
+    u = torch.zeros(3, 14, dtype=torch.float64)
+    u[:, 12:] = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+    dynamics = model.dynamics(q, v, u)
+    feet_forces = foot_friction((0, 1))
+    for force in feet_forces:
+        force.check(model.robot, model.contacts)
+    mixing = torch.cat([force.direction(dynamics) for force in feet_forces], dim=-1)
+    assert mixing.shape == (3, robot.nv, 2)
+    for number, leg in enumerate(feet):
+        J = dynamics.state.kinematics.frame_jacobian(f"{leg}_foot")[:, :2]
+        sliding = (J @ v[..., None])[..., 0]
+        along = -(J.mT @ (sliding / sliding.norm(dim=-1, keepdim=True))[..., None])[..., 0]
+        load = dynamics.multiplier_map().offset[:, number].abs()
+        torch.testing.assert_close(mixing[..., number], load[:, None] * along, rtol=1e-6, atol=1e-6)
+    assert mixing[0].abs().amax(0).min() > 0.0
+    assert not mixing[2].any()
+    assert mixing[1, :, 0].any()
+    assert not mixing[1, :, 1].any()

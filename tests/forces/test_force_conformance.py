@@ -1,0 +1,119 @@
+"""Every unknown force, with several options, passes the suite of all; so does one that forcegp does not bring."""
+
+from math import pi
+
+import pytest
+from tests.forces.force_conformance import UnknownConformance
+from tests.forces.third_party_unknown import AirDrag
+
+from forcegp.forces import (
+    AerodynamicForce,
+    BaseWrench,
+    ContactFriction,
+    JointAccelerations,
+    JointForces,
+    JointFriction,
+    PeriodicJointForces,
+    ToolForces,
+)
+from forcegp.forces.contact_friction import ExpectedFriction, TabulatedCurve
+
+TIP = ("hand", (0.0, 0.0, 0.2))  # where the arm touches its plane
+
+
+# random states and a fit of a few iterations: friction that was found may lift the contact without end somewhere
+JAMS = pytest.mark.filterwarnings("ignore:the expected friction nearly jams")
+
+
+class TestJointForces(UnknownConformance):
+    prior = JointForces()
+
+
+class TestJointForcesOnAngles(UnknownConformance):
+    prior = JointForces(("q", "v"), kernel="matern-5/2", angles="sin-cos")
+
+
+class TestJointAccelerations(UnknownConformance):
+    prior = JointAccelerations(("v",))
+
+
+class TestJointFriction(UnknownConformance):
+    prior = JointFriction()
+
+
+class TestJointFrictionOfTwoJoints(UnknownConformance):
+    prior = JointFriction(("bend", "pan"), kernel="linear + squared-exponential")
+
+
+class TestBaseWrench(UnknownConformance):
+    prior = BaseWrench("hand", ("velocity", "angular-velocity", "height", "attitude"))
+    acts_at = ("hand", (0.0, 0.0, 0.0))
+
+
+class TestAerodynamicForce(UnknownConformance):
+    prior = AerodynamicForce("hand", kernel="linear")
+    acts_at = ("hand", (0.0, 0.0, 0.0))
+
+
+class TestToolForces(UnknownConformance):
+    prior = ToolForces()
+    acts_at = TIP
+
+
+class TestToolForcesAndTorquesOnASurface(UnknownConformance):
+    prior = ToolForces(torque=True, inputs=("velocity", "angular-velocity", "position"), kernel="matern-3/2")
+    acts_at = TIP
+
+
+class TestToolForcesAlongTheWorld(UnknownConformance):
+    prior = ToolForces("fore", (0.1, 0.0, -0.1), axes="world", inputs=("position", "u", "load"))
+    acts_at = ("fore", (0.1, 0.0, -0.1))
+
+
+class TestToolForcesAlongTheTool(UnknownConformance):
+    prior = ToolForces(axes="tool", torque=True, inputs=("velocity", "angular-velocity", "q"))
+    acts_at = TIP
+
+
+class TestContactFriction(UnknownConformance):
+    prior = ContactFriction()
+    acts_at = TIP
+
+
+@JAMS
+class TestContactFrictionUnderLoad(UnknownConformance):
+    prior = ContactFriction(load=True)
+    acts_at = TIP
+
+
+class TestContactFrictionUnderExpectedLoad(UnknownConformance):
+    prior = ContactFriction(load=True, expected=0.3)
+    acts_at = TIP
+
+
+class TestContactFrictionUnderLoadWithJointFriction(UnknownConformance):
+    prior = ContactFriction(
+        load=True,
+        expected=ExpectedFriction(
+            TabulatedCurve((0.0, 0.4, 1.0), (0.0, 0.2, 0.1)), (("bend", TabulatedCurve((-1.0, 1.0), (-2.0, 3.0))),)
+        ),
+    )
+    acts_at = TIP
+
+
+class TestContactFrictionOfTwoAxes(UnknownConformance):
+    prior = ContactFriction(axes="two-axis", load=True, kernel="linear")
+    acts_at = TIP
+
+
+class TestPeriodicJointForces(UnknownConformance):
+    prior = PeriodicJointForces()
+
+
+class TestPeriodicJointForcesOfOneJoint(UnknownConformance):
+    prior = PeriodicJointForces(pi / 6, ("lift",))
+
+
+class TestAirDrag(UnknownConformance):
+    prior = AirDrag("hand")
+    acts_at = ("hand", (0.0, 0.0, 0.0))

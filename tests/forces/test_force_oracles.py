@@ -1,0 +1,283 @@
+"""The forces that priors stand for against Pinocchio, dense equations of motion, and laws of friction."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from tests.mechanics.systems import POINT, contacts, solve_kkt, states
+from tests.mechanics.systems import model_with as model_of
+from tests.robots.pinocchio_oracle import Oracle
+from tests.robots.robot_models import FRAMES, MODELS
+
+from forcegp.forces import ContactFriction, JointForces, JointFriction, Payload, PeriodicJointForces, ToolForces
+from forcegp.inference import LatentKernels
+from forcegp.mechanics import Contact, ImplicitSurface, Plane
+from forcegp.model import Model
+from forcegp.robots import Robot
+
+MODEL = "chain"  # prismatic, continuous and revolute joints
+FRAME = FRAMES[MODEL]
+ROWS = 5
+GRAVITY = (1.0, -2.0, -9.0)
+CENTER = (0.03, -0.05, 0.11)
+MASS = 1.7
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_of(MODEL)
+
+
+@pytest.fixture(scope="module")
+def oracle(model):
+    return Oracle(MODELS[MODEL](), model.robot)
+
+
+@pytest.fixture(scope="module")
+def rows(model):
+    return states(model.robot.nv, ROWS)
+
+
+@pytest.fixture(scope="module")
+def dynamics(model, rows):
+    return model.dynamics(*rows)
+
+
+def jacobians(oracle, q, v, point=POINT):
+    """Poses and Jacobians of a point of FRAME in every row, by Pinocchio."""
+    index = oracle.with_point(FRAME, np.array(point))
+    found = [oracle.frame(a, b, index) for a, b in zip(q.numpy(), v.numpy(), strict=True)]
+    return tuple(torch.tensor(np.stack(part)) for part in list(zip(*found, strict=True))[:2])
+
+
+class TestPayload:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def robot(cls):
+        return Robot.from_urdf_text(MODELS[MODEL](), gravity=GRAVITY)
+
+    def test_it_is_the_gravity_that_a_mass_adds(self, robot, rows):
+        """Pinocchio, with a point mass put into the body that carries the link."""
+        bare, loaded = (Oracle(MODELS[MODEL](), robot) for _ in range(2))
+        joint, placement = loaded.carrier(FRAME)
+        at = pin.SE3(placement).act(np.array(CENTER))
+        loaded.model.inertias[joint] = loaded.model.inertias[joint] + pin.Inertia(MASS, at, np.zeros((3, 3)))
+        loaded.data = loaded.model.createData()
+        q, *_ = rows
+        expected = [bare.gravity_forces(row) - loaded.gravity_forces(row) for row in q.numpy()]
+        without, with_load = Model(robot), Model(robot).with_forces(Payload(FRAME, MASS, CENTER))
+        still = rows[0], 0.0 * rows[1], 0.0 * rows[2]
+        given = with_load.dynamics(*still).Q_K - without.dynamics(*still).Q_K
+        torch.testing.assert_close(given, torch.tensor(np.stack(expected)), rtol=1e-10, atol=1e-10)
+
+
+class TestToolForces:
+    def test_along_the_world_and_the_tool(self, oracle, rows, dynamics):
+        pose, J = jacobians(oracle, *rows[:2])
+        world = ToolForces(FRAME, POINT, axes="world", torque=True).direction(dynamics)
+        torch.testing.assert_close(world, J.mT, rtol=1e-10, atol=1e-10)
+        tool = ToolForces(FRAME, POINT, axes="tool", torque=True).direction(dynamics)
+        R = pose[:, :3, :3]
+        expected = torch.cat([J[:, :3].mT @ R, J[:, 3:].mT @ R], -1)
+        torch.testing.assert_close(tool, expected, rtol=1e-10, atol=1e-10)
+        at_contact = ToolForces(axes="tool", torque=True).direction(dynamics)
+        torch.testing.assert_close(at_contact, tool, rtol=1e-13, atol=1e-13)
+
+    def test_features_are_place_and_motion_along_the_axes(self, oracle, rows, dynamics, model):
+        q, v, u = rows
+        pose, J = jacobians(oracle, q, v)
+        R, twist = pose[:, :3, :3], (J @ v[..., None])[..., 0]
+        inputs = ("velocity", "angular-velocity", "position", "load", "q", "v", "u")
+        prior = ToolForces(axes="tool", inputs=inputs)
+        load = dynamics.multiplier(torch.zeros_like(q)).abs() * dynamics.normals[:, 0].norm(dim=-1, keepdim=True)
+        turned = [(R.mT @ part[..., None])[..., 0] for part in (twist[:, :3], twist[:, 3:])]
+        expected = torch.cat([*turned, pose[:, :3, 3], load, q, v, u], dim=-1)
+        for z in prior.features(dynamics):
+            torch.testing.assert_close(z, expected, rtol=1e-10, atol=1e-10)
+        names = prior.feature_names(model.robot)[0]
+        assert names[0] == "tool velocity along tool-x [m/s]"
+        assert names[6] == "tool position along x [m]"
+        assert len(names) == expected.shape[-1]
+
+    def test_along_a_surface_the_force_is_tangential_to_it(self, oracle, rows, dynamics):
+        """For a point that stays on it; for one that drifts off, the force is tilted to resist all of its motion."""
+        q, v, u = rows
+        _, J = jacobians(oracle, q, v)
+        normal = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
+        normal = normal / normal.norm()
+        on_the_plane = v - (torch.linalg.pinv(dynamics.A) @ (dynamics.A @ v[..., None]))[..., 0]
+        held = Model(dynamics.state.robot, contacts("one", FRAME)).dynamics(q, on_the_plane, u)
+        force = ToolForces().point_force(held)
+        torch.testing.assert_close(force.mT @ force, torch.eye(2).double().expand(ROWS, 2, 2), rtol=0.0, atol=1e-12)
+        assert float((normal @ force).abs().max()) < 1e-12
+        torch.testing.assert_close(ToolForces().direction(held), J[:, :3].mT @ force, rtol=1e-10, atol=1e-10)
+        drifted = v - 0.99 * (v - on_the_plane)
+        moving = Model(dynamics.state.robot, contacts("one", FRAME)).dynamics(q, drifted, u)
+        velocity = (J[:, :3] @ drifted[..., None])[..., 0]
+        (z, _), tangents = ToolForces().features(moving), ToolForces().point_force(moving)
+        off = float((velocity @ normal).abs().max())
+        assert off > 1e-4
+        resisting = (tangents @ z[..., None])[..., 0]
+        assert float((resisting - velocity).abs().max()) < 0.1 * off
+
+    def test_without_its_contact_it_is_zero(self, model, rows):
+        free = model.with_contacts([]).dynamics(*rows)
+        for prior in (ToolForces(torque=True), ToolForces(FRAME, axes="surface"), ContactFriction(axes="two-axis")):
+            count = len(prior.latent_names(model.robot))
+            assert torch.equal(prior.direction(free), torch.zeros(ROWS, model.robot.nv, count).double())
+            assert torch.equal(prior.point_force(free), torch.zeros(ROWS, 3, count).double())
+            shapes = [z.shape for z in prior.features(model.dynamics(*rows))]
+            assert [z.shape for z in prior.features(free)] == shapes
+        assert bool((ToolForces(FRAME, axes="world").direction(free) != 0.0).any())
+
+
+class TestContactFriction:
+    def friction(self, dynamics, prior, *coefficients):
+        latents = torch.tensor(coefficients, dtype=torch.float64)
+        return [(part(dynamics) @ latents) for part in (prior.direction, prior.point_force)]
+
+    def test_it_takes_power_and_has_the_size_of_the_latent(self, oracle, rows, dynamics):
+        q, v, _ = rows
+        joint_force, force = self.friction(dynamics, ContactFriction(), 2.5)
+        power = (v * joint_force).sum(-1)
+        assert bool((power < -1e-3).all())
+        torch.testing.assert_close(force.norm(dim=-1), 2.5 * torch.ones(ROWS).double(), rtol=1e-9, atol=0.0)
+        _, J = jacobians(oracle, q, v)
+        velocity = (J[:, :3] @ v[..., None])[..., 0]
+        normal = dynamics.normals[:, 0] / dynamics.normals[:, 0].norm(dim=-1, keepdim=True)
+        along = velocity - (velocity * normal).sum(-1, keepdim=True) * normal
+        expected = -2.5 * along / along.norm(dim=-1, keepdim=True)
+        torch.testing.assert_close(force, expected, rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(power, -2.5 * along.norm(dim=-1), rtol=1e-8, atol=0.0)
+        (speed,) = ContactFriction().features(dynamics)
+        torch.testing.assert_close(speed[:, 0], along.norm(dim=-1), rtol=1e-9, atol=0.0)
+
+    @pytest.mark.parametrize("scale", [1.0, 3.0], ids=["distance", "any-surface"])
+    def test_load_is_the_normal_force_of_the_dense_equations(self, model, rows, scale):
+        """A surface function that is no distance has another multiplier and the same force."""
+        plane = model.contacts[0].surface
+        surface = ImplicitSurface(lambda p: scale * plane.value(p))
+        dynamics = model.with_contacts([Contact(FRAME, POINT, surface)]).dynamics(*rows)
+        _, multiplier = solve_kkt(dynamics.M, dynamics.Q_K, dynamics.A, dynamics.b)
+        force_of_contact = multiplier[:, 0].abs() * scale
+        _, force = self.friction(dynamics, ContactFriction(load=True), 0.3)
+        torch.testing.assert_close(force.norm(dim=-1), 0.3 * force_of_contact, rtol=1e-8, atol=0.0)
+        plain = ContactFriction(axes="two-axis").direction(dynamics)
+        loaded = ContactFriction(axes="two-axis", load=True).direction(dynamics)
+        torch.testing.assert_close(loaded, force_of_contact[:, None, None] * plain, rtol=1e-8, atol=1e-12)
+
+    def test_isotropic_friction_knows_no_direction(self, model, rows):
+        """The robot and its plane turned about the vertical by any angle feel the same joint forces."""
+        text = MODELS[MODEL]()
+        first, second = (Contact(FRAME, POINT, Plane(normal, 0.05)) for normal in ((0.2, -0.1, 1.0), (0.1, 0.2, 1.0)))
+        quarter = f'<link name="ground"/><joint name="turn" type="fixed"><origin xyz="0 0 0" rpy="0 0 {math.pi / 2}"/>'
+        quarter += '<parent link="ground"/><child link="rail"/></joint><link name="rail"/>'
+        assert '<link name="rail"/>' in text
+        turned = Robot.from_urdf_text(text.replace('<link name="rail"/>', quarter))
+        here = Model(model.robot, (first,)).dynamics(*rows)
+        there = Model(turned, (second,)).dynamics(*rows)
+        for prior in (ContactFriction(), ContactFriction(load=True)):
+            torch.testing.assert_close(prior.direction(there), prior.direction(here), rtol=1e-9, atol=1e-9)
+            torch.testing.assert_close(prior.features(there)[0], prior.features(here)[0], rtol=1e-9, atol=1e-9)
+
+    def test_two_axes_act_each_along_its_own(self, dynamics, rows):
+        prior = ContactFriction(axes="two-axis")
+        force, (one, two) = -prior.point_force(dynamics), prior.features(dynamics)
+        torch.testing.assert_close(force.mT @ force, torch.eye(2).double().expand(ROWS, 2, 2), rtol=0.0, atol=1e-12)
+        viscous = -(prior.direction(dynamics) @ torch.cat([one, two], -1)[..., None])[..., 0]
+        assert bool(((viscous * rows[1]).sum(-1) > 0.0).all())
+        isotropic = (ContactFriction().direction(dynamics) @ ContactFriction().features(dynamics)[0][..., None])[..., 0]
+        torch.testing.assert_close(-viscous, isotropic, rtol=1e-8, atol=1e-8)
+
+    @pytest.mark.parametrize(
+        "how",
+        [{"viscous": True}, {"viscous": True, "inputs": ("position",)}, {"inputs": ("position",)}],
+        ids=["viscous", "viscous-map", "dry-map"],
+    )
+    def test_two_axes_whose_latents_do_not_know_the_direction_resist_in_all(self, model, rows, how):
+        """Positive coefficients take power, the force turns round with the motion, and equal ones are isotropic."""
+        q, v, u = rows
+        prior = ContactFriction(axes="two-axis", **how)
+        there, back = model.dynamics(q, v, u), model.dynamics(q, -v, u)
+        joint_force, force = self.friction(there, prior, 0.7, 2.5)
+        assert bool(((v * joint_force).sum(-1) < -1e-4).all())
+        torch.testing.assert_close(self.friction(back, prior, 0.7, 2.5)[1], -force, rtol=1e-12, atol=1e-12)
+        one = self.friction(there, ContactFriction(**how), 2.5)
+        torch.testing.assert_close(self.friction(there, prior, 2.5, 2.5), one, rtol=1e-12, atol=1e-12)
+
+
+def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
+    prior = JointFriction(("tilt", "slide"))
+    order = [dynamics.state.robot.joint_names.index(name) for name in ("tilt", "slide")]
+    force = prior.direction(dynamics) @ torch.tensor([2.0, 3.0], dtype=torch.float64)
+    expected = torch.zeros_like(rows[1])
+    expected[:, order] = torch.tensor([-2.0, -3.0], dtype=torch.float64)
+    assert torch.equal(force, expected)
+    assert torch.equal(torch.cat(prior.features(dynamics), -1), rows[1][:, order])
+
+
+def test_periodic_forces_repeat(dynamics):
+    """Functions of the kernel at q and at q + k periods are perfectly correlated; in between they are not."""
+    prior = PeriodicJointForces(0.3)
+    robot = dynamics.state.robot
+    z = prior.features(dynamics)
+    later = [one + 0.3 * torch.arange(ROWS).double()[:, None] for one in z]
+    half = [one + 0.15 for one in z]
+    kernels = LatentKernels(prior.kernels(robot, (1,) * robot.nv, torch.arange(1.0, 1.0 + robot.nv).double()))
+    with torch.no_grad():
+        for c, kernel in enumerate(kernels):
+            K = kernel(z[c], later[c]).to_dense()
+            torch.testing.assert_close(K, kernel(z[c], z[c]).to_dense(), rtol=1e-9, atol=1e-9)
+            torch.testing.assert_close(K.diagonal(), (c + 1.0) * torch.ones(ROWS).double(), rtol=1e-9, atol=0.0)
+            assert float(kernel(z[c], half[c]).to_dense().diagonal().max()) < 0.5 * (c + 1.0)
+
+
+def test_a_periodic_kernel_starts_at_the_median_of_its_prior(dynamics):
+    robot = dynamics.state.robot
+    for kernel in PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()):
+        assert kernel.base_kernel.lengthscale.item() == pytest.approx(1.0)
+        assert kernel.base_kernel.period_length.item() == pytest.approx(0.3)
+
+
+def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
+    """A unit step of the search, such as a restart takes, is one standard deviation of the prior: 2 %."""
+    given = torch.tensor(0.3, dtype=torch.float64)
+    robot = dynamics.state.robot
+    kernels = LatentKernels(PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()))
+    start = kernels.initial_parameters()
+    name = "kernels.1.base_kernel.raw_period_length"
+    torch.testing.assert_close(start[name], torch.zeros(1, 1).double(), rtol=0.0, atol=1e-9)
+    moved = {name: torch.full((1, 1), 1.5, dtype=torch.float64, requires_grad=True)}
+    there = list(kernels.at(start | moved))[1].base_kernel
+    torch.testing.assert_close(there.period_length[0, 0], given * math.exp(1.5 * 0.02), rtol=1e-12, atol=0.0)
+    there.period_length = 0.9 * there.period_length  # by value, as start values are
+    torch.testing.assert_close(there.period_length[0, 0], 0.9 * given * math.exp(1.5 * 0.02), rtol=1e-12, atol=0.0)
+    density = kernels.log_prior(start | moved)
+    torch.testing.assert_close(density - kernels.log_prior(start), torch.tensor(-0.5 * 1.5**2).double())
+    density.backward()
+    torch.testing.assert_close(moved[name].grad, torch.full((1, 1), -1.5, dtype=torch.float64), rtol=1e-9, atol=0.0)
+
+
+def test_sines_and_cosines_do_not_see_a_full_turn_and_keep_sliding_joints(model, rows):
+    prior = JointForces(("q", "v"), angles="sin-cos")
+    robot = model.robot
+    slides = torch.tensor([joint.type == "prismatic" for joint in robot.joints])
+    assert 0 < int(slides.sum()) < robot.nv
+    q, v, u = rows
+    here = prior.features(model.dynamics(q, v, u))[0]
+    turn = torch.where(slides, 0.0, 2.0 * math.pi * torch.arange(-2.0, robot.nv - 2.0).double())
+    torch.testing.assert_close(prior.features(model.dynamics(q + turn, v, u))[0], here, rtol=0.0, atol=1e-12)
+    shifted = prior.features(model.dynamics(q + 0.1, v, u))[0]
+    assert bool(((shifted - here).abs()[:, : -robot.nv].amax(0) > 1e-3).all())
+    names = prior.feature_names(robot)[0]
+    expected = {
+        **{f"q of {name}": q[:, k] for k, name in enumerate(robot.joint_names) if slides[k]},
+        **{f"sin q of {name}": q[:, k].sin() for k, name in enumerate(robot.joint_names) if not slides[k]},
+        **{f"cos q of {name}": q[:, k].cos() for k, name in enumerate(robot.joint_names) if not slides[k]},
+        **{f"v of {name}": v[:, k] for k, name in enumerate(robot.joint_names)},
+    }
+    found = {name.split(" [")[0]: here[:, k] for k, name in enumerate(names)}
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[name], value) for name, value in expected.items())

@@ -1,0 +1,333 @@
+"""Kernels by name: every one of them passes the conformance suite; closed forms; expressions."""
+
+import math
+
+import gpytorch.kernels as gk
+import pytest
+import torch
+from tests.forces.kernel_conformance import KernelConformance
+from tests.inference.dense import squared_exponential
+from tests.inference.kernel_functions import kernel_cross, kernel_matrix
+from tests.inference.problems import normal
+
+from forcegp.errors import InvalidInput
+from forcegp.forces.kernels import KERNELS, check_kernel, kernel_of
+from forcegp.inference import ExactPosterior, LatentKernels, Terms, minimize_objective, negative_log_likelihood
+
+
+class TestSquaredExponential(KernelConformance):
+    expression = "squared-exponential"
+
+
+class TestMatern12(KernelConformance):
+    expression = "matern-1/2"
+
+
+class TestMatern32(KernelConformance):
+    expression = "matern-3/2"
+
+
+class TestMatern52(KernelConformance):
+    expression = "matern-5/2"
+
+
+class TestRationalQuadratic(KernelConformance):
+    expression = "rational-quadratic"
+
+
+class TestPeriodic(KernelConformance):
+    expression = "periodic"
+
+
+class TestConstant(KernelConformance):
+    expression = "constant"
+
+
+class TestLinear(KernelConformance):
+    expression = "linear"
+
+
+class TestFriction(KernelConformance):
+    expression = "friction"
+    dimensions = (1,)
+    variance_at_the_start = False  # tanh^2 is a little below 1
+
+
+class TestDeep(KernelConformance):
+    expression = "deep"
+
+
+class TestDeviation(KernelConformance):
+    expression = "deviation"
+    share_at_the_start = 1e-4
+
+
+class TestSum(KernelConformance):
+    expression = "linear + squared-exponential + constant"
+
+
+class TestProduct(KernelConformance):
+    expression = "periodic * (constant + linear) * matern-3/2"
+
+
+class TestProductOfScaled(KernelConformance):
+    expression = "squared-exponential * rational-quadratic"
+
+
+def test_every_name_is_tested():
+    assert set(KERNELS) <= {suite.expression for suite in KernelConformance.__subclasses__()}
+
+
+# ---------------------------------------------------------------- closed forms
+
+
+def float64(values) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def matrix(kernel: gk.Kernel, z: torch.Tensor) -> torch.Tensor:
+    return kernel_matrix(kernel, z).detach()
+
+
+def test_friction_against_its_formula():
+    kernel = kernel_of("friction", 1, 3.0)
+    sign, level = kernel.kernels[0].kernels
+    sign.raw_width.data.fill_(math.log(0.2))
+    level.kernels[0].constant = float64([0.7])
+    level.kernels[1].outputscale = float64(0.4)
+    level.kernels[1].base_kernel.raw_width.data.fill_(math.log(0.3))
+    level.kernels[1].base_kernel.lengthscale = float64([[0.6]])
+    kernel.kernels[1].variance = float64([[0.9]])
+    s = normal(7, 1)
+    phi, x = torch.tanh(s / 0.2), torch.asinh(s / 0.3)
+    expected = phi @ phi.mT * (0.7 + 0.4 * torch.exp(-(x - x.mT).abs() / 0.6)) + 0.9 * s @ s.mT
+    torch.testing.assert_close(matrix(kernel, s), expected, rtol=1e-13, atol=1e-14)
+
+
+def test_friction_is_zero_at_rest_and_starts_with_equal_shares():
+    kernel = kernel_of("friction", 1, 3.0)
+    rest, fast = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
+    assert float(matrix(kernel, rest)) == 0.0
+    assert float(kernel_cross(kernel, rest, normal(5, 1)).detach().abs().max()) == 0.0
+    assert float(matrix(kernel, fast)) == pytest.approx(3.0, rel=1e-6)
+    (coulomb, stribeck), viscous = kernel.kernels[0].kernels[1].kernels, kernel.kernels[1]
+    shares = [float(x.detach()) for x in (coulomb.constant, stribeck.outputscale, viscous.variance)]
+    assert shares == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_friction_is_a_function_of_one_velocity():
+    with pytest.raises(InvalidInput, match="one velocity and was given 3 features"):
+        kernel_of("friction", 3, 1.0)
+
+
+def test_linear_against_its_formula():
+    kernel = kernel_of("linear", 3, 1.0)
+    variances = float64([[0.5, 2.0, 1.5]])
+    kernel.variance = variances
+    z = normal(6, 3)
+    torch.testing.assert_close(matrix(kernel, z), z @ torch.diag(variances[0]) @ z.mT, rtol=1e-13, atol=1e-14)
+
+
+def test_periodic_against_its_formula_and_after_a_period():
+    kernel = kernel_of("periodic", 2, 1.3)
+    period, scale = float64([2.0, 3.0]), float64([0.7, 1.9])
+    kernel.base_kernel.period_length = period[None]
+    kernel.base_kernel.lengthscale = scale[None]
+    z = normal(6, 2)
+    sine = torch.sin(math.pi * (z[:, None] - z[None]) / period)
+    expected = 1.3 * torch.exp(-2.0 * (sine.square() / scale).sum(-1))
+    torch.testing.assert_close(matrix(kernel, z), expected, rtol=1e-13, atol=1e-14)
+    later = kernel_cross(kernel, z + period * float64([3.0, -2.0]), z).detach()
+    torch.testing.assert_close(later, expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("name", "formula"),
+    [
+        ("matern-1/2", lambda r: torch.exp(-r)),
+        ("matern-3/2", lambda r: (1 + 3**0.5 * r) * torch.exp(-(3**0.5) * r)),
+        ("matern-5/2", lambda r: (1 + 5**0.5 * r + 5 / 3 * r.square()) * torch.exp(-(5**0.5) * r)),
+        ("rational-quadratic", lambda r: 1 / (1 + r.square() / 2)),
+    ],
+)
+def test_functions_of_the_distance_against_their_formulas(name, formula):
+    kernel = kernel_of(name, 3, 1.3)
+    z = normal(6, 3)
+    r = (z[:, None] - z[None]).norm(dim=-1) / 3**0.5
+    torch.testing.assert_close(matrix(kernel, z), 1.3 * formula(r), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["matern-1/2", "matern-3/2"])
+def test_points_that_nearly_coincide_keep_their_difference(name):
+    """A distance of 1e-9 from a difference of squares would be 1e-8 or nothing."""
+    kernel = kernel_of(name, 1, 1.0)
+    z = float64([[5.0], [5.0 + 2.0**-30]])
+    missing = 1.0 - float(kernel_cross(kernel, z[:1], z[1:]).detach())
+    expected = 2.0**-30 if name == "matern-1/2" else 0.0
+    assert missing == pytest.approx(expected, rel=1e-5, abs=1e-15)
+
+
+# ---------------------------------------------------------------- expressions
+
+
+def test_precedence_and_parentheses():
+    z = normal(6, 2)
+    a, b, c = ("squared-exponential", "matern-1/2", "linear")
+    one = {name: matrix(kernel_of(name, 2, 1.0), z) for name in (a, b, c)}
+    bare = {name: one[name] for name in (a, b)}
+    torch.testing.assert_close(matrix(kernel_of(f"{a} + {b} * {c}", 2, 2.0), z), one[a] + bare[b] * one[c])
+    torch.testing.assert_close(matrix(kernel_of(f"({a}+{b})*{c}", 2, 2.0), z), (one[a] + one[b]) * one[c])
+    torch.testing.assert_close(matrix(kernel_of(f" ( ( {c} ) ) ", 2, 1.0), z), one[c])
+    torch.testing.assert_close(matrix(kernel_of(f"{a} + {b} + {c}", 2, 3.0), z), one[a] + one[b] + one[c])
+
+
+def test_a_product_has_one_variance():
+    names = [name for name, _ in kernel_of("squared-exponential * matern-3/2 * matern-1/2", 2, 2.0).named_parameters()]
+    assert [name for name in names if "outputscale" in name] == ["kernels.0.raw_outputscale"]
+    names = [name for name, _ in kernel_of("squared-exponential * linear", 2, 2.0).named_parameters()]
+    assert sorted(name.rpartition(".")[2] for name in names) == ["raw_lengthscale", "raw_variance"]
+
+
+@pytest.mark.parametrize(
+    ("expression", "message"),
+    [
+        ("", "ends where a name is expected"),
+        ("linear +", "ends where a name is expected"),
+        ("+ linear", "'\\+' stands where a name is expected"),
+        ("linear * * constant", "'\\*' stands where a name is expected"),
+        ("linear constant", "'constant' is not expected there"),
+        ("linear)", "'\\)' is not expected there"),
+        ("linear * (constant", "parenthesis is not closed"),
+        ("()", "'\\)' stands where a name is expected"),
+        ("liner", "no kernel 'liner' in the registry; did you mean 'linear'"),
+        ("constant + perodic", "no kernel 'perodic' in 'constant \\+ perodic'; did you mean 'periodic'"),
+        ("matern", "Valid kernels: constant, deep, deviation, friction, linear, matern-1/2"),
+    ],
+)
+def test_wrong_expressions_say_what_is_allowed(expression, message):
+    for read in (check_kernel, lambda text: kernel_of(text, 1, 1.0)):
+        with pytest.raises(InvalidInput, match=message) as error:
+            read(expression)
+        assert "rational-quadratic" in str(error.value)
+
+
+def test_a_kernel_of_ones_own(monkeypatch):
+    def mine(dimension, variance):
+        kernel = gk.ScaleKernel(gk.CosineKernel()).double()
+        kernel.outputscale = torch.as_tensor(variance).double()
+        return kernel
+
+    monkeypatch.setitem(KERNELS, "mine", mine)
+    z = normal(5, 1)
+    cosine = torch.cos(math.pi * (z - z.mT) / gk.CosineKernel().double().period_length.detach()[0])
+    expected = 0.5 * cosine + 0.5 * z @ z.mT
+    torch.testing.assert_close(matrix(kernel_of("mine + linear", 1, 1.0), z), expected, rtol=1e-12, atol=1e-13)
+
+
+# ---------------------------------------------------------------- priors on parameters
+
+
+@pytest.mark.parametrize(
+    ("expression", "part", "center", "spread"),
+    [
+        ("matern-5/2", "base_kernel.raw_lengthscale", 0.5 * math.log(2.0) + 3.0, 2.0),
+        ("rational-quadratic", "base_kernel.raw_alpha", 0.0, 2.0),
+        ("periodic", "base_kernel.raw_period_length", math.log(2.0 * math.pi), 0.5),
+        ("linear", "raw_variance", math.log(0.6 / 2), 2.0),
+        ("constant", "raw_constant", math.log(0.6), 2.0),
+        ("deviation", "raw_outputscale", math.log(0.6e-4), 2.0),
+    ],
+)
+def test_hyperpriors_are_normal_in_the_logarithm(expression, part, center, spread):
+    latent = LatentKernels([kernel_of(expression, 2, 0.6)])
+    start = latent.initial_parameters()
+    name = f"kernels.0.{part}"
+    moved = start | {name: start[name] + 0.7}
+    normal_prior = torch.distributions.Normal(float64(center), spread)
+    difference = normal_prior.log_prob(moved[name]).sum() - normal_prior.log_prob(start[name]).sum()
+    assert float(latent.log_prior(moved) - latent.log_prior(start)) == pytest.approx(float(difference), rel=1e-9)
+
+
+def test_the_width_of_friction_has_a_hyperprior():
+    latent = LatentKernels([kernel_of("friction", 1, 0.6)])
+    start = latent.initial_parameters()
+    for name in (
+        "kernels.0.kernels.0.kernels.0.raw_width",
+        "kernels.0.kernels.0.kernels.1.kernels.1.base_kernel.raw_width",
+    ):
+        assert float(start[name].exp()) == pytest.approx(0.1)
+        moved = latent.log_prior(start | {name: start[name] + 1.5})
+        assert float(latent.log_prior(start) - moved) == pytest.approx(1.125)
+
+
+# ---------------------------------------------------------------- the kernel that learns where a force changes
+
+
+def test_deep_without_changes_is_the_squared_exponential_and_a_change_separates_two_sides():
+    kernel = kernel_of("deep", 2, 1.5)
+    base = kernel.base_kernel
+    z = normal(6, 2)
+    base.change.data.zero_()
+    expected = squared_exponential(z, z, base.lengthscale.detach(), 1.5)
+    torch.testing.assert_close(matrix(kernel, z), expected, rtol=1e-12, atol=1e-14)
+    base.change.data.copy_(float64([1.2, 0.0]))
+    base.slope.data.copy_(float64([[3.0, 0.0], [1.0, 0.0]]))
+    base.bias.data.copy_(float64([-1.5, 0.0]))  # the plane z_0 = 1/2
+    pair = float64([[0.0, 0.3], [1.0, 0.3]])
+    near = squared_exponential(pair, pair, base.lengthscale.detach(), 1.5)
+    side = math.tanh(4.0 * 1.5)
+    across = float(near[0, 1]) * math.exp(-0.5 * (2.0 * 1.2 * side) ** 2)
+    assert float(matrix(kernel, pair)[0, 1]) == pytest.approx(across, rel=1e-12)
+
+
+def test_the_hyperpriors_of_deep():
+    """Student t of the changes, (1 + a^2 / s^2)^-(0.3 parameters of the unit); normal bias and logarithm of |w|."""
+    latent = LatentKernels([kernel_of("deep", 3, 0.6)])
+    start = latent.initial_parameters()
+
+    def fall(name, moved):
+        full = f"kernels.0.base_kernel.{name}"
+        return float(latent.log_prior(start) - latent.log_prior(start | {full: moved(start[full])}))
+
+    ratio = (1.0 + (1.0 / 0.01) ** 2) / (1.0 + (0.5 / 0.01) ** 2)
+    assert fall("change", lambda a: 2.0 * a) == pytest.approx(2 * 0.3 * 5 * math.log(ratio), rel=1e-9)
+    assert fall("slope", lambda w: 1.5 * w) == pytest.approx(2 * 0.5 * (math.log(1.5) / 0.3) ** 2, rel=1e-9)
+    bias = start["kernels.0.base_kernel.bias"]
+    expected = 0.5 * float(((bias + 1.0).square() - bias.square()).sum())
+    assert fall("bias", lambda b: b + 1.0) == pytest.approx(expected, rel=1e-9)
+
+
+def neg_log_posterior(kernel, z, y, noise):
+    latent = LatentKernels([kernel])
+    W = torch.ones(len(z), 1, 1, dtype=torch.float64)
+
+    def objective(parameters):
+        value = negative_log_likelihood(W, y, float64([[noise]]), latent.matrices(parameters, [z]))
+        return value - latent.log_prior(parameters)
+
+    result = minimize_objective(objective, latent.initial_parameters())
+    return ExactPosterior.condition(latent.at(result.parameters), Terms([z], W, y, float64([[noise]]))), result
+
+
+def test_deep_finds_a_step_that_the_squared_exponential_smears():
+    z = torch.linspace(-2.0, 2.0, 40, dtype=torch.float64)[:, None]
+    new = z[:-1] + 0.5 * (z[1] - z[0])
+
+    def truth(z):
+        return 0.3 * torch.sin(2.0 * z) + 1.5 * (z > 0.3)
+
+    y = truth(z) + 0.05 * normal(40, 1)
+    errors = {}
+    for name in ("squared-exponential", "deep"):
+        posterior, result = neg_log_posterior(kernel_of(name, 1, 1.0), z, y, 0.05**2)
+        away = ((new - 0.3).abs() > 0.15)[:, 0]
+        errors[name] = float((posterior.mean([new]) - truth(new))[away].square().mean().sqrt())
+    assert errors["deep"] < 0.75 * errors["squared-exponential"]
+    assert float(result.parameters["kernels.0.base_kernel.change"].abs().max()) > 0.5
+
+
+def test_deep_forgets_its_units_where_a_function_is_smooth():
+    z = torch.linspace(-2.0, 2.0, 30, dtype=torch.float64)[:, None]
+    y = torch.sin(1.5 * z) + 0.1 * normal(30, 1)
+    _, result = neg_log_posterior(kernel_of("deep", 1, 1.0), z, y, 0.1**2)
+    assert float(result.parameters["kernels.0.base_kernel.change"].abs().max()) < 0.02

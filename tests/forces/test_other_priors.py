@@ -1,0 +1,93 @@
+"""The prior on unconstrained accelerations, and no unknown force at all, against the formulas that they stand for."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.errors import InvalidInput
+from forcegp.fit import fit
+from forcegp.forces import JointAccelerations, JointForces
+from forcegp.inference import OptimizerOptions
+from forcegp.noise import Noise
+
+QUICK = OptimizerOptions(iterations=10)
+
+
+@pytest.fixture(scope="module")
+def train():
+    return arm_data(30, 1)
+
+
+@pytest.fixture(scope="module")
+def test():
+    return arm_data(20, 2)
+
+
+def test_accelerations_are_mixed_by_the_projection_onto_the_constraint(train):
+    states = [torch.tensor(x) for x in (train.q, train.v, train.u)]
+    dynamics = train.model.dynamics(*states)
+    W = dynamics.H @ JointAccelerations().direction(dynamics)
+    M, A = dynamics.M.numpy(), dynamics.A.numpy()
+    M_inverse = np.linalg.inv(M)
+    projector = np.eye(3) - M_inverse @ A.transpose(0, 2, 1) @ np.linalg.inv(A @ M_inverse @ A.transpose(0, 2, 1)) @ A
+    assert np.allclose(W.numpy(), projector, atol=1e-12)
+    assert np.allclose(projector @ projector, projector, atol=1e-10)
+
+
+def test_without_contacts_the_mixing_is_the_identity():
+    model = arm_model(contacts=0)
+    data = arm_data(10, 3, model)
+    dynamics = model.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u)))
+    assert torch.allclose(dynamics.H @ JointAccelerations().direction(dynamics), torch.eye(3).double(), atol=1e-12)
+
+
+def test_a_fit_with_accelerations_obeys_the_constraint_and_can_be_stored(train, test, tmp_path):
+    from forcegp.posterior import load_posterior, save_posterior
+
+    posterior = fit(train.model.with_forces(JointAccelerations()).without_mean(), train, restarts=1, options=QUICK)
+    mean = posterior.predict(test.q, test.v, test.u).mean
+    dynamics = train.model.dynamics(*(torch.tensor(x) for x in (test.q, test.v, test.u)))
+    assert torch.allclose((dynamics.A @ mean[..., None])[..., 0], dynamics.b, atol=1e-9)
+    save_posterior(posterior, tmp_path / "run")
+    assert torch.equal(load_posterior(tmp_path / "run").predict(test.q, test.v, test.u).mean, mean)
+
+
+def test_without_forces_the_prediction_is_the_analytical_model(train, test):
+    posterior = fit(train.model, train)
+    prediction = posterior.predict(test.q, test.v, test.u)
+    dynamics = train.model.dynamics(*(torch.tensor(x) for x in (test.q, test.v, test.u)))
+    assert torch.allclose(prediction.mean, dynamics.acceleration_map().offset, atol=1e-12)
+    assert prediction.covariance is not None
+    assert bool((prediction.covariance == 0).all())
+
+
+def test_without_forces_learned_noise_is_the_mean_square_residual(train):
+    posterior = fit(train.model.with_forces(noise=Noise(0.3, learn=True)), train, hyperprior=False)
+    states = [torch.tensor(x) for x in (train.q, train.v, train.u)]
+    residual = torch.tensor(train.a) - train.model.dynamics(*states).acceleration_map().offset
+    assert torch.allclose(posterior.noise_std, residual.square().mean(0).sqrt(), rtol=1e-4)
+    likelihood = torch.distributions.Normal(0.0, posterior.noise_std).log_prob(residual).sum()
+    assert posterior.negative_log_likelihood == pytest.approx(-float(likelihood), rel=1e-10)
+
+
+def test_a_search_begins_where_it_is_told(train):
+    model = train.model.with_forces(JointForces())
+    long = fit(model, train, points=20, restarts=1, options=OptimizerOptions(iterations=60))
+    again = fit(model, train, points=20, restarts=1, start=long.hyperparameters, options=OptimizerOptions(iterations=1))
+    assert again.result.history[0] == pytest.approx(long.result.value, rel=1e-10)
+    more = fit(model, train, start=long.hyperparameters, restarts=1, options=OptimizerOptions(iterations=1))
+    fresh = fit(model, train, restarts=1, options=OptimizerOptions(iterations=1))
+    assert more.result.history[0] < fresh.result.history[0]
+    assert math.isfinite(more.result.value)
+
+
+def test_a_start_with_other_parameters_is_refused(train):
+    model = train.model.with_forces(JointForces())
+    with pytest.raises(InvalidInput, match="start has 'magic'"):
+        fit(model, train, start={"magic": torch.ones(1).double()}, options=QUICK)
+    name = "kernels.0.raw_outputscale"
+    with pytest.raises(InvalidInput, match=r"start\['kernels.0.raw_outputscale'\]"):
+        fit(model, train, start={name: torch.ones(3).double()}, options=QUICK)

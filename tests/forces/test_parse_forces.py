@@ -1,0 +1,251 @@
+"""Forces written as text: every name, options of every kind, several, and errors that say what to write."""
+
+import math
+from dataclasses import dataclass
+
+import pytest
+from tests.posterior.arm import arm_model
+
+from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint, UnknownLink
+from forcegp.forces import (
+    FORCES,
+    AerodynamicForce,
+    BaseWrench,
+    ContactFriction,
+    Coulomb,
+    CoupledRotors,
+    DirectionalFriction,
+    IndependentAccelerations,
+    JointAccelerations,
+    JointForces,
+    JointFriction,
+    LoadFriction,
+    Offset,
+    Payload,
+    PeriodicJointForces,
+    RigidBodies,
+    Rotor,
+    Spring,
+    Stribeck,
+    ToolForces,
+    UnknownForces,
+    Viscous,
+    force_from_dict,
+    parse_forces,
+)
+from forcegp.forces.registry import SHORT, described_force, is_unknown
+
+BUILT_IN = tuple(name for name, where in FORCES.items() if isinstance(where, str))
+SURFACE_FORCES = ToolForces(inputs=("velocity", "position"), kernel="squared-exponential")
+NAMES = {
+    "bodies": RigidBodies("all"),
+    "gp:joint": JointForces(),
+    "gp:joint-ripple": PeriodicJointForces(),
+    "gp:tool-friction": ToolForces(),
+    "gp:tool-forces": SURFACE_FORCES,
+    "gp:load-friction": ContactFriction(load=True),
+    "gp:friction-map": ContactFriction(viscous=True, inputs=("position",)),
+    "gp:foot-friction:contacts=0": ContactFriction(load=True),
+    "rigid-bodies": RigidBodies(),
+    "payload:hand": Payload("hand"),
+    "viscous": Viscous(),
+    "direction": DirectionalFriction(),
+    "coulomb": Coulomb(),
+    "stribeck": Stribeck(),
+    "load": LoadFriction(),
+    "offset": Offset(),
+    "spring": Spring(),
+    "rotor": Rotor(),
+    "coupled-rotors": CoupledRotors(),
+    "gp:joint-forces": JointForces(),
+    "gp:joint-accelerations": JointAccelerations(),
+    "gp:independent": IndependentAccelerations(),
+    "gp:joint-friction": JointFriction(),
+    "gp:periodic-joint-forces": PeriodicJointForces(),
+    "gp:contact-friction": ContactFriction(),
+    "gp:base-wrench:hand": BaseWrench("hand"),
+    "gp:aerodynamic:frame=hand:observe=0.2": AerodynamicForce("hand", observe=0.2),
+}
+EXPRESSIONS = {
+    "gp:joint:inputs=v/q,angles=sin-cos": JointForces(("v", "q"), angles="sin-cos"),
+    "gp:joint:v": JointForces(("v",)),
+    "gp: joint-friction : joints = lift / pan ": JointFriction(("lift", "pan")),
+    "gp:joint-ripple:period=0.5:joints=pan": PeriodicJointForces(0.5, ("pan",)),
+    "gp:tool-forces:frame=hand:point=0/-0.1/2e-1:axes=world": ToolForces(
+        "hand", (0.0, -0.1, 0.2), axes="world", inputs=SURFACE_FORCES.inputs, kernel=SURFACE_FORCES.kernel
+    ),
+    "gp:tool-friction:torque=true:contact=0": ToolForces(torque=True),
+    "gp:load-friction:load=false": ContactFriction(),
+    "gp:tool-friction:kernel=(linear + deep)": ToolForces(kernel="linear + deep"),
+    "gp:tool-friction:kernel=linear*deep": ToolForces(kernel="linear*deep"),
+    "gp:tool-friction:kernel=(linear + deep) * (linear + constant)": ToolForces(
+        kernel="(linear + deep) * (linear + constant)"
+    ),
+    "viscous:0.3": Viscous(0.3),
+    "coulomb:level=0.3/0.4/0.5": Coulomb((0.3, 0.4, 0.5)),
+    "payload:hand:mass=1.5": Payload("hand", 1.5),
+    "rigid-bodies:learn=upper/hand": RigidBodies(("upper", "hand")),
+}
+MISTAKES = {
+    "gp:joint-fricton": "no force 'joint-fricton' in 'gp:joint-fricton'; did you mean 'joint-friction'? Valid force",
+    "viscos": "did you mean 'viscous'",
+    "viscous,tool": "no force 'tool' in 'viscous,tool'",
+    "": "no force '' in ''",
+    "viscous, ": "no force '' in 'viscous, '",
+    "joint-friction": "'joint-friction' in 'joint-friction' is an unknown force; write gp:joint-friction",
+    "gp:viscous": "'viscous' in 'gp:viscous' is a law with coefficients; write viscous",
+    "gp:joint:color=red": "force 'joint' cannot take 'color=red'; write FIELD=VALUE with one of: inputs, ",
+    "gp:joint:inptus=q": "did you mean 'inputs'",
+    "gp:joint:kernel=deep:q": "force 'joint' cannot take 'q'; write FIELD=VALUE",
+    "gp:joint:": "force 'joint' cannot take ''; write FIELD=VALUE",
+    "gp:load-friction:load=yes": "force 'load-friction' has load=yes; give true or false",
+    "gp:contact-friction:contact=first": "force 'contact-friction' has contact=first; give a whole number",
+    "gp:contact-friction:contact=-1": "a contact's number from 0",
+    "gp:joint-ripple:period=fast": "force 'joint-ripple' has period=fast; give a number",
+    "gp:joint-ripple:period=nan": "PeriodicJointForces period is nan; give a positive number",
+    "gp:tool-friction:point=0/0": "a point of three numbers",
+    "gp:tool-friction:point=0/0/x": r"force 'tool-friction' has point=0/0/x; give numbers as in 0.0/0.0/0.0",
+    "gp:foot-friction:contacts=0.5/1": r"force 'foot-friction' has contacts=0.5/1; give whole numbers as in 0/1/2/3",
+    "gp:tool-friction:axes=sideways": "give axes 'world' or 'tool' or 'surface'",
+    "gp:joint:inputs=q/torque": "give one or more of 'q', 'v', 'u', each once",
+    "gp:joint:angles=cos": "give 'plain' or 'sin-cos'",
+    "gp:joint-friction:kernel=frictoin": "did you mean 'friction'",
+    "gp:joint-friction:kernel=(linear + ": "a parenthesis is not closed|ends where a name is expected",
+    "gp:joint-friction:joints=pan/pan": "each once, or None for all",
+    "gp:deep": "'deep' in 'gp:deep' is a kernel, not a force; write it as an option",
+}
+
+
+def test_every_name_that_needs_no_columns_of_u_is_here():
+    told = {name.removeprefix("gp:").partition(":")[0] for name in NAMES}
+    observed = {"actuation", "thrusters", "observed-wrench", "observed-wind"}
+    assert told == {*SHORT, *BUILT_IN} - observed
+    assert all(is_unknown(name.removeprefix("gp:").partition(":")[0]) == name.startswith("gp:") for name in NAMES)
+
+
+@pytest.mark.parametrize("expression", [*NAMES, *EXPRESSIONS])
+def test_expressions(expression):
+    (found,) = parse_forces(expression)
+    assert described_force(found) == described_force({**NAMES, **EXPRESSIONS}[expression])
+
+
+def test_several_are_written_with_commas():
+    several = parse_forces("viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + deep),torque=true, payload:hand")
+    wanted = (Viscous(), Coulomb(0.1), ToolForces(kernel="linear + deep", torque=True), Payload("hand"))
+    assert list(map(described_force, several)) == list(map(described_force, wanted))
+    assert [force.title for force in parse_forces(["viscous", "gp:joint-friction"])] == ["viscous", "joint-friction"]
+
+
+@pytest.mark.parametrize("expression", MISTAKES)
+def test_mistakes_are_explained(expression):
+    with pytest.raises(InvalidInput) as caught:
+        parse_forces(expression)
+    pieces = MISTAKES[expression].split("|")
+    assert any(piece in str(caught.value) for piece in pieces), str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("expression", "error", "message"),
+    [
+        ("gp:joint-friction:joints=elbow", UnknownJoint, "no joint 'elbow' in arm"),
+        ("gp:joint-ripple:joints=pna", UnknownJoint, "did you mean 'pan'"),
+        ("payload:hnad", UnknownLink, "did you mean 'hand'"),
+        ("gp:tool-friction:contact=1", InvalidInput, "contact 1, but the model has only contact 0"),
+        ("gp:joint,gp:joint", InvalidInput, "'joint-forces' twice"),
+    ],
+)
+def test_a_model_checks_them(expression, error, message):
+    with pytest.raises(error, match=message):
+        arm_model().with_forces(*parse_forces(expression))
+
+
+def test_people_add_their_own(monkeypatch):
+    @dataclass(frozen=True)
+    class Slow(JointForces):
+        limits: tuple[float, float] = (0.0, 1.0)
+        count: int = 3
+
+    def faster(period: float = 1.0, joints: tuple[str, ...] | None = None) -> PeriodicJointForces:
+        return PeriodicJointForces(0.5 * period, joints)
+
+    monkeypatch.setitem(FORCES, "slow", Slow)
+    monkeypatch.setitem(FORCES, "faster", faster)
+    assert parse_forces("gp:slow:v:limits=-1/2.5:count=4") == (Slow(("v",), limits=(-1.0, 2.5), count=4),)
+    assert parse_forces("gp:faster:period=3:joints=pan/lift") == (PeriodicJointForces(1.5, ("pan", "lift")),)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: JointForces("force"), "JointForces inputs are 'force'"),
+        (lambda: JointForces(None), "JointForces inputs are None"),
+        (lambda: JointForces(kernel=3), "kernel .*3"),
+        (lambda: JointFriction(()), r"joints are \(\)"),
+        (lambda: JointFriction(7), "joints are 7"),
+        (lambda: JointFriction((1, 2)), r"joints are \(1, 2\)"),
+        (lambda: ToolForces(point=None), "point None"),
+        (lambda: ToolForces(point="top"), "point 'top'"),
+        (lambda: ToolForces(point=(0.0, 0.0, math.inf)), r"point \(0.0, 0.0, inf\)"),
+        (lambda: ToolForces(frame=3), "frame is 3"),
+        (lambda: ToolForces(contact="0"), "contact '0'"),
+        (lambda: ContactFriction(contact=True), "contact True"),
+        (lambda: ContactFriction(axes="three"), "axes 'three'"),
+        (lambda: PeriodicJointForces(-1.0), "period is -1.0"),
+        (lambda: PeriodicJointForces("long"), "period is 'long'"),
+        (lambda: Payload(mass=2.0), "no link; name the link that carries it"),
+        (lambda: Payload("hand", -1.0), "mass is -1.0"),
+    ],
+)
+def test_wrong_arguments_of_constructors(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"type": "magic"},
+        {"type": 3},
+        {"type": "joint-forces", "more": 1},
+        {"type": "joint-friction", "joints": []},
+        "sum",
+    ],
+    ids=str,
+)
+def test_damaged_files_are_refused(stored):
+    with pytest.raises((FileFormatError, InvalidInput)):
+        force_from_dict(stored)
+
+
+def test_units_are_those_of_the_joints():
+    from tests.forces.force_conformance import bent_arm
+
+    robot = bent_arm().robot  # its last joint slides
+    assert JointForces().latent_units(robot) == ("Nm", "Nm", "N")
+    assert JointFriction(("bend",)).latent_units(robot) == ("N",)
+    assert PeriodicJointForces().latent_units(robot) == ("Nm", "Nm", "N")
+    assert JointAccelerations().latent_units(robot) == ("rad/s^2", "rad/s^2", "m/s^2")
+    assert ContactFriction().latent_units(robot) == ("N",)
+    assert ContactFriction(load=True, axes="two-axis").latent_units(robot) == ("", "")
+    assert ContactFriction(viscous=True, axes="two-axis").latent_units(robot) == ("N/(m/s)", "N/(m/s)")
+    assert ContactFriction(viscous=True, load=True).latent_units(robot) == ("s/m",)
+    assert ToolForces(torque=True, axes="tool").latent_units(robot) == ("N",) * 3 + ("Nm",) * 3
+    assert JointFriction().feature_names(robot)[1:] == (("velocity of lift [rad/s]",), ("velocity of bend [m/s]",))
+    assert PeriodicJointForces().feature_names(robot)[2] == ("position of bend [m]",)
+    names = JointForces(angles="sin-cos").feature_names(robot)[0]
+    assert names == (
+        *("q of bend [m]", "sin q of pan", "sin q of lift", "cos q of pan", "cos q of lift"),
+        *(
+            "v of pan [rad/s]",
+            "v of lift [rad/s]",
+            "v of bend [m/s]",
+            "u of pan [Nm]",
+            "u of lift [Nm]",
+            "u of bend [N]",
+        ),
+    )
+    tool = ToolForces(inputs=("velocity", "u")).feature_names(robot)[0]
+    assert tool[1:] == ("tool velocity along tangent-2 [m/s]", "u of pan [Nm]", "u of lift [Nm]", "u of bend [N]")
+    alone = UnknownForces((JointFriction(),))
+    assert alone.feature_names(robot) == JointFriction().feature_names(robot)
+    assert alone.slices(robot) == (slice(0, 3),)

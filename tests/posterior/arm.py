@@ -1,0 +1,111 @@
+"""A three-joint arm that holds its tool on a plane, and data from it with a friction that nobody told the model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from forcegp.data import Dataset, units_for
+from forcegp.forces import Actuation, RigidBodies, Unknown, kernel_of
+from forcegp.mechanics import Baumgarte, Contact, Plane
+from forcegp.model import Model
+from forcegp.robots import Robot
+
+LINK = """<link name="{name}"><inertial><origin xyz="0.02 -0.01 {com}" rpy="0.1 0 0.2"/><mass value="{mass}"/>
+<inertia ixx="{i1}" iyy="{i2}" izz="{i3}" ixy="0.001" ixz="0" iyz="-0.001"/></inertial></link>"""
+JOINT = """<joint name="{name}" type="revolute"><origin xyz="{xyz}" rpy="{rpy}"/><parent link="{parent}"/>
+<child link="{child}"/><axis xyz="{axis}"/><limit lower="-3" upper="3" effort="50" velocity="5"/>
+<dynamics damping="0.3" friction="0.1"/></joint>"""
+URDF = "\n".join(
+    [
+        '<robot name="arm"><link name="base"/>',
+        LINK.format(name="upper", com=0.15, mass=2.0, i1=0.03, i2=0.032, i3=0.012),
+        LINK.format(name="fore", com=0.12, mass=1.2, i1=0.02, i2=0.022, i3=0.008),
+        LINK.format(name="hand", com=0.05, mass=0.6, i1=0.01, i2=0.011, i3=0.006),
+        JOINT.format(name="pan", xyz="0 0 0.3", rpy="0 0 0", parent="base", child="upper", axis="0 0 1"),
+        JOINT.format(name="lift", xyz="0 0 0.3", rpy="0 0 0", parent="upper", child="fore", axis="0 1 0"),
+        JOINT.format(name="bend", xyz="0 0 0.25", rpy="0 0 0", parent="fore", child="hand", axis="0 1 0"),
+        "</robot>",
+    ]
+)
+NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class Weight(Unknown):
+    """The weight of an unknown mass at the origin of `frame`: a constant, which has no features."""
+
+    frame: str = "hand"
+
+    def latent_names(self, robot):
+        return ("mass",)
+
+    def latent_units(self, robot):
+        return ("kg",)
+
+    def direction(self, dynamics):
+        J = dynamics.state.kinematics.frame_jacobian(self.frame, (0.0, 0.0, 0.0))
+        return -9.81 * J[..., 2, :, None]
+
+    def point_force(self, dynamics):
+        column = torch.tensor([[0.0], [0.0], [-9.81]], dtype=torch.float64)
+        return column.expand(*dynamics.state.q.shape[:-1], 3, 1)
+
+    def features(self, dynamics):
+        return (dynamics.state.v[..., :0],)
+
+    def feature_names(self, robot):
+        return ((),)
+
+    def kernels(self, robot, dimensions, variances):
+        return tuple(kernel_of("constant", d, s) for d, s in zip(dimensions, variances, strict=True))
+
+
+def arm_model(contacts: int = 1, **changes) -> Model:
+    """The arm with its tool on up to one plane, without the damping and dry friction of its file."""
+    robot = Robot.from_urdf_text(URDF)
+    contact = Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.4))
+    return Model(
+        robot, (contact,) * contacts, **{"forces": (Actuation(), RigidBodies()), "baumgarte": Baumgarte(5.0), **changes}
+    )
+
+
+def unknown_force(v: torch.Tensor) -> torch.Tensor:
+    """Dry and viscous friction of every joint."""
+    return -0.8 * torch.tanh(v / 0.4) - 0.3 * v
+
+
+def on_the_plane(model: Model, q: np.ndarray) -> np.ndarray:
+    """The nearest postures with the tool on the first contact's surface, by Newton's method."""
+    at = torch.tensor(q)
+    rest = torch.zeros_like(at)
+    for _ in range(20 if model.contacts else 0):
+        A = model.dynamics(at, rest, rest).A[:, :1]
+        distance = model.contacts[0].distance(model.robot.kinematics(at))
+        at = at - (torch.linalg.pinv(A) @ distance[:, None, None])[..., 0]
+    return at.numpy()
+
+
+def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
+    """Random states, the exact constrained acceleration and noise of standard deviation NOISE on it."""
+    model = model or arm_model()
+    generator = np.random.default_rng(seed)
+    q = on_the_plane(model, generator.uniform([-1.0, 0.3, 0.3], [1.0, 1.2, 1.2], (rows, 3)))
+    v = generator.normal(0.0, 0.7, (rows, 3))
+    u = generator.normal(0.0, 3.0, (rows, 3))
+    states = [torch.tensor(x) for x in (q, v, u)]
+    dynamics = model.dynamics(*states)
+    Q_U = unknown_force(states[1])
+    a = dynamics.acceleration(Q_U).numpy()
+    return Dataset(
+        q=q,
+        v=v,
+        u=u,
+        a=a + generator.normal(0.0, NOISE, a.shape),
+        time=np.arange(rows) * 0.01,
+        joint_names=model.robot.joint_names,
+        units=units_for(model.robot),
+        model=model,
+        noise_std=np.full(3, NOISE),
+        truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},
+    )

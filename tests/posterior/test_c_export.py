@@ -1,0 +1,490 @@
+"""Exported C: against `predict`, as C99 without warnings, in CasADi, by acados' form, and what cannot be exported."""
+
+import ctypes
+import errno
+import os
+import shutil
+import subprocess
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp import Dataset, Model, Robot, export_c
+from forcegp.codegen.c_writer import write_function
+from forcegp.errors import CompilerError, InvalidInput, NumericalError
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointForces, JointFriction
+from forcegp.inference import OptimizerOptions
+from forcegp.noise import Noise
+from forcegp.posterior import StructuredPosterior, c_files, casadi_function
+from forcegp.posterior.c_files import identifier
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
+DT = 0.02
+
+pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+
+
+def fitted(*forces, **more) -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
+        return fit(arm_model().with_forces(*forces, **more), arm_data(30, 0), **options)
+
+
+def compiled(folder: Path, *files: str, include: Path | None = None) -> ctypes.CDLL:
+    """The files as a library, without a warning."""
+    where = [] if include is None else ["-I", str(include), "-isystem", str(casadi_headers())]
+    command = ["cc", *STRICT, *where, "-shared", "-fPIC", *files, "-o", "lib.so", "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(folder / "lib.so"))
+
+
+def casadi_headers() -> Path:
+    return Path(pytest.importorskip("casadi").__file__).parent / "include"
+
+
+def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
+    given = [np.ascontiguousarray(x, dtype=float) for x in arrays]
+    made = [np.full(size, 7.0) for size in sizes]
+    return function(*(ctypes.c_void_p(x.ctypes.data) for x in (*given, *made))), made
+
+
+@pytest.fixture(scope="module")
+def posterior() -> StructuredPosterior:
+    return fitted(JointForces())
+
+
+@pytest.fixture(scope="module")
+def friction() -> StructuredPosterior:
+    return fitted(JointFriction(), ContactFriction(load=True, expected=0.2))
+
+
+ONE = """<robot name="Größe */ 1"><link name="base"/><link name="l"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="*/ int" type="continuous"><parent link="base"/><child link="l"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+def test_one_joint_with_any_name_compiles_without_a_warning(tmp_path):
+    model = Model(Robot.from_urdf_text(ONE))
+    q, v, u = np.random.default_rng(0).normal(size=(3, 12, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        data = Dataset(q=q, v=v, u=u, a=u - v, time=np.arange(12.0), model=model, noise_std=[0.1])
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = fit(model.with_forces(JointForces()), data, **options)
+    made = export_c(model, tmp_path / "one", covariance=True, jacobian=True, steps=DT, integrator="implicit-midpoint")
+    function = compiled(tmp_path / "one", f"{made.name}.c", f"{made.name}_external.c").gr_e_1_mean_covariance
+    _, (a, spread) = call(function, [1, 1], q[0], v[0], u[0])
+    np.testing.assert_allclose(a, model.predict(q, v, u).mean[0], rtol=1e-10)
+    assert 0.0 < spread[0] < 1e3
+
+
+@pytest.fixture(scope="module")
+def complete(posterior, tmp_path_factory) -> Path:
+    """Everything that can be written of a model."""
+    folder = tmp_path_factory.mktemp("complete") / "arm"
+    export_c(posterior, folder, covariance=True, jacobian=True, steps=DT, integrator="rk4", source="models/*/run?")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def library(complete) -> ctypes.CDLL:
+    return compiled(complete, "arm.c", "arm_external.c")
+
+
+@pytest.fixture(scope="module")
+def states() -> list[np.ndarray]:
+    data = arm_data(5, 1)
+    return [data.q, data.v, data.u]
+
+
+def test_every_function_computes_what_the_model_does(posterior, library, states):
+    predicted = posterior.predict(*states)
+    reference = posterior.predictor(compile=False)
+    covariance = reference(*states)[1]
+    linear = reference.linearize(*states)
+    step = reference.linearize_step(*states, DT, "rk4")
+    for k in range(5):
+        at = [x[k] for x in states]
+        bits, (a,) = call(library.arm_mean, [3], *at)
+        assert bits == 0
+        np.testing.assert_allclose(a, predicted.mean[k], rtol=1e-11, atol=1e-11)
+        _, (a, spread) = call(library.arm_mean_covariance, [3, 9], *at)
+        np.testing.assert_allclose(a, predicted.mean[k], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(spread.reshape(3, 3), covariance[k], rtol=1e-7, atol=1e-9)
+        exact, wider = predicted.covariance[k].numpy(), spread.reshape(3, 3)
+        assert np.linalg.eigvalsh(wider - exact).min() > -1e-9 * np.abs(exact).max()
+        _, (_, jacobian) = call(library.arm_linearize, [3, 27], *at)
+        np.testing.assert_allclose(jacobian.reshape(3, 9), torch.cat(linear[1:], -1)[k], rtol=1e-9, atol=1e-9)
+        _, (q, v, A, B) = call(library.arm_step_jacobian, [3, 3, 36, 18], *at)
+        for found, wanted in zip((q, v, A.reshape(6, 6), B.reshape(6, 3)), step, strict=False):
+            np.testing.assert_allclose(found, wanted[k], rtol=1e-9, atol=1e-9)
+        _, again = call(library.arm_step, [3, 3], *at)
+        np.testing.assert_allclose(again, (q, v), rtol=1e-13)
+
+
+@pytest.mark.parametrize("integrator", [pytest.param("rk4", marks=pytest.mark.nightly), "implicit-midpoint"])
+def test_steps_of_friction_and_their_derivatives(friction, states, integrator, tmp_path):
+    made = export_c(friction, tmp_path / "arm", jacobian=True, steps=DT, integrator=integrator)
+    library = compiled(tmp_path / "arm", "arm.c")
+    step = friction.predictor(covariance="none", compile=False).linearize_step(*states, DT, integrator)
+    for k in range(5):
+        bits, (q, v, A, B) = call(library.arm_step_jacobian, [3, 3, 36, 18], *(x[k] for x in states))
+        assert bits == 0
+        for found, wanted in zip((q, v, A.reshape(6, 6), B.reshape(6, 3)), step, strict=False):
+            np.testing.assert_allclose(found, wanted[k], rtol=1e-8, atol=1e-8)
+    assert set(made.differences) == {"arm_mean", "arm_linearize", "arm_step", "arm_step_jacobian"}
+    assert max(made.differences.values()) < 1e-8
+
+
+def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(complete, folder)
+    commands = [line.partition("#")[0] for line in (folder / "README.txt").read_text().splitlines() if "cc " in line]
+    assert len(commands) == 3
+    for command in commands:
+        done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert (folder / "libarm_external.so").exists()
+    for program in ("example.c", "self_test.c"):
+        subprocess.run(["cc", *STRICT, "-O0", program, "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
+    text = (folder / "arm.c").read_text()
+    first = text.index("table0[]")
+    place = text.index("0x1.", first)
+    (folder / "arm.c").write_text(f"{text[:place]}-{text[place:]}")  # one weight or centre of the model
+    subprocess.run(["cc", *STRICT, "-O0", "self_test.c", "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
+    broken = subprocess.run(["./x"], cwd=folder, capture_output=True, text=True, check=False)
+    assert broken.returncode == 1
+    assert "differs by" in broken.stdout
+
+
+@pytest.mark.skipif(not shutil.which("cmake"), reason="needs CMake")
+def test_cmake_builds_and_tests(complete, tmp_path):
+    for command in (["-S", str(complete), "-B", "."], ["--build", "."]):
+        done = subprocess.run(["cmake", *command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert subprocess.run(["ctest"], cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert (tmp_path / "libarm.a").exists()
+
+
+def test_the_program_allocates_nothing_and_keeps_nothing(complete):
+    text = (complete / "arm.c").read_text()
+    assert set(line for line in text.splitlines() if line.startswith("#include")) == {
+        '#include "arm.h"',
+        "#include <math.h>",
+        "#include <string.h>",
+    }
+    subprocess.run(["cc", *STRICT, "-c", "arm.c", "-o", "arm.o"], cwd=complete, check=True)
+    symbols = subprocess.run(["nm", "arm.o"], cwd=complete, capture_output=True, text=True, check=True).stdout
+    kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
+    assert not [name for name, kind in kinds.items() if kind in "bBDC"]  # nothing that could be written to
+    outside = {name for name, kind in kinds.items() if kind == "U"}
+    assert not outside & {"malloc", "calloc", "realloc", "free"}
+
+
+def test_the_header_says_what_it_is(complete, posterior):
+    header = (complete / "arm.h").read_text()
+    for wanted in ("joint 1: lift, q in rad, v in rad/s, u in Nm", "30 training points", posterior.description):
+        assert wanted in header
+    assert "model: models/_/run_" in header  # no end of a comment, no trigraph
+    assert "arm_mean" in header
+    assert header.count("int arm_") == 5
+
+
+def test_what_is_not_finite_is_reported(library, states):
+    q, v, u = (x[0].copy() for x in states)
+    v[1] = np.nan
+    bits, (a, jacobian) = call(library.arm_linearize, [3, 27], q, v, u)
+    assert bits == 1
+    assert np.isnan(a).all()
+    assert np.isnan(jacobian).all()
+    bits, (a,) = call(library.arm_mean, [3], q, [1e200, 0.0, 0.0], u)  # squares of it are not finite
+    assert bits == 4
+
+
+def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states, tmp_path):
+    export_c(friction, tmp_path / "arm", steps=DT, integrator="implicit-midpoint", unchecked=True)
+    source = tmp_path / "arm" / "arm.c"
+    text = source.read_text()
+    assert "ROUNDS = 60" in text
+    source.write_text(text.replace("ROUNDS = 60", "ROUNDS = 1"))  # Newton's method needs more
+    step = compiled(tmp_path / "arm", "arm.c").arm_step
+    bits, (_, v) = call(step, [3, 3], *(x[0] for x in states))
+    assert bits == 8
+    assert np.isnan(v).any()
+    assert "arm_STEP_NOT_FOUND = 8" in (tmp_path / "arm" / "arm.h").read_text()
+    assert call(step, [3, 3], states[0][0], [1e200, 0.0, 0.0], states[2][0])[0] == 4
+
+
+def test_casadi_loads_it_with_derivatives(complete, library, posterior, states):
+    casadi = pytest.importorskip("casadi")
+    reference = posterior.predictor(covariance="none", compile=False)
+    q, v, u = (x[2] for x in states)
+    path = str(complete / "lib.so")
+    a = casadi.external("arm_acceleration", path)
+    np.testing.assert_allclose(a(q, v, u).full()[:, 0], reference.mean(q, v, u), rtol=1e-11)
+    following = casadi.external("arm_next", path)
+    x, w = casadi.MX.sym("x", 6), casadi.MX.sym("u", 3)
+    jacobian = casadi.Function("J", [x, w], [casadi.jacobian(following(x, w), casadi.vertcat(x, w))])
+    linear = reference.linearize_step(q, v, u, DT, "rk4")
+    found = jacobian(np.concatenate([q, v]), u).full()
+    np.testing.assert_allclose(found, torch.cat([linear.A, linear.B], -1), rtol=1e-9, atol=1e-9)
+    by_v = casadi.Function("D", [x, w], [casadi.jacobian(a(x[:3], x[3:], w), x)])
+    slopes = reference.linearize(q, v, u).da_dv
+    np.testing.assert_allclose(by_v(np.concatenate([q, v]), u).full()[:, 3:], slopes, rtol=1e-9, atol=1e-9)
+
+
+ACADOS = """#pragma once
+#include "blasfeo_common.h"
+struct blasfeo_dvec_args { struct blasfeo_dvec *x; int xi; };
+struct blasfeo_dmat_args { struct blasfeo_dmat *A; int ai; int aj; };
+"""
+CALLED = """
+int try_it(const double *x, const double *u, double *next, double *jacobian) {
+  struct blasfeo_dvec sx, su, sn;
+  struct blasfeo_dmat J;
+  blasfeo_allocate_dvec(8, &sx); blasfeo_allocate_dvec(8, &su); blasfeo_allocate_dvec(8, &sn);
+  blasfeo_allocate_dmat(9, 6, &J);
+  for (int k = 0; k < 6; k++) blasfeo_dvecin1(x[k], &sx, 1 + k);
+  for (int k = 0; k < 3; k++) blasfeo_dvecin1(u[k], &su, 2 + k);
+  struct blasfeo_dvec_args xa = {&sx, 1}, ua = {&su, 2}, na = {&sn, 0};
+  struct blasfeo_dmat_args ja = {&J, 0, 0};
+  void *in[] = {&xa, &ua}, *out[] = {&na, &ja};
+  int found = arm_disc_dyn_fun_jac(in, out, 0);
+  for (int k = 0; k < 6; k++) next[k] = blasfeo_dvecex1(&sn, k);
+  found |= arm_disc_dyn_fun(in, out, 0);
+  for (int k = 0; k < 6; k++) found |= next[k] != blasfeo_dvecex1(&sn, k);
+  for (int i = 0; i < 9; i++) for (int j = 0; j < 6; j++) jacobian[6 * i + j] = blasfeo_dgeex1(&J, i, j);
+  return found;
+}
+"""
+
+
+def test_the_form_for_acados_works_on_vectors_of_blasfeo(complete, posterior, states, tmp_path):
+    headers = casadi_headers()
+    (blasfeo,) = [path for path in headers.parent.glob("libblasfeo.so*")][:1] or [None]
+    if blasfeo is None or not (headers / "blasfeo_d_aux.h").exists():
+        pytest.skip("this CasADi comes without BLASFEO")
+    folder = tmp_path / "acados"
+    shutil.copytree(complete, folder)
+    (folder / "acados" / "utils").mkdir(parents=True)
+    (folder / "acados" / "utils" / "external_function_generic.h").write_text(ACADOS)
+    caller = '#include "arm_acados.c"\n#include "blasfeo_d_aux_ext_dep.h"\n' + CALLED
+    (folder / "caller.c").write_text(caller)
+    library = compiled(folder, "caller.c", str(blasfeo), f"-Wl,-rpath,{blasfeo.parent}", include=folder)
+    q, v, u = (x[1] for x in states)
+    bits, (following, jacobian) = call(library.try_it, [6, 54], np.concatenate([q, v]), u)
+    assert bits == 0
+    linear = posterior.predictor(covariance="none", compile=False).linearize_step(q, v, u, DT, "rk4")
+    np.testing.assert_allclose(following, torch.cat(linear[:2]), rtol=1e-11)
+    wanted = torch.cat([linear.B, linear.A], -1).T
+    np.testing.assert_allclose(jacobian.reshape(9, 6), wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
+    """Without an analytical mean, processes sum gravity and inertia up from terms thousands of times as large."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = arm_model().with_forces(JointForces()).without_mean()
+        smooth = fit(model, arm_data(60, 0), restarts=1, options=OptimizerOptions(iterations=60))
+    predictor, rows = smooth.predictor(covariance="none", compile=False), [torch.tensor(x) for x in states]
+    q, v, u = (x[None] if x.dim() == 1 else x for x in rows)
+    dynamics = smooth.dynamics(q, v, u)
+    W = dynamics.H @ smooth.model.unknown.direction(dynamics)
+    features = smooth.likelihood.standardization(smooth.model.unknown.features(dynamics))
+    latent = smooth.latent
+    terms = [
+        (kernel.cross(z, at) * w).abs().sum(-1)
+        for kernel, z, at, w in zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
+    ]
+    largest = (W.abs() @ torch.stack(terms, dim=-1)[..., None]).max() / predictor.mean(q, v, u).abs().max()
+    assert predictor.rounding(q, v, u) == pytest.approx(2.0**-52 * float(largest), rel=1e-6)
+    assert 5e-12 < predictor.rounding(q, v, u) < 1e-6
+    made = export_c(smooth, tmp_path / "arm")
+    assert made.differences["arm_mean"] < 1e-7
+
+
+def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch):
+    def spoiled(*arguments):
+        return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
+
+    monkeypatch.setattr(c_files, "write_function", spoiled)
+    with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
+        export_c(posterior, tmp_path / "arm")
+    assert list(tmp_path.iterdir()) == []
+    made = export_c(posterior, tmp_path / "arm", unchecked=True)
+    assert made.differences == {}
+    assert "was not compared with forcegp" in (tmp_path / "arm" / "arm.h").read_text()
+
+
+def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(posterior, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.warns(UserWarning, match="was not compared with forcegp: .*'no-such-compiler'"):
+        made = export_c(posterior, tmp_path / "arm")
+    assert made.differences == {}
+    assert (tmp_path / "arm" / "arm.c").exists()
+
+
+def test_a_compiler_that_fails_leaves_nothing(posterior, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", shutil.which("false"))
+    with pytest.raises(CompilerError, match="unchecked=True"):
+        export_c(posterior, tmp_path / "arm")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_without_unknown_forces(tmp_path, states):
+    none = fitted()
+    export_c(none, tmp_path / "arm", jacobian=True)
+    _, (a,) = call(compiled(tmp_path / "arm", "arm.c").arm_mean, [3], *(x[0] for x in states))
+    np.testing.assert_allclose(a, none.predict(*states).mean[0], rtol=1e-11)
+    with pytest.raises(InvalidInput, match="has no covariance that could be exported"):
+        export_c(none, tmp_path / "other", covariance=True)
+
+
+@dataclass(frozen=True)
+class Branching(JointFriction):
+    """With a sorted feature, which no graph holds."""
+
+    def features(self, dynamics):
+        return tuple(z.sort(dim=-1).values for z in super().features(dynamics))
+
+
+def test_what_cannot_be_exported_is_named(tmp_path):
+    model = fitted(JointForces(), Branching())
+    with pytest.raises(InvalidInput, match=r"the force 'branching' cannot be exported: .*sort") as error:
+        export_c(model, tmp_path / "arm")
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@dataclass(frozen=True)
+class Deciding(JointFriction):
+    """With a branch on values, in one of the ways in which Python can take one."""
+
+    how: str = "if"
+
+    def features(self, dynamics):
+        ways = {"if": lambda z: bool(z[0, 0] > 0.0), "numpy": lambda z: z.detach().numpy().min() > 0.0}
+        return tuple(z if ways[self.how](z) else -z for z in super().features(dynamics))
+
+
+@pytest.mark.parametrize("how", ["if", "numpy"])
+def test_a_branch_on_values_is_an_error_everywhere(how, tmp_path, states):
+    model = fitted(JointForces(), Deciding(how=how))
+    branch = "compiled code cannot hold a branch on the values of a tensor"
+    with pytest.raises(InvalidInput, match=rf"^{branch}, or .*give compile=False, whose results are the same.$"):
+        model.predictor(covariance="none")
+    term = rf"^the force 'deciding' cannot be exported: {branch}.*; write it with other operations and without"
+    with pytest.raises(InvalidInput, match=term):
+        export_c(model, tmp_path / "arm")
+    pytest.importorskip("casadi")
+    with pytest.raises(InvalidInput, match=term):
+        casadi_function(model)
+    assert list(tmp_path.iterdir()) == []
+    found = model.predictor(covariance="none", compile=False).mean(*states)
+    torch.testing.assert_close(found, model.predict(*states).mean)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_leaves_nothing(posterior, tmp_path, monkeypatch, number):
+    written = []
+
+    def full(path, text, **more):
+        written.append(path)
+        if len(written) == 12:  # after the files were compared, halfway through the second time
+            raise OSError(number, os.strerror(number), str(path))
+        return write(path, text, **more)
+
+    write = Path.write_text
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match=os.strerror(number)):
+        export_c(posterior, tmp_path / "arm", unchecked=True)
+    assert len(written) == 12
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compiler_that_hangs_leaves_nothing(posterior, tmp_path, monkeypatch):
+    hangs, folder = tmp_path / "hangs", tmp_path / "deployed"
+    hangs.write_text("#!/bin/sh\nexec sleep 60\n")
+    hangs.chmod(0o700)
+    folder.mkdir()
+    monkeypatch.setenv("CC", str(hangs))
+    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
+    with pytest.raises(CompilerError, match=r"hangs: it did not end within 0\.5 s; .*`unchecked=True`"):
+        export_c(posterior, folder / "arm")
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": float("nan")}, "dt is nan; give the time step as a positive number"),
+        ({"steps": -0.1}, "dt is -0.1; give the time step as a positive number"),
+        ({"steps": 0.0}, "dt is 0.0; give the time step as a positive number"),
+        ({"steps": DT, "integrator": "rk5"}, "integrator 'rk5'"),
+        (
+            {"steps": DT, "integrator": "projected"},
+            "an exported step is not 'projected'; give one of 'symplectic-euler'",
+        ),
+    ],
+)
+def test_steps_that_cannot_be_exported(posterior, tmp_path, options, message):
+    with pytest.raises(InvalidInput, match=message):
+        export_c(posterior, tmp_path / "arm", **options)
+
+
+def test_other_models_are_refused(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        other = fit(arm_model().black_box(), arm_data(20, 0), **options)
+    with pytest.raises(InvalidInput, match="a IndependentPosterior cannot be exported as C"):
+        export_c(other, tmp_path / "arm")  # type: ignore[arg-type]  # refused
+    measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
+    with pytest.raises(InvalidInput, match="a predictor is for commanded torques"):
+        export_c(measured, tmp_path / "arm")
+
+
+def test_a_folder_with_files_stays(posterior, tmp_path):
+    (tmp_path / "mine.c").write_text("mine")
+    with pytest.raises(InvalidInput, match="exists already and is not an empty folder"):
+        export_c(posterior, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.c"]
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ("LBR-iiwa 7", "lbr_iiwa_7"),
+        ("7dof", "robot_7dof"),
+        ("", "robot"),
+        ("math", "math_model"),
+        ("Jac", "jac_model"),
+        ("über-Arm 2", "ber_arm_2"),
+        ("a" * 300, "a" * 60),
+    ],
+)
+def test_names_for_c(given, found):
+    assert identifier(given) == found
+
+
+def test_a_state_outside_of_a_table_is_reported(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = fit(arm_model().with_forces(JointFriction(kernel="squared-exponential")), arm_data(140, 0), **options)
+    made = export_c(model, tmp_path / "arm")
+    assert 0.0 < made.differences["arm_mean"] < 1e-7
+    assert "tables of one input, relative error" in (tmp_path / "arm" / "arm.h").read_text()
+    mean = compiled(tmp_path / "arm", "arm.c").arm_mean
+    assert call(mean, [3], [0.3] * 3, [0.5] * 3, [0.0] * 3)[0] == 0
+    bits, (a,) = call(mean, [3], [0.3] * 3, [1e3] * 3, [0.0] * 3)
+    assert bits == 4
+    assert np.isnan(a).all()

@@ -1,0 +1,161 @@
+"""A posterior as a CasADi function: `predict`, its derivatives, and what CasADi makes of it."""
+
+import errno
+import os
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.codegen.library import Purpose, compile_library
+from forcegp.errors import InvalidInput, MissingExtra, NumericalError
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointForces, JointFriction
+from forcegp.inference import OptimizerOptions
+from forcegp.posterior import StructuredPosterior, casadi_function, export_casadi
+
+casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
+
+PRIORS = {
+    "joint": JointForces(),
+    "friction under load": (JointFriction(), ContactFriction(load=True, expected=0.2)),
+    "matern": (JointFriction(kernel="matern-5/2"), JointForces(kernel="matern-3/2 * periodic + linear", inputs=("q",))),
+    "none": (),
+}
+
+
+OFTEN = "friction under load", "matern", "none"  # the other one has no kernel that "matern" lacks
+
+
+@pytest.fixture(
+    scope="module",
+    params=[name if name in OFTEN else pytest.param(name, marks=pytest.mark.nightly) for name in PRIORS],
+)
+def posterior(request) -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
+        return fit(arm_model().with_forces(PRIORS[request.param]), arm_data(30, 0), **options)
+
+
+@pytest.fixture(scope="module")
+def friction() -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        return fit(arm_model().with_forces(JointFriction()), arm_data(12, 0), **options)
+
+
+@pytest.fixture(scope="module")
+def states() -> list[torch.Tensor]:
+    data = arm_data(6, 1)
+    return [torch.tensor(x) for x in (data.q, data.v, data.u)]
+
+
+def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
+    function = casadi_function(posterior)
+    slopes = function.jacobian()
+    expected = posterior.predict(*states, covariance=False).mean.numpy()
+    linear = posterior.predictor(covariance="none").linearize(*states)
+    jacobians = torch.cat([linear.da_dq, linear.da_dv, linear.da_du], dim=-1).numpy()
+    for k, state in enumerate(zip(*(x.numpy() for x in states), strict=True)):
+        np.testing.assert_allclose(
+            np.array(function(*state)).ravel(), expected[k], rtol=0, atol=1e-12 * abs(expected).max()
+        )
+        found = np.hstack([np.array(part) for part in slopes(*state, 0)])
+        np.testing.assert_allclose(found, jacobians[k], rtol=0, atol=1e-12 * abs(jacobians).max())
+
+
+def test_second_derivatives_are_differences_of_first_ones(posterior, states):
+    q, v, u = (x[0].numpy() for x in states)
+    function = casadi_function(posterior)
+    x = casadi.MX.sym("v", 3)
+    gradient = casadi.Function("g", [x], [casadi.gradient(casadi.sumsqr(function(q, x, u)), x)])
+    hessian = np.array(gradient.jacobian()(v, 0))
+    step = 1e-6
+    columns = [
+        (np.array(gradient(v + step * e)) - np.array(gradient(v - step * e))).ravel() / (2 * step) for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(hessian, np.stack(columns, axis=1), rtol=1e-4, atol=1e-5 * abs(hessian).max())
+
+
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
+def test_steps_are_those_of_a_predictor(posterior, states, integrator):
+    function = casadi_function(posterior, steps=0.01, integrator=integrator)
+    expected = posterior.predictor(covariance="none").step(*states, 0.01, integrator)
+    for k in range(len(states[0])):
+        found = function(*(x[k].numpy() for x in states))
+        for ours, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(np.array(ours).ravel(), theirs[k], rtol=1e-9, atol=1e-9)
+    for wrong, message in (({"steps": 0.0}, "dt is 0.0"), ({"steps": 0.1, "integrator": "projected"}, "'projected'")):
+        with pytest.raises(InvalidInput, match=message):
+            casadi_function(posterior, **wrong)
+
+
+def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function = casadi_function(posterior, name="arm")
+    function.generate("arm.c", {"with_header": False})
+    source, library = (tmp_path / "arm.c").read_text(encoding="utf-8"), tmp_path / "arm.so"
+    compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm", Purpose("a test", "MOVE", "give up"))
+    external = casadi.external("arm", str(library))
+    state = [x[2].numpy() for x in states]
+    np.testing.assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
+
+
+def test_a_full_disk_is_an_error(posterior, tmp_path, monkeypatch):
+    """`casadi.Function.save` writes half of a file without a word."""
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        with pytest.raises(OSError, match="No space left"):
+            export_casadi(posterior, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert set(export_casadi(posterior, tmp_path)) == {"arm.casadi"}
+    casadi.Function.load(str(tmp_path / "arm.casadi"))
+
+
+def test_a_kernel_that_is_the_same_for_all_centres(states):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
+        model = fit(arm_model().with_forces(JointForces(kernel="constant", inputs=("q",))), arm_data(12, 0), **options)
+    expected = model.predict(*states).mean[0].numpy()
+    found = np.array(casadi_function(model)(*(x[0].numpy() for x in states))).ravel()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())  # weights that cancel
+
+
+def test_a_step_that_newtons_method_does_not_find_is_one_line(friction, tmp_path, monkeypatch):
+    def never(*given):
+        return rootfinder(*given, {"max_iter": 1})
+
+    rootfinder = casadi.rootfinder
+    monkeypatch.setattr(casadi, "rootfinder", never)
+    message = r"^CasADi finds no step of 0\.05 s by implicit-midpoint .*; give shorter steps, or .*$"
+    with pytest.raises(NumericalError, match=message):
+        export_casadi(friction, tmp_path, steps=0.05, integrator="implicit-midpoint")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("given", "made"), [("my arm", "my_arm"), ("jac", "jac1"), ("", "step"), (None, "step")])
+def test_any_name_becomes_one_of_casadi(friction, given, made):
+    assert casadi_function(friction, steps=0.1, name=given).name() == made
+
+
+def test_without_casadi_and_without_a_program(states, monkeypatch):
+    black_box = arm_model().black_box()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        other = fit(black_box, arm_data(20, 0), restarts=1, options=OptimizerOptions(iterations=2))
+    with pytest.raises(InvalidInput, match=r"no program can be written of a .*export a structured model"):
+        casadi_function(other)
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'forcegp\[casadi\]'"):
+        casadi_function(other)

@@ -1,0 +1,311 @@
+"""Forces by themselves, their curves, and other contacts and robots, against dense conditioning and true forces."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import URDF, Weight, arm_data, arm_model, on_the_plane
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput, UnknownFrame
+from forcegp.evidence import Accelerations
+from forcegp.fit import fit
+from forcegp.forces import FORCES, ContactFriction, JointForces, JointFriction, ToolForces, UnknownForces
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, Plane, Sphere
+from forcegp.noise import Noise
+from forcegp.posterior import load_posterior, save_posterior
+from forcegp.robots import Robot
+
+PRIOR = UnknownForces((JointFriction(), ContactFriction(), Weight()))
+NOISE = 0.05
+TIP = (0.0, 0.0, 0.2)
+OTHER_CONTACTS = {
+    "same": arm_model().contacts,
+    "sphere": (Contact("hand", TIP, Sphere((0.0, 0.0, -2.0), 2.4)),),
+    "none": (),
+    "two": (*arm_model().contacts, Contact("fore", (0.1, 0.0, 0.0), Plane((1.0, 0.0, 0.0), 0.1))),
+}
+
+
+@pytest.fixture(scope="module")
+def train():
+    return arm_data(16, 1)
+
+
+@pytest.fixture(scope="module")
+def posterior(train):
+    return fit(train.model.with_forces(PRIOR.terms), train, restarts=1, options=OptimizerOptions(iterations=5))
+
+
+@pytest.fixture(scope="module")
+def states():
+    test = arm_data(4, 2)
+    return [torch.tensor(x) for x in (test.q, test.v, test.u)]
+
+
+class Dense:
+    """All processes of PRIOR given the training data, from one joint covariance, written plainly."""
+
+    def __init__(self, posterior, train):
+        self.kernels, self.widening = list(posterior.latent.kernels), posterior.widening
+        dynamics = train.model.dynamics(*(torch.tensor(x) for x in (train.q, train.v, train.u)))
+        self.scales = [z.square().mean(0).sqrt() for z in PRIOR.features(dynamics)]  # velocities keep their zero
+        self.z, self.W = self.scaled(dynamics), dynamics.H @ PRIOR.direction(dynamics)
+        N, D, _ = self.W.shape
+        S = NOISE**2 * torch.eye(N * D).double()
+        for c, kernel in enumerate(self.kernels):
+            w = self.W[..., c]
+            S += torch.einsum("id,ij,je->idje", w, self.k(kernel, self.z[c], self.z[c]), w).reshape(N * D, N * D)
+        self.S = S
+        self.residual = (torch.tensor(train.a) - dynamics.acceleration_map().offset).reshape(-1)
+
+    def scaled(self, dynamics):
+        return [z / s for z, s in zip(PRIOR.features(dynamics), self.scales, strict=True)]
+
+    @staticmethod
+    def k(kernel, one, other):
+        with torch.no_grad():
+            pairs = [[float(kernel(a[None], b[None], diag=True)) for b in other] for a in one]
+        return torch.tensor(pairs, dtype=torch.float64)
+
+    def latents(self, z):
+        """Means (n, C) and covariances (n, C, C) at scaled features."""
+        cross, own = [], []
+        for c, kernel in enumerate(self.kernels):
+            cross.append(torch.einsum("nj,jd->njd", self.k(kernel, z[c], self.z[c]), self.W[..., c]).flatten(1))
+            own.append(self.k(kernel, z[c], z[c]).diagonal())
+        cross = torch.stack(cross, dim=1)
+        mean = cross @ torch.linalg.solve(self.S, self.residual)
+        covariance = torch.diag_embed(torch.stack(own, -1)) - cross @ torch.linalg.solve(self.S, cross.mT)
+        return mean, self.widening**2 * covariance
+
+
+@pytest.fixture(scope="module")
+def dense(posterior, train):
+    return Dense(posterior, train)
+
+
+def close(given, expected, tolerance=1e-7):
+    torch.testing.assert_close(given, expected, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("contacts", OTHER_CONTACTS)
+def test_components_are_those_of_dense_conditioning(posterior, dense, states, contacts):
+    """Under the contacts of the training data, and under others."""
+    moved = posterior.with_contacts(OTHER_CONTACTS[contacts])
+    dynamics = moved.model.dynamics(*states)
+    mean, covariance = dense.latents(dense.scaled(dynamics))
+    B = PRIOR.direction(dynamics)
+    components = moved.components(*states)
+    assert tuple(components) == ("joint-friction", "contact-friction", "weight")
+    for name, which in zip(components, (slice(0, 3), slice(3, 4), slice(4, 5)), strict=True):
+        part, b = components[name], B[..., which]
+        own = covariance[:, which, which]
+        close(part.latents.mean, mean[:, which])
+        close(part.latents.covariance, own)
+        for gaussian, matrix in ((part.joint_force, b), (part.acceleration, dynamics.H @ b)):
+            close(gaussian.mean, (matrix @ mean[:, which, None])[..., 0])
+            close(gaussian.covariance, matrix @ own @ matrix.mT)
+    force = torch.tensor([0.0, 0.0, -9.81]).double() * components["weight"].latents.mean
+    close(components["weight"].point_force.mean, force, 1e-6)
+    assert components["joint-friction"].point_force is None
+    close(components.total.mean, (B @ mean[..., None])[..., 0])
+    close(components.total.covariance, B @ covariance @ B.mT)
+    alone = sum(part.joint_force.covariance for part in components.values())
+    assert float((components.total.covariance - alone).abs().max()) > 1e-4  # the data tie the parts to each other
+    for gaussian, affine in (
+        (components.multiplier, dynamics.multiplier_map()),
+        (components.contact_force, dynamics.contact_force_map()),
+        (moved.predict(*states).acceleration, dynamics.acceleration_map()),
+    ):
+        close(gaussian.mean, affine(components.total.mean))
+        close(gaussian.covariance, affine.matrix @ B @ covariance @ B.mT @ affine.matrix.mT)
+    if contacts == "none":
+        assert float(components["contact-friction"].joint_force.mean.abs().max()) == 0.0
+    bare = moved.components(*states, covariance=False)
+    torch.testing.assert_close(bare.total.mean, components.total.mean, rtol=1e-12, atol=1e-12)
+    assert bare["weight"].joint_force.covariance is None
+
+
+def test_components_of_any_batch_and_their_names(posterior, states):
+    flat = posterior.components(*states)
+    folded = posterior.components(*(x.reshape(2, 2, 3) for x in states))
+    close(folded["contact-friction"].point_force.mean.reshape(4, 3), flat["contact-friction"].point_force.mean, 1e-12)
+    single = posterior.components(*(x[1].tolist() for x in states))
+    close(single.total.covariance, flat.total.covariance[1], 1e-12)
+    assert flat["contact-friction"].latent_units == ("N",)
+    assert flat["joint-friction"].latent_names == ("pan", "lift", "bend")
+    with pytest.raises(InvalidInput, match=r"'joint-fricton'.*'joint-friction'"):
+        flat["joint-fricton"]
+    with pytest.raises(InvalidInput, match="last dimension must be 3"):
+        posterior.components([1.0], [1.0], [1.0])
+
+
+def test_quantities_by_what_they_are_of(posterior, states):
+    """Each is affine in the same forces: accelerations, the force at a contact, one unknown force by itself."""
+    whole, parts = posterior.predict(*states), posterior.components(*states)
+    contact, force = posterior.model.contacts[0], posterior.model.unknown_forces[0]
+    a, at_contact, alone = posterior.predict(*states, of=[Accelerations(), contact, force])
+    torch.testing.assert_close(a.mean, whole.mean)
+    torch.testing.assert_close(at_contact.mean, whole.contact_force.mean[..., :3])
+    torch.testing.assert_close(at_contact.covariance, whole.contact_force.covariance[..., :3, :3])
+    torch.testing.assert_close(alone.mean, next(iter(parts.values())).joint_force.mean)
+    with pytest.raises(InvalidInput, match=r"of holds 'lambda'; give Accelerations\(\)"):
+        posterior.predict(*states, of=["lambda"])
+
+
+def test_a_curve_is_that_of_dense_conditioning(posterior, dense, train):
+    v = torch.tensor(train.v)
+    for name, index in (("joint-friction lift", 1), ("contact-friction sliding", 3)):
+        curve = posterior.curve(name, points=7)
+        assert curve.features.shape == (7, 1)
+        z = [curve.features / scale if len(scale) else curve.features[:, :0] for scale in dense.scales]
+        mean, covariance = dense.latents(z)
+        close(curve.mean, mean[:, index])
+        close(curve.std, covariance[:, index, index].sqrt(), 1e-6)
+        assert torch.equal(curve.visited, torch.stack([curve.features[0], curve.features[-1]]))
+    lift = posterior.curve("joint-friction lift", points=7)
+    assert (lift.name, lift.unit, lift.feature_names) == ("joint-friction lift", "Nm", ("velocity of lift [rad/s]",))
+    assert torch.equal(lift.visited[:, 0], torch.stack([v[:, 1].min(), v[:, 1].max()]))
+    lower, upper = lift.interval(0.5)
+    close(0.5 * (upper - lower) / lift.std, 0.6744897501960817 * torch.ones(7).double(), 1e-12)
+    with pytest.raises(InvalidInput, match=r"probability is 1\.5"):
+        lift.interval(1.5)
+    given = posterior.curve("joint-friction lift", [0.0, 3.0])
+    assert float(given.mean[0]) == pytest.approx(0.0, abs=1e-12)  # friction at rest is zero
+    assert torch.equal(given.features, torch.tensor([[0.0], [3.0]]).double())
+    constant = posterior.curve("weight mass")
+    assert (constant.unit, constant.feature_names) == ("kg", ())
+    assert constant.mean.shape == constant.std.shape == (1,)
+    parts = posterior.components(*(torch.tensor(x[:1]) for x in (train.q, train.v, train.u)))
+    close(constant.mean, parts["weight"].latents.mean[0], 1e-10)
+
+
+def test_wrong_curves_are_refused(posterior, train):
+    with pytest.raises(InvalidInput, match="no latent '0' in this model"):
+        posterior.curve(0)  # a number is no name
+    with pytest.raises(InvalidInput, match=r"no latent 'lift' in this model.* Valid latents: "):
+        posterior.curve("lift")
+    with pytest.raises(InvalidInput, match=r"'joint-friction lift' .*\(3, 2\).*\(n, 1\)"):
+        posterior.curve("joint-friction lift", np.zeros((3, 2)))
+    with pytest.raises(InvalidInput, match="give finite numbers"):
+        posterior.curve("joint-friction lift", [math.nan])
+    with pytest.raises(InvalidInput, match="points=0"):
+        posterior.curve("joint-friction lift", points=0)
+    joint = fit(train.model.with_forces(JointForces()), train, restarts=1, options=OptimizerOptions(iterations=1))
+    with pytest.raises(InvalidInput, match=r"'pan' .*\(n, 9\)"):
+        joint.curve("pan")
+    assert joint.curve("pan", np.zeros((2, 9))).mean.shape == (2,)
+
+
+def test_the_same_contacts_change_nothing(posterior, states):
+    again = posterior.with_contacts(list(posterior.model.contacts))
+    mine, theirs = posterior.predict(*states), again.predict(*states)
+    assert torch.equal(mine.mean, theirs.mean)
+    assert torch.equal(mine.covariance, theirs.covariance)
+    assert torch.equal(mine.contact_force.covariance, theirs.contact_force.covariance)
+    back = posterior.with_contacts([]).with_contacts(posterior.model.contacts)
+    assert torch.equal(back.predict(*states).mean, mine.mean)
+    assert posterior.with_contacts([]).predict(*states).multiplier.mean.shape == (4, 0)
+    assert posterior.model.contacts  # nothing happened to the first
+    assert again.latent is posterior.latent  # and nothing was factorised again
+
+
+def test_it_moves_to_a_surface_that_has_no_normal_where_all_joints_are_zero(posterior, states):
+    rest = torch.zeros(1, 3).double()
+    center = Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.0)).position(posterior.model.robot.kinematics(rest))[0]
+    ball = Contact("hand", TIP, Sphere(tuple(center.tolist()), 0.3))
+    assert bool(torch.isfinite(posterior.with_contacts([ball]).predict(*states).mean).all())
+
+
+def slid(model, friction, rows, seed, speed):
+    """Noise-free rows on the surface of `model` under a true friction of its tool, and the force itself."""
+    generator = np.random.default_rng(seed)
+    q = on_the_plane(model, generator.uniform([-0.6, 0.4, 0.4], [0.6, 1.0, 1.0], (rows, 3)))
+    v, u = generator.normal(0.0, speed, (rows, 3)), generator.normal(0.0, 3.0, (rows, 3))
+    at = [torch.tensor(x) for x in (q, v, u)]
+    A = model.dynamics(*at).A
+    at[1] = at[1] - (torch.linalg.pinv(A) @ (A @ at[1][..., None]))[..., 0]  # along the surface
+    dynamics = model.dynamics(*at)
+    prior = ContactFriction()
+    latent = friction(prior.features(dynamics)[0])[..., None]
+    force = (prior.point_force(dynamics) @ latent)[..., 0]
+    a = dynamics.acceleration((prior.direction(dynamics) @ latent)[..., 0])
+    data = Dataset(
+        q=q, v=at[1].numpy(), u=u, a=a.numpy(), time=0.01 * np.arange(rows), model=model, noise_std=np.full(3, 1e-4)
+    )
+    return data, force
+
+
+def test_friction_learned_on_one_plane_predicts_motions_on_another_and_on_a_ball():
+    def friction(speed):
+        return 3.0 * torch.tanh(speed / 0.1) + 2.0 * speed
+
+    model = arm_model()
+    train, _ = slid(model, friction, 30, 1, speed=0.7)
+    posterior = fit(model.with_forces(ContactFriction()), train, restarts=1, options=OptimizerOptions(iterations=40))
+    for surface in (Plane((-0.3, 0.1, 1.0), 0.55), Sphere((0.0, 0.0, -2.0), 2.4)):
+        moved = model.with_contacts([Contact("hand", TIP, surface)])
+        test, force = slid(moved, friction, 20, 2, speed=0.25)
+        transferred = posterior.with_contacts(moved.contacts)
+        error = np.abs(transferred.predict(test.q, test.v, test.u).mean.numpy() - test.a)
+        states = (torch.tensor(x) for x in (test.q, test.v, test.u))
+        unknown = np.abs(moved.dynamics(*states).acceleration_map().offset.numpy() - test.a)
+        assert error.mean() < 1e-3 * unknown.mean()
+        part = transferred.components(test.q, test.v, test.u)["contact-friction"]
+        assert float((part.point_force.mean - force).abs().max()) < 1e-3
+
+
+def test_forces_move_to_a_robot_with_another_tool(posterior, states):
+    heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
+    moved = posterior.with_robot(heavier)
+    assert moved.model.robot is heavier
+    mine, theirs = posterior.components(*states), moved.components(*states)
+    close(theirs["joint-friction"].joint_force.mean, mine["joint-friction"].joint_force.mean, 1e-12)
+    dynamics = posterior.model.with_robot(heavier).dynamics(*states)
+    close(moved.predict(*states).mean, dynamics.acceleration(theirs.total.mean), 1e-10)
+
+
+def test_what_cannot_move_is_refused(posterior, train):
+    heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
+    renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
+    with pytest.raises(InvalidInput, match=r"pan, lift, bend.*yaw, lift, bend"):
+        posterior.with_robot(renamed)
+    handless = Robot.from_urdf_text(URDF.replace('"hand"', '"claw"'))
+    with pytest.raises(UnknownFrame, match="hand"):
+        posterior.with_model(arm_model(contacts=0).with_robot(handless))
+    once = OptimizerOptions(iterations=1)
+    zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=once)
+    with pytest.raises(InvalidInput, match=r"no rigid bodies.* fit a model with RigidBodies\(\)"):
+        zero.with_robot(heavier)
+    assert zero.with_contacts([]).predict(train.q, train.v, train.u).multiplier.mean.shape == (16, 0)
+
+
+def test_a_moved_model_comes_back_from_a_folder_as_it_was(posterior, states, tmp_path, monkeypatch):
+    """What it was trained on and what it predicts for are two models, and both are stored."""
+    monkeypatch.setitem(FORCES, "weight", Weight)
+    moved = posterior.with_contacts(OTHER_CONTACTS["sphere"])
+    save_posterior(moved, tmp_path / "moved")
+    again = load_posterior(tmp_path / "moved")
+    assert again.model.contacts == moved.model.contacts
+    assert again.trained.contacts == posterior.model.contacts
+    assert torch.equal(again.predict(*states).mean, moved.predict(*states).mean)
+    assert torch.equal(again.predict(*states).covariance, moved.predict(*states).covariance)
+    assert again.negative_log_likelihood == posterior.negative_log_likelihood
+    home = again.with_contacts(posterior.model.contacts)
+    assert torch.equal(home.predict(*states).mean, posterior.predict(*states).mean)
+
+
+def test_one_prior_alone_is_one_component(train, states):
+    for prior, name in ((JointForces(("v",)), "joint-forces"), (ToolForces(), "tool-friction")):
+        model = train.model.with_forces(prior, noise=Noise(0.1))
+        fitted = fit(model, train, restarts=1, options=OptimizerOptions(iterations=1))
+        components = fitted.components(*states)
+        assert tuple(components) == (name,)
+        close(components[name].joint_force.covariance, components.total.covariance, 1e-12)
+        dynamics = train.model.dynamics(*states)
+        curve = fitted.curve(fitted.latent_names[0], prior.features(dynamics)[0])  # standardised or only scaled
+        close(curve.mean, components[name].latents.mean[:, 0], 1e-10)
+        close(curve.std, components[name].latents.std[:, 0], 1e-8)

@@ -1,0 +1,155 @@
+"""Motions by the compiled loop are those of `integrate`, whose results they may take the place of."""
+
+import warnings
+
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.fit import fit
+from forcegp.forces import JointForces, JointFriction
+from forcegp.inference import OptimizerOptions
+from forcegp.posterior import Predictor, StructuredPosterior, rollout
+
+DT, STEPS = 0.01, 12
+INTEGRATORS = ["symplectic-euler", "rk4", "implicit-midpoint"]
+
+
+def fitted(prior) -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        return fit(arm_model().with_forces(prior), arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3))
+
+
+@pytest.fixture(scope="module")
+def friction() -> StructuredPosterior:
+    return fitted(JointFriction())
+
+
+@pytest.fixture(scope="module")
+def predictor(friction) -> Predictor:
+    return friction.predictor(covariance="none")
+
+
+@pytest.fixture(scope="module")
+def starts() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """11 motions, more than the lanes of a vector hold."""
+    data = arm_data(11, 1)
+    wave = torch.linspace(0.0, 3.0, STEPS, dtype=torch.float64).sin()
+    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
+    return q, v, u[:, None] * (1.0 + 0.1 * wave[:, None])
+
+
+def rolled_out(posterior, starts, **how):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        return posterior.rollout(*starts, DT, baumgarte=posterior.model.baumgarte, **how)
+
+
+def close(found, expected, tolerance=1e-8):
+    for name in ("q", "v", "a"):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        scale = float(theirs.nan_to_num().abs().max())
+        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=tolerance * scale, equal_nan=True)
+    assert torch.equal(found.diverged_at, expected.diverged_at)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("prior", ["sums over centres", "pieces"])
+def test_every_integrator_is_that_of_torch(friction, starts, integrator, prior):
+    posterior = friction if prior == "pieces" else fitted(JointForces(inputs=("q", "v")))
+    found = posterior.predictor(covariance="none").rollouts(*starts, DT, integrator=integrator)
+    close(found, rolled_out(posterior, starts, integrator=integrator))
+
+
+def test_drawn_functions_are_those_of_a_rollout(friction, predictor, starts):
+    found = predictor.rollouts(*starts, DT, functions=3, seed=5)
+    assert found.q.shape == (3, 11, STEPS + 1, 3)
+    close(found, rolled_out(friction, starts, samples=3, seed=5).samples, 1e-7)
+    assert not torch.equal(found.q, predictor.rollouts(*starts, DT, functions=3, seed=6).q)
+
+
+def test_motions_that_become_too_fast_end_as_they_do_in_torch(friction, predictor, starts):
+    q, v, u = starts
+    pushed = u.clone()
+    pushed[3:5] += 3e3
+    with pytest.warns(NumericalWarning, match=r"2 of 11 motions diverged, the first at step"):
+        found = predictor.rollouts(q, v, pushed, DT)
+    expected = rolled_out(friction, (q, v, pushed))
+    assert int((expected.diverged_at >= 0).sum()) == 2
+    close(found, expected)
+
+
+def test_motions_that_leave_a_table_go_on(starts):
+    """A table of a squared exponential reaches a quarter beyond its centres; beyond it torch takes over."""
+    posterior = fitted(JointFriction(kernel="squared-exponential"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("forcegp.inference.one_input_calls.FEW_CENTERS", 0)
+        predictor = posterior.predictor(covariance="none")
+    q, v, u = starts
+    v = v * torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64)
+    close(predictor.rollouts(q, v, u, DT), rolled_out(posterior, (q, v, u)), 1e-5)
+    torch.testing.assert_close(
+        predictor.mean(q, v, u[:, 0]), posterior.predict(q, v, u[:, 0]).mean, rtol=1e-6, atol=1e-6
+    )
+
+
+def test_batches_broadcast_and_threads_change_nothing(predictor, starts):
+    q, v, u = starts
+    found = predictor.rollouts(q[0], v[0], u[:6].reshape(2, 3, STEPS, 3), DT, threads=2)
+    assert found.q.shape == (2, 3, STEPS + 1, 3)
+    assert torch.equal(found.a[1, 2], predictor.rollouts(q[0], v[0], u[5], DT).a)
+    many = [x.repeat(9, *[1] * (x.dim() - 1)) for x in starts]
+    one, two = (predictor.rollouts(*many, DT, threads=threads) for threads in (1, 2))
+    assert torch.equal(one.q, two.q)
+
+
+def test_without_a_compiler_torch_does_the_same(friction, predictor, starts):
+    eager = friction.predictor(covariance="none", compile=False)
+    close(eager.rollouts(*starts, DT), predictor.rollouts(*starts, DT))
+    close(eager.rollouts(*starts, DT, integrator="projected"), rolled_out(friction, starts, integrator="projected"))
+
+
+def test_rollouts_of_a_posterior_are_compiled_where_they_are_long(friction, starts, monkeypatch):
+    expected = rolled_out(friction, starts, samples=2)
+    monkeypatch.setattr(rollout, "STEPS_TO_COMPILE", 1)
+    called = []
+    fused = rollout.fused
+    monkeypatch.setattr(rollout, "fused", lambda *given: called.append(given[0]) or fused(*given))
+    found = rolled_out(friction, starts, samples=2)
+    assert [len(loops) for loops in called] == [1, 2]
+    close(found, expected)
+    close(found.samples, expected.samples, 1e-7)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/nowhere")
+    with pytest.warns(NumericalWarning, match="computed by torch, some 50 times slower: .*"):
+        close(friction.rollout(*starts, DT, baumgarte=friction.model.baumgarte), expected, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"dt": 0.0}, "dt is 0.0"),
+        ({"dt": float("nan")}, "dt is nan"),
+        ({"threads": 1.5}, "`threads=1.5` must be an integer of at least 1"),
+        ({"threads": 0}, "`threads=0` must be an integer of at least 1"),
+        ({"functions": -1}, "`functions=-1` must be"),
+        ({"integrator": "euler"}, "no integrator 'euler'"),
+    ],
+)
+def test_bad_arguments(predictor, starts, changed, message):
+    with pytest.raises(InvalidInput, match=message):
+        predictor.rollouts(*starts, **({"dt": DT} | changed))
+
+
+def test_bad_states(predictor, starts):
+    q, v, u = starts
+    with pytest.raises(InvalidInput, match=r"u has shape \(11, 12, 2\); it must be \(\.\.\., T, 3\)"):
+        predictor.rollouts(q, v, u[..., :2], DT)
+    with pytest.raises(InvalidInput, match=r"do not broadcast: q0 \(11,\), v0 \(11,\), u \(4,\)"):
+        predictor.rollouts(q, v, u[:4], DT)
+    with pytest.raises(InvalidInput, match="u has no rows"):
+        predictor.rollouts(q, v, u[:, :0], DT)
+    with pytest.raises(InvalidInput, match=r"q0 requires a gradient.*rollout\(\.\.\., grad=True\)"):
+        predictor.rollouts(q.clone().requires_grad_(), v, u, DT)

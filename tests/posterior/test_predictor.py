@@ -1,0 +1,324 @@
+"""The predictor says what `predict` says, faster; its compressed covariance is never below the exact one."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import Weight, arm_data, arm_model
+from torch.autograd import forward_ad
+
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointForces, JointFriction
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
+from forcegp.model import Model
+from forcegp.posterior import Predictor, StructuredPosterior
+
+TIP = (0.0, 0.0, 0.2)
+CONTACTS = {
+    "none": [],
+    "sphere": [Contact("hand", TIP, Sphere((0.0, 0.0, -1.0), 1.5))],
+    "implicit": [Contact("hand", TIP, ImplicitSurface(lambda p: p[2] - 0.3 * torch.sin(2 * p[0]) - 0.1 * p[1] ** 2))],
+    "two": [
+        Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.4)),
+        Contact("hand", (0.0, 0.1, 0.2), Sphere((0.0, 0.0, -1.0), 1.5)),
+    ],
+    "redundant": [Contact("hand", TIP, Plane((0.2, 0.0, 1.0), 0.4))] * 2,
+}
+SHORT = OptimizerOptions(iterations=3)
+
+
+def fitted(model: Model, rows: int = 30) -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        return fit(model, arm_data(rows, 0), restarts=1, options=SHORT)
+
+
+@pytest.fixture(scope="module")
+def posterior() -> StructuredPosterior:
+    return fitted(arm_model().with_forces(JointForces()))
+
+
+@pytest.fixture(scope="module")
+def means(posterior) -> Predictor:
+    return posterior.predictor(covariance="none")
+
+
+@pytest.fixture(scope="module")
+def compressed(posterior) -> Predictor:
+    return posterior.predictor(tolerance=0.1)
+
+
+@pytest.fixture(scope="module")
+def states() -> tuple[torch.Tensor, ...]:
+    data = arm_data(5, 1)
+    return tuple(torch.tensor(x) for x in (data.q, data.v, data.u))
+
+
+def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-10):
+    assert found.shape == expected.shape
+    assert float((found - expected).abs().max()) <= tolerance * (1e-300 + float(expected.abs().max()))
+
+
+def check(posterior: StructuredPosterior, states: tuple[torch.Tensor, ...]):
+    """Mean, exact covariance and derivatives are those of `predict`, for one state and for several."""
+    predictor = posterior.predictor(covariance="exact")
+    expected = posterior.predict(*states)
+    mean, covariance = predictor(*states)
+    assert_close(mean, expected.mean)
+    assert_close(predictor.mean(*states), expected.mean)
+    assert_close(covariance, expected.covariance, 1e-9)
+    alone = tuple(x[2] for x in states)
+    assert_close(predictor.mean(*alone), expected.mean[2])
+    assert_close(predictor(*alone)[1], expected.covariance[2], 1e-9)
+    derivatives = torch.autograd.functional.jacobian(
+        lambda *x: posterior.predict(*(y[None] for y in x), covariance=False).mean[0], alone
+    )
+    for linear in (predictor.linearize(*alone), [part[2] for part in predictor.linearize(*states)]):
+        assert_close(linear[0], expected.mean[2])
+        for found, derivative in zip(linear[1:], derivatives, strict=True):
+            assert float((found - derivative).abs().max()) <= 1e-9 * (1.0 + float(derivative.abs().max()))
+
+
+@pytest.mark.parametrize("contacts", CONTACTS)
+def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
+    check(posterior.with_contacts(CONTACTS[contacts]), states)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2)),
+        arm_model().with_forces(ContactFriction(inputs=("velocity", "position"))),
+        arm_model(),
+        arm_model().with_forces(JointFriction()).without_mean(),
+    ],
+    ids=["friction under load", "friction map", "no forces", "zero mean"],
+)
+def test_it_is_predict_with_any_prior(states, model):
+    check(fitted(model), states)
+
+
+def test_constant_kernels_have_no_slopes_of_their_own(states):
+    posterior = fitted(arm_model().with_forces(Weight()))
+    predictor = posterior.predictor(covariance="exact")
+    # the mean of a constant is k sum_i beta_i, whose terms of 1e8 cancel to 1e-2: each rounds to eps of itself, and the
+    # factor 10 stands for the operations on the way
+    variances = torch.stack(
+        [K[0, 0] for K in posterior.kernels.matrices(posterior.hyperparameters, posterior.latent.features)]
+    )
+    dynamics = posterior.model.dynamics(*states)
+    response = (dynamics.H @ posterior.model.unknown.direction(dynamics)).abs()
+    terms = response @ (variances * posterior.latent.system.beta.abs().sum(0))
+    error = (predictor.mean(*states) - posterior.predict(*states).mean).abs()
+    assert bool((error <= 10.0 * torch.finfo(torch.float64).eps * terms).all())
+    x = tuple(part.clone().requires_grad_() for part in states)
+    slopes = torch.autograd.grad(predictor.mean(*x)[:, 1].sum(), x)
+    for found, slope in zip(predictor.linearize(*states)[1:], slopes, strict=True):
+        assert_close(found[:, 1], slope, 1e-6)
+
+
+def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states):
+    compiled = posterior.predictor(tolerance=100.0)
+    eager = posterior.predictor(tolerance=100.0, compile=False)
+    assert compiled.rank == eager.rank > 1
+
+    def gradients(predictor) -> tuple[torch.Tensor, ...]:
+        x = tuple(part.clone().requires_grad_() for part in states)
+        mean, covariance = predictor(*x)
+        return torch.autograd.grad(
+            mean.square().mean() + covariance.diagonal(dim1=1, dim2=2).sqrt().sum() + covariance[:, 0, 1].sum(), x
+        )
+
+    for found, expected in zip(gradients(compiled), gradients(eager), strict=True):
+        assert_close(found, expected, 1e-6)
+    for found, expected in zip(compiled.linearize(*states), eager.linearize(*states), strict=True):
+        assert_close(found, expected)
+
+
+def test_gradients_of_the_covariance_are_differences_of_it(compressed, states):
+    predictor = compressed
+    state = [x[0] for x in states]
+    direction = [torch.linspace(-1.0, 1.0, 3, dtype=torch.float64) for _ in state]
+    moved = [x.clone().requires_grad_() for x in state]
+    slopes = torch.autograd.grad(predictor(*moved)[1].diagonal().sqrt().sum(), moved)
+    slope = sum(float(g @ d) for g, d in zip(slopes, direction, strict=True))
+    step = 1e-5
+
+    def spread(scale: float) -> float:
+        return float(
+            predictor(*(x + scale * d for x, d in zip(state, direction, strict=True)))[1].diagonal().sqrt().sum()
+        )
+
+    assert slope == pytest.approx((spread(step) - spread(-step)) / (2 * step), rel=1e-5)
+
+
+def test_the_compressed_covariance_is_never_below_the_exact_one(posterior, states):
+    exact = posterior.predict(*states).covariance
+    for rank in (1, 5, 20):
+        with pytest.warns(NumericalWarning, match=f"rank {rank} makes"):
+            predictor = posterior.predictor(tolerance=1e-9, largest_rank=rank, compile=False)
+        assert predictor.rank == rank
+        excess = predictor(*states)[1] - exact
+        assert float(torch.linalg.eigvalsh(excess).min()) > -1e-9 * float(exact.abs().max())
+    assert float(excess.diagonal(dim1=1, dim2=2).max()) > 1e-6 * float(exact.abs().max())  # it is a compression
+
+
+def test_the_rank_keeps_the_tolerance_and_no_more(posterior):
+    loose, tight = (posterior.predictor(tolerance=tolerance, compile=False) for tolerance in (100.0, 0.01))
+    assert loose.rank < tight.rank <= 2 * 30
+    assert 0.01 < float(loose.inflation.max()) <= 100.0
+    assert float(tight.inflation.max()) <= 0.01
+    rows = posterior.training
+    compressed = tight(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
+    ratio = (compressed / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt()
+    assert 1.0 - 1e-6 < float(ratio.min()) <= float(ratio.max()) < 1.02
+
+
+def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch):
+    posterior = fitted(arm_model().with_forces(JointFriction()), rows=60)
+    monkeypatch.setattr("forcegp.posterior.predictor_preparation.SAMPLES", 30)
+    predictor = posterior.predictor(compile=False)  # without a warning; of ten rows it is 97 times too large at others
+    rows = posterior.training
+    ratio = predictor(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
+    assert float((ratio / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt().max()) < 1.05
+
+
+def test_directions_found_in_blocks_are_nearly_as_few_as_the_best(posterior, monkeypatch):
+    ranks = {}
+    for directions in (10**6, 8):  # all at once: half of all singular vectors
+        monkeypatch.setattr("forcegp.inference.prepared_kernels.DIRECTIONS", directions)
+        predictor = posterior.predictor(compile=False)
+        assert float(predictor.inflation.max()) <= 0.01
+        ranks[directions] = predictor.rank
+    assert 2 < ranks[8] <= 1.2 * ranks[10**6]
+
+
+def test_many_states_are_one_by_one(compressed):
+    predictor = compressed
+    data = arm_data(3000, 3)  # more than one block
+    mean, covariance = predictor(data.q, data.v, data.u)
+    assert mean.shape == (3000, 3)
+    assert covariance.shape == (3000, 3, 3)
+    for row in (0, 1499, 2999):
+        alone = predictor(*(np.array(x[row]) for x in (data.q, data.v, data.u)))
+        assert_close(alone[0], mean[row])
+        assert_close(alone[1], covariance[row], 1e-9)
+    assert predictor.mean(data.q[:0], data.v[:0], data.u[:0]).shape == (0, 3)
+
+
+def test_a_copy_in_another_process_is_the_same(compressed, states):
+    copied = pickle.loads(pickle.dumps(compressed))
+    for found, expected in zip(copied(*states), compressed(*states), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_predictions_without_a_graph_need_none(means, states):
+    assert not means.mean(*states).requires_grad
+    x = [part.clone().requires_grad_() for part in states]
+    with torch.no_grad():
+        assert not means.mean(*x).requires_grad
+    with pytest.raises(InvalidInput, match="first derivatives only"):
+        torch.autograd.grad(means.mean(*x).sum(), x, create_graph=True)
+
+
+TRANSFORMS = {
+    "jacrev": lambda f, x: torch.func.jacrev(f)(x),
+    "grad": lambda f, x: torch.stack([torch.func.grad(lambda y, i=i: f(y)[i])(x) for i in range(3)]),
+    "vjp": lambda f, x: torch.stack([torch.func.vjp(f, x)[1](row)[0] for row in torch.eye(3, dtype=x.dtype)]),
+    "jacfwd": lambda f, x: torch.func.jacfwd(f)(x),
+    "jvp": lambda f, x: torch.stack([torch.func.jvp(f, (x,), (row,))[1] for row in torch.eye(3, dtype=x.dtype)], 1),
+}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+def test_transforms_are_refused_by_code_and_taken_by_torch(posterior, means, compressed, states, transform):
+    q, v, u = (x[0] for x in states)
+    take = TRANSFORMS[transform]
+    refused = r"does not support transforms of torch\.func .*linearize.*compile=False"
+    for function in (means.mean, compressed, means.linearize):
+        with pytest.raises(InvalidInput, match=refused):
+            take(lambda y, f=function: f(y, v, u), q)
+    eager = posterior.predictor(covariance="none", compile=False)
+    assert_close(take(lambda y: eager.mean(y, v, u), q), means.linearize(q, v, u).da_dq)
+    with pytest.raises(InvalidInput, match="linearize does not support transforms"):  # it would give zeros
+        take(lambda y: eager.linearize(y, v, u).a, q)
+
+
+def test_rows_replace_vmap(means, states):
+    with pytest.raises(InvalidInput, match=r"transforms of torch\.func .*rows \(n, nv\)"):
+        torch.func.vmap(means.mean)(*states)
+
+
+def test_forward_mode_derivatives_are_not_lost(posterior, means, states):
+    q, v, u = (x[0] for x in states)
+    direction = torch.linspace(-1.0, 1.0, 3, dtype=torch.float64)
+    eager = posterior.predictor(covariance="none", compile=False)
+    with forward_ad.dual_level():
+        assert_close(means.mean(q, v, u), eager.mean(q, v, u))  # numbers alone are taken as ever
+        x = forward_ad.make_dual(q, direction)
+        for function in (means.mean, means.linearize):
+            with pytest.raises(InvalidInput, match=r"forward-mode .*linearize"):
+                function(x, v, u)
+        with pytest.raises(InvalidInput, match="linearize does not support forward-mode"):
+            eager.linearize(x, v, u)
+        tangent = forward_ad.unpack_dual(eager.mean(x, v, u)).tangent
+    assert_close(tangent, means.linearize(q, v, u).da_dq @ direction)
+
+
+def test_errors_name_the_remedy(posterior, means, states):
+    predictor = means
+    q, v, u = states
+    with pytest.raises(InvalidInput, match=r"u \(5, 2\); give all three \(3,\)"):
+        predictor.mean(q, v, u[:, :2])
+    with pytest.raises(InvalidInput, match=r"v \(3,\)"):
+        predictor.mean(q, v[0], u)
+    with pytest.raises(InvalidInput, match="not finite"):
+        predictor.mean(q, v * float("nan"), u)
+    with pytest.raises(InvalidInput, match=r"device .*cpu"):
+        predictor.mean(q.to("meta"), v, u)
+    with pytest.raises(InvalidInput, match="covariance='compressed' or 'exact'"):
+        predictor(q, v, u)
+    with pytest.raises(InvalidInput, match=r"'dense'.*'auto', 'compressed', 'exact', 'none'"):
+        posterior.predictor(covariance="dense")
+    with pytest.raises(InvalidInput, match=r"tolerance is 0\.0 .*give a positive number"):
+        posterior.predictor(tolerance=0.0)
+    with pytest.raises(NumericalError, match="not finite"):
+        predictor.mean(q, v * 1e200, u)
+
+
+def test_operations_that_no_tape_holds_are_named(posterior, states):
+    surface = ImplicitSurface(lambda p: p[2] + torch.special.bessel_j0(p[0]))
+    bent = posterior.with_contacts([Contact("hand", TIP, surface)])
+    with pytest.raises(InvalidInput, match=r"operation aten.*bessel_j.*compile=False"):
+        bent.predictor(covariance="none")
+    eager = bent.predictor(covariance="none", compile=False)
+    assert_close(eager.mean(*states), bent.predict(*states).mean)
+
+
+def test_it_takes_what_another_engine_knows(states):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = arm_model().with_forces(JointFriction())
+        posterior = fit(model, arm_data(30, 0), restarts=1, options=SHORT, engine="inducing")
+    check(posterior, states)
+    with pytest.raises(InvalidInput, match=r"InducingPosterior .*covariance='exact'"):
+        posterior.predictor(covariance="compressed")
+    predictor = posterior.predictor()
+    assert (predictor.kind, predictor.rank, predictor.inflation) == ("exact", None, None)
+    assert_close(predictor(*states)[1], posterior.predict(*states).covariance, 1e-9)
+
+
+def test_the_covariance_is_compressed_unless_another_is_asked_for(compressed, means):
+    assert (compressed.kind, means.kind) == ("compressed", "none")
+
+
+def test_other_models_have_none():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        other = fit(arm_model().black_box(), arm_data(8, 0), restarts=1, options=SHORT)
+    with pytest.raises(InvalidInput, match="has no predictor for control rates; call predict"):
+        other.predictor()

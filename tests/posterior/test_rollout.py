@@ -1,0 +1,314 @@
+"""Rollouts of a fitted model: against a loop over `predict`, on the surface, and as functions drawn from the model."""
+
+import numpy as np
+import pytest
+import torch
+from tests.mechanics.test_thrusters import DRONE
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.fit import fit
+from forcegp.forces import BaseWrench, JointForces, RigidBodies
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Baumgarte
+from forcegp.model import Model
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.rollout import roll_out
+from forcegp.robots import Robot
+
+DT, STEPS = 1 / 240, 12
+QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=15)}
+
+
+@pytest.fixture(scope="module")
+def data():
+    return arm_data(40, seed=0)
+
+
+@pytest.fixture(scope="module")
+def posterior(data):
+    return fit(data.model.with_forces(JointForces()), data, points=20, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def start(data):
+    """Two states on the plane and gravity-compensating torques (2, T, nv)."""
+    q, v = torch.tensor(data.q[:2]), 0.3 * torch.tensor(data.v[:2])
+    return q, v, data.model.robot.gravity_forces(q)[:, None].repeat(1, STEPS, 1)
+
+
+def test_symplectic_euler_is_a_loop_over_predict(data, start):
+    model = arm_model(baumgarte=None)  # so `predict` and `rollout` speak of the same stabilisation: none
+    posterior = fit(model.with_forces(JointForces()), data, points=20, **QUICK)
+    q, v, u = start
+    rollout = posterior.rollout(q, v, u, DT)
+    for k in range(STEPS):
+        a = posterior.predict(q, v, u[:, k], covariance=False).mean
+        torch.testing.assert_close(rollout.a[:, k], a, rtol=1e-9, atol=1e-9)
+        v = v + DT * a
+        q = q + DT * v
+    torch.testing.assert_close(rollout.q[:, -1], q, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(rollout.v[:, -1], v, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(rollout.time, DT * torch.arange(STEPS + 1, dtype=torch.float64))
+    assert rollout.baumgarte is None
+    assert rollout.samples is None
+    assert (rollout.diverged_at == -1).all()
+    assert (rollout.initial_correction == 0).all()
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "projected"])
+def test_the_black_box_way_through_predict_gives_the_same_motion(data, start, integrator):
+    posterior = fit(arm_model(baumgarte=None).with_forces(JointForces()).without_mean(), data, points=15, **QUICK)
+    q, v, u = start
+    direct = posterior.rollout(q, v, u[:, :4], DT, integrator=integrator)
+    through = roll_out(Posterior.accelerations(posterior, None), q, v, u[:, :4], DT, integrator=integrator)
+    torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
+    torch.testing.assert_close(direct.a, through.a, rtol=1e-9, atol=1e-9)
+
+
+def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posterior, start):
+    q, v, u = start
+    q = q + 1e-3  # off the plane
+    assert posterior.model.baumgarte == Baumgarte(5.0)
+    for baumgarte in (None, Baumgarte(20.0, 0.7)):
+        rollout = posterior.rollout(q, v, u[:, :1], DT, baumgarte=baumgarte)
+        dynamics = arm_model(baumgarte=baumgarte).dynamics(q, v, u[:, 0])
+        torch.testing.assert_close((dynamics.A @ rollout.a[:, 0, :, None])[..., 0], dynamics.b, rtol=1e-9, atol=1e-10)
+        assert rollout.baumgarte == baumgarte
+
+
+def test_batches_lead_and_broadcast(posterior, start):
+    q, v, u = start
+    many = posterior.rollout(q[:, None], v[:, None], u[0].expand(3, -1, -1), DT)
+    assert many.q.shape == many.v.shape == (2, 3, STEPS + 1, 3)
+    assert many.a.shape == (2, 3, STEPS, 3)
+    assert many.constraint.shape == many.velocity_constraint.shape == (2, 3, STEPS + 1, 1)
+    assert many.diverged_at.shape == (2, 3)
+    alone = posterior.rollout(q[1].tolist(), v[1].numpy(), u[0], DT)
+    assert alone.q.shape == (STEPS + 1, 3)
+    torch.testing.assert_close(many.q[1, 2], alone.q, rtol=0, atol=1e-12)
+
+
+def test_the_constraint_is_that_of_the_contacts_and_projection_keeps_it(posterior, start):
+    q, v, u = start
+    contact, robot = posterior.model.contacts[0], posterior.model.robot
+    loose = posterior.rollout(q + 1e-3, v, u, DT, integrator="rk4")
+    torch.testing.assert_close(loose.constraint[..., 0], contact.distance(robot.kinematics(loose.q)))
+    kept = posterior.rollout(q + 1e-3, v, u, DT, integrator="projected")
+    assert loose.constraint.abs().max() > 1e-4
+    assert kept.constraint.abs().max() <= 1e-11
+    assert kept.velocity_constraint.abs().max() <= 1e-12
+    correction = kept.initial_correction
+    torch.testing.assert_close(correction[:, 0], (kept.q[:, 0] - q - 1e-3).abs().amax(-1), rtol=1e-9, atol=0)
+    torch.testing.assert_close(correction[:, 1], (kept.v[:, 0] - v).abs().amax(-1), rtol=1e-9, atol=0)
+    assert (correction > 1e-4).all()
+
+
+def test_a_rollout_goes_on_from_any_of_its_own_states(posterior, start):
+    q, v, u = start
+    whole = posterior.rollout(q, v, u, DT, integrator="rk4")
+    rest = posterior.rollout(whole.q[:, 5], whole.v[:, 5], u[:, 5:], DT, integrator="rk4")
+    torch.testing.assert_close(rest.q, whole.q[:, 5:], rtol=0, atol=1e-12)
+
+
+def test_samples_are_functions_that_obey_the_constraint(posterior, start):
+    q, v, u = start
+    rollout = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=3)
+    drawn = rollout.samples
+    assert drawn.q.shape == (5, 2, STEPS + 1, 3)
+    assert drawn.a.shape == (5, 2, STEPS, 3)
+    dynamics = arm_model(baumgarte=Baumgarte(10.0)).dynamics(drawn.q[..., :-1, :], drawn.v[..., :-1, :], u)
+    violation = (dynamics.A @ drawn.a[..., None])[..., 0] - dynamics.b
+    assert violation.abs().max() <= 1e-10
+    assert drawn.a[:, :, 0].std(0).max() > 1e-4  # they differ
+    again = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=3)
+    torch.testing.assert_close(again.samples.q, drawn.q, rtol=0, atol=0)
+    other = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=4)
+    assert (other.samples.q - drawn.q).abs().max() > 1e-9
+    torch.testing.assert_close(rollout.std("v"), drawn.v.std(0))
+    torch.testing.assert_close(rollout.quantiles(), rollout.quantiles((0.025, 0.5, 0.975), "q"))
+    low, high = rollout.quantiles((0.0, 1.0), "q")
+    mean = drawn.q.mean(0)
+    rounding = 8 * torch.finfo(mean.dtype).eps * mean.abs()  # of 5 numbers added; at the start all five are one number
+    assert (low <= mean + rounding).all()
+    assert (mean - rounding <= high).all()
+
+
+def test_first_sampled_accelerations_have_the_predicted_distribution(posterior, start):
+    q, v, u = (x[0] for x in start)
+    rollout = posterior.rollout(q, v, u[:1], DT, baumgarte=Baumgarte(5.0), samples=3000, seed=0)
+    first = rollout.samples.a[:, 0]
+    expected = posterior.predict(q, v, u[0])
+    assert ((first.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
+    scale = expected.covariance.diagonal().max()
+    torch.testing.assert_close(torch.cov(first.mT), expected.covariance, rtol=0.1, atol=0.1 * float(scale))
+
+
+def test_the_independent_model_rolls_out_its_mean_and_functions_of_its_own(data, start):
+    posterior = fit(arm_model().black_box(), data, points=20, options=OptimizerOptions(iterations=15))
+    q, v, u = start
+    direct = posterior.rollout(q, v, u[:, :4], DT, integrator="rk4")
+    through = roll_out(Posterior.accelerations(posterior, None), q, v, u[:, :4], DT, integrator="rk4")
+    torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
+    drawn = posterior.rollout(q[0], v[0], u[0, :1], DT, samples=3000, seed=0).samples.a[:, 0]
+    expected = posterior.predict(q[0], v[0], u[0, 0])
+    assert ((drawn.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
+    torch.testing.assert_close(drawn.std(0), expected.std, rtol=0.08, atol=0)
+    assert torch.corrcoef(drawn.mT).tril(-1).abs().max() <= 5.0 / np.sqrt(3000)
+    with pytest.raises(InvalidInput, match=r"IndependentPosterior has no constraint"):
+        posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0))
+    on_surface = posterior.rollout(q, v, u[:, :4], DT, integrator="projected")
+    assert on_surface.constraint.abs().max() <= 1e-11
+
+
+def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):
+    q, v, u = start
+    rollout = fit(data.model, data, points=10, **QUICK).rollout(q, v, u, DT, samples=2)
+    torch.testing.assert_close(rollout.samples.q, rollout.q.expand(2, -1, -1, -1), rtol=1e-12, atol=1e-12)
+
+
+def test_progress_counts_mean_and_samples(posterior, start):
+    q, v, u = start
+    seen = []
+    posterior.rollout(q, v, u[:, :3], DT, samples=2, progress=lambda *now: seen.append(now))
+    assert seen == [(k, 6) for k in range(1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"q0": torch.zeros(2, 4)}, r"q0 has shape \(2, 4\); it must be \(\.\.\., 3\)"),
+        ({"u": torch.zeros(3)}, r"u has shape \(3,\); it must be \(\.\.\., T, 3\)"),
+        ({"u": torch.zeros(0, 3)}, "u has no rows"),
+        ({"v0": torch.full((3,), float("nan"))}, "v0 has values that are not finite"),
+        ({"v0": torch.zeros(3, 3)}, "shapes do not broadcast"),
+        ({"q0": "here"}, "q0 must be an array of real numbers"),
+        ({"q0": torch.zeros(0, 1, 3)}, "no motion at all"),
+        ({"samples": -1}, "samples=-1"),
+        ({"seed": -1}, "seed=-1"),
+        ({"integrator": "euler"}, "no integrator 'euler' in forcegp; did you mean 'symplectic-euler'"),
+        ({"dt": 0.0}, r"dt is 0\.0"),
+    ],
+)
+def test_wrong_arguments_are_named(posterior, start, changed, message):
+    q, v, u = start
+    arguments = {"q0": q, "v0": v, "u": u, "dt": DT} | changed
+    with pytest.raises(InvalidInput, match=message):
+        posterior.rollout(**arguments)
+
+
+def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, start):
+    q, v, u = start
+    rollout = posterior.rollout(q, v, u[:, :1], DT)
+    for ask in (rollout.std, rollout.quantiles):
+        with pytest.raises(InvalidInput, match="this rollout has 0 samples"):
+            ask()
+    with pytest.raises(InvalidInput, match="quantile levels"):
+        rollout.quantiles((1.5,))
+    with pytest.raises(InvalidInput, match=r"has no constraint.*integrator='projected'"):
+        Posterior.accelerations(posterior, Baumgarte(1.0))
+    with pytest.raises(InvalidInput, match="no functions can be drawn from a StructuredPosterior"):
+        roll_out(Posterior.accelerations(posterior, None), q, v, u, DT, samples=1)
+    free = fit(arm_model(0).with_forces(JointForces()), arm_data(20, 1, arm_model(0)), points=10, **QUICK)
+    with pytest.raises(InvalidInput, match="has no contacts; give baumgarte=None"):
+        free.rollout(q, v, u, DT, baumgarte=Baumgarte(1.0))
+    assert free.rollout(q, v, u, DT, integrator="projected").constraint.shape == (2, STEPS + 1, 0)
+
+
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "projected"])
+def test_feedback_is_asked_once_per_step_and_acts_until_the_next(posterior, start, integrator):
+    q, v, u = start
+    gains = torch.linspace(0.5, 2.0, STEPS, dtype=torch.float64)
+    asked = []
+
+    def feedback(k, q, v):
+        asked.append((k, q.clone(), v.clone()))
+        return u[:, k] - gains[k] * v
+
+    rollout = posterior.rollout(q, v, 0.0 * u, DT, integrator=integrator, feedback=feedback)
+    assert [k for k, _, _ in asked] == list(range(STEPS))
+    torch.testing.assert_close(torch.stack([at for _, at, _ in asked], dim=1), rollout.q[:, :-1], rtol=0, atol=0)
+    torch.testing.assert_close(torch.stack([rate for _, _, rate in asked], dim=1), rollout.v[:, :-1], rtol=0, atol=0)
+    applied = u - gains[:, None] * rollout.v[:, :-1]
+    same = posterior.rollout(q, v, applied, DT, integrator=integrator)
+    torch.testing.assert_close(rollout.q, same.q, rtol=1e-12, atol=1e-12)
+    without = posterior.rollout(q, v, u, DT, integrator=integrator)
+    assert not torch.allclose(rollout.v, without.v, atol=1e-6)
+
+
+def test_feedback_sees_the_batch_dimensions_of_the_motions(posterior, start):
+    q, v, u = start
+    seen = set()
+
+    def feedback(k, q, v):
+        seen.add((tuple(q.shape), tuple(v.shape)))
+        return torch.zeros_like(q)
+
+    with_feedback = posterior.rollout(q, v, u, DT, feedback=feedback, samples=3, seed=1)
+    assert seen == {((2, 3), (2, 3)), ((3, 2, 3), (3, 2, 3))}
+    plain = posterior.rollout(q, v, u, DT, samples=3, seed=1)
+    torch.testing.assert_close(with_feedback.q, plain.q)
+    torch.testing.assert_close(with_feedback.samples.q, plain.samples.q)
+
+
+def test_feedback_of_another_shape_is_refused(posterior, start):
+    q, v, u = start
+    with pytest.raises(InvalidInput, match=r"feedback .*\(3,\) at step 0.*\(2, 3\)"):
+        posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: torch.zeros(3).double())
+
+
+@pytest.mark.parametrize(
+    ("integrator", "samples"),
+    [("symplectic-euler", 2), ("rk4", 0), ("implicit-midpoint", 0), ("projected", 0)]
+    + [pytest.param(name, 2, marks=pytest.mark.nightly) for name in ("rk4", "implicit-midpoint", "projected")],
+)
+def test_gradients_in_initial_states_and_forces_are_those_of_finite_differences(posterior, start, integrator, samples):
+    q, v, u = start
+    x = [part.clone().requires_grad_() for part in (q[:1], v[:1], u[:1, :2])]
+
+    def motion(*x):
+        rollout = posterior.rollout(*x, 0.02, integrator=integrator, samples=samples, grad=True)
+        drawn = [rollout.samples.q[..., 1:, :]] if samples else []
+        return rollout.q[:, 1:], rollout.v[:, 1:], rollout.a, rollout.constraint[:, 1:], *drawn
+
+    plain = posterior.rollout(*(part.detach() for part in x), 0.02, integrator=integrator, samples=samples)
+    torch.testing.assert_close(motion(*x)[0].detach(), plain.q[:, 1:], rtol=0, atol=1e-10)
+    assert torch.autograd.gradcheck(motion, x, fast_mode=True)
+
+
+def test_gradients_flow_through_feedback(posterior, start):
+    q, v, u = start
+    gain = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+
+    def end(gain):
+        return posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: -gain * v, grad=True).q[:, -1]
+
+    assert torch.autograd.gradcheck(end, gain, fast_mode=True)
+
+
+def test_a_gradient_is_never_dropped_in_silence(posterior, start):
+    arguments = dict(zip(("q0", "v0", "u"), start, strict=True))
+    for name in arguments:
+        changed = {**arguments, name: arguments[name].clone().requires_grad_()}
+        with pytest.raises(InvalidInput, match=rf"{name} requires a gradient.* give grad=True, or {name}\.detach\(\)"):
+            posterior.rollout(**changed, dt=DT)
+        with torch.no_grad():  # asked for without a graph on purpose
+            assert not posterior.rollout(**changed, dt=DT).q.requires_grad
+    with pytest.raises(InvalidInput, match="grad is a str; give a bool"):
+        posterior.rollout(**arguments, dt=DT, grad="yes")
+
+
+def test_a_body_without_actuators_moves_too():
+    """u has no columns; the first step is that of `predict`, and samples are many motions."""
+    model = Model(Robot.from_urdf_text(DRONE, base="floating", locked={"tilt": 0.0}), (), (RigidBodies(),))
+    draw = torch.Generator().manual_seed(0)
+    q, v = model.robot.random(draw, 12), torch.randn(12, 6, generator=draw, dtype=torch.float64)
+    u = torch.zeros(12, 0, dtype=torch.float64)
+    a = model.dynamics(q, v, u).acceleration(-v)
+    rows = {name: x.numpy() for name, x in {"q": q, "v": v, "u": u, "a": a, "time": 0.1 * torch.arange(12)}.items()}
+    body = fit(model.with_forces(BaseWrench(), noise=0.1), Dataset(**rows, model=model), points=12, restarts=1)
+    found = body.rollout(q[:2], v[:2], torch.zeros(2, 3, 0).double(), 0.01, samples=4)
+    expected = v[:2] + 0.01 * body.predict(q[:2], v[:2], u[:2]).mean
+    torch.testing.assert_close(found.v[:, 1], expected, rtol=1e-9, atol=1e-9)
+    assert found.samples.q.shape == (4, 2, 4, 7)

@@ -1,0 +1,287 @@
+"""Fitting and predicting with the structured model."""
+
+import numpy as np
+import pytest
+import torch
+from tests.posterior.arm import NOISE, URDF, arm_data, arm_model
+
+from forcegp.data import Dataset
+from forcegp.errors import ContactError, DataWarning, FitError, InvalidInput
+from forcegp.fit import fit
+from forcegp.forces import JointForces
+from forcegp.inference import OptimizerOptions
+from forcegp.mechanics import Contact, Plane
+from forcegp.model import Model
+from forcegp.noise import Noise
+from forcegp.robots import Robot
+
+QUICK = OptimizerOptions(iterations=40)
+
+
+@pytest.fixture(scope="module")
+def train():
+    return arm_data(60, seed=1)
+
+
+@pytest.fixture(scope="module")
+def test():
+    return arm_data(200, seed=2)
+
+
+@pytest.fixture(scope="module")
+def posterior(train):
+    return fit(train.model.with_forces(JointForces()), train, restarts=1, options=QUICK)
+
+
+def test_learns_the_friction_and_is_calibrated(posterior, test):
+    prediction = posterior.predict(test.q, test.v, test.u)
+    nominal = test.model.dynamics(*map(torch.tensor, (test.q, test.v, test.u))).acceleration_map().offset.numpy()
+    error = np.abs(prediction.mean.numpy() - test.truth["a"]).mean()
+    assert error < 0.1 * np.abs(nominal - test.truth["a"]).mean()
+    inside = np.abs(prediction.mean.numpy() - test.a) < 1.96 * prediction.measurement.std.numpy()
+    assert 0.90 < inside.mean() < 0.99
+
+
+def test_every_prediction_obeys_the_constraint(posterior, test):
+    prediction = posterior.predict(test.q, test.v, test.u)
+    dynamics = test.model.dynamics(*map(torch.tensor, (test.q, test.v, test.u)))
+    violation = (dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b
+    assert float(violation.abs().max()) < 1e-10
+    along_normal = dynamics.A @ prediction.covariance @ dynamics.A.mT
+    assert float(along_normal.abs().max()) < 1e-12
+    assert float(torch.linalg.eigvalsh(prediction.covariance).min()) > -1e-12
+
+
+def test_forces_and_acceleration_belong_together(posterior, test):
+    prediction = posterior.predict(test.q, test.v, test.u)
+    dynamics = test.model.dynamics(*map(torch.tensor, (test.q, test.v, test.u)))
+    Q_U = prediction.unknown_force
+    assert torch.allclose(dynamics.acceleration(Q_U.mean), prediction.mean, atol=1e-10)
+    assert torch.allclose(dynamics.H @ Q_U.covariance @ dynamics.H.mT, prediction.covariance, atol=1e-10)
+    assert torch.allclose(dynamics.multiplier(Q_U.mean), prediction.multiplier.mean, atol=1e-10)
+    normals = dynamics.normals[:, 0]
+    assert torch.allclose(prediction.contact_force.mean, normals * prediction.multiplier.mean, atol=1e-10)
+    # M a = Q_K + Q_U + A^T lambda
+    balance = (
+        (dynamics.M @ prediction.mean[..., None])[..., 0]
+        - dynamics.Q_K
+        - Q_U.mean
+        - (dynamics.A.mT @ prediction.multiplier.mean[..., None])[..., 0]
+    )
+    assert float(balance.abs().max()) < 1e-9
+
+
+def test_equals_dense_gaussian_conditioning(posterior, train, test):
+    """p(a*) from one joint covariance of all training accelerations, written plainly."""
+    model = posterior.likelihood
+    kernels = list(posterior.latent.kernels)
+
+    def parts(data):
+        dynamics = train.model.dynamics(*map(torch.tensor, (data.q, data.v, data.u)))
+        z = torch.cat([torch.tensor(x) for x in (data.q, data.v, data.u)], -1)
+        (scaled, *_) = model.standardization([z] * 3)
+        return dynamics.H, dynamics.acceleration_map().offset, scaled
+
+    H, m, z = parts(train)
+    H_new, m_new, z_new = parts(test.rows(slice(0, 5)))
+    S = torch.zeros(60, 3, 60, 3).double()
+    cross = torch.zeros(5, 3, 60, 3).double()
+    prior = torch.zeros(5, 3, 3).double()
+    for joint, kernel in enumerate(kernels):
+        w, w_new = H[..., joint], H_new[..., joint]
+        S += torch.einsum("id,ij,je->idje", w, kernel(z, z).to_dense(), w)
+        cross += torch.einsum("id,ij,je->idje", w_new, kernel(z_new, z).to_dense(), w)
+        prior += torch.einsum("id,ie->ide", w_new, w_new) * kernel.outputscale
+    S = S.reshape(180, 180) + NOISE**2 * torch.eye(180).double()
+    cross = cross.reshape(5, 3, 180)
+    solved = torch.linalg.solve(S, (torch.tensor(train.a) - m).reshape(-1))
+    mean = m_new + cross @ solved
+    covariance = prior - cross @ torch.linalg.solve(S, cross.mT)
+
+    prediction = posterior.predict(*(x[:5] for x in (test.q, test.v, test.u)))
+    assert torch.allclose(prediction.mean, mean, atol=1e-8)
+    assert torch.allclose(prediction.covariance, posterior.widening**2 * covariance, atol=1e-8)
+
+
+def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
+    states = [torch.tensor(x[:6]) for x in (test.q, test.v, test.u)]
+    flat = posterior.predict(*states)
+    batched = posterior.predict(*(x.reshape(2, 3, 3) for x in states))
+    torch.testing.assert_close(batched.mean.reshape(6, 3), flat.mean, rtol=1e-10, atol=1e-10)
+    assert batched.covariance.shape == (2, 3, 3, 3)
+    assert batched.multiplier.mean.shape == (2, 3, 1)
+    single = posterior.predict(*(x[0] for x in states))
+    assert single.mean.shape == (3,)
+    assert torch.allclose(single.mean, flat.mean[0], atol=1e-12)
+    assert posterior.predict(*(x[:0] for x in states)).mean.shape == (0, 3)
+    monkeypatch.setattr("forcegp.posterior.posterior.ROWS_PER_BLOCK", 4)
+    assert torch.allclose(posterior.predict(*states).covariance, flat.covariance, atol=1e-12)
+    assert posterior.predict(*states, covariance=False).covariance is None
+
+    def mean_of(q, v, u):
+        return posterior.predict(q, v, u, covariance=False).mean
+
+    point = tuple(x[0].requires_grad_() for x in states)
+    assert torch.autograd.gradcheck(mean_of, point, atol=1e-6)
+
+
+def test_zero_mean_carries_the_known_forces_in_the_processes(train, test):
+    zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=QUICK)
+    states = tuple(map(torch.tensor, (test.q, test.v, test.u)))
+    dynamics = test.model.dynamics(*states)
+    prediction = zero.predict(*states)
+    total = prediction.unknown_force.mean
+    assert torch.allclose(dynamics.acceleration_map(known=False)(total), prediction.mean, atol=1e-9)
+    assert float(((dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b).abs().max()) < 1e-9
+
+
+def test_the_noise_is_learned(train):
+    fitted = fit(
+        train.model.with_forces(JointForces(), noise=Noise(0.2, learn=True)),
+        train,
+        options=OptimizerOptions(iterations=80),
+    )
+    assert np.allclose(fitted.noise_std.numpy(), NOISE, rtol=0.5)
+
+
+def test_force_level_noise_widens_along_H(train, test):
+    fitted = fit(
+        train.model.with_forces(JointForces(), noise=Noise(NOISE, 0.3)),
+        train,
+        restarts=1,
+        options=OptimizerOptions(iterations=3),
+    )
+    prediction = fitted.predict(test.q[:4], test.v[:4], test.u[:4])
+    H = test.model.dynamics(*(torch.tensor(x[:4]) for x in (test.q, test.v, test.u))).H
+    expected = NOISE**2 * torch.eye(3).double() + 0.09 * H @ H.mT
+    assert torch.allclose(prediction.noise_covariance, expected, atol=1e-12)
+
+
+def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
+    options = OptimizerOptions(iterations=5)
+    model = train.model.with_forces(JointForces())
+    three = fit(model, train, points=15, restarts=3, seed=7, options=options)
+    again = fit(model, train, points=15, restarts=3, seed=7, jobs=2, options=options)
+    more = fit(model, train, points=15, restarts=4, seed=7, options=options)
+    values = three.settings["restart_objective"]
+    assert len(set(values)) == 3
+    assert three.result.value == min(values)
+    assert np.allclose(again.settings["restart_objective"], values, rtol=1e-9)
+    assert np.allclose(more.settings["restart_objective"][:3], values, rtol=1e-12)
+    other = fit(model, train, points=15, restarts=2, seed=8, options=options)
+    assert other.settings["restart_objective"][0] == pytest.approx(values[0])
+    assert other.settings["restart_objective"][1] != pytest.approx(values[1])
+
+
+def test_the_hyperprior_can_be_left_out(train):
+    model = train.model.with_forces(JointForces())
+    options = OptimizerOptions(iterations=100)
+    plain = fit(model, train, points=20, restarts=4, hyperprior=False, options=options)
+    held = fit(model, train, points=20, restarts=1, options=options)
+    assert plain.result.value == pytest.approx(plain.negative_log_likelihood, abs=1e-6)
+    assert plain.negative_log_likelihood < held.negative_log_likelihood < held.result.value
+    assert plain.result.history[-1] <= plain.result.history[0]
+
+
+def test_nothing_of_the_caller_changes(train):
+    before = {name: getattr(train, name).copy() for name in ("q", "v", "u", "a")}
+    state = torch.get_default_dtype(), torch.get_num_threads()
+    fit(train.model.with_forces(JointForces()), train, points=10, options=OptimizerOptions(iterations=2))
+    assert all(np.array_equal(getattr(train, name), value) for name, value in before.items())
+    assert state == (torch.get_default_dtype(), torch.get_num_threads())
+
+
+def test_works_without_contacts():
+    model = arm_model(contacts=0)
+    train, test = arm_data(50, 3, model), arm_data(50, 4, model)
+    prediction = fit(model.with_forces(JointForces()), train, restarts=1, options=QUICK).predict(test.q, test.v, test.u)
+    assert prediction.multiplier.mean.shape == (50, 0)
+    assert np.abs(prediction.mean.numpy() - test.truth["a"]).mean() < 0.2
+
+
+def test_redundant_contacts_change_nothing(train, test):
+    doubled = train.model.with_contacts(train.model.contacts * 2)
+    options = OptimizerOptions(iterations=5)
+    one = fit(train.model.with_forces(JointForces()), train, points=20, restarts=1, options=options).predict(
+        test.q, test.v, test.u
+    )
+    two = fit(doubled.with_forces(JointForces()), train, points=20, restarts=1, options=options).predict(
+        test.q, test.v, test.u
+    )
+    assert torch.allclose(one.mean, two.mean, atol=1e-6)
+    assert torch.allclose(two.multiplier.mean.sum(-1), one.multiplier.mean[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": 61}, "points=61` must be an integer from 2 to 60, the rows"),
+        ({"points": 1}, "points=1"),
+        ({"restarts": 0}, "restarts=0"),
+        ({"seed": -1}, "seed=-1"),
+    ],
+)
+def test_bad_numbers_are_refused(train, change, message):
+    with pytest.raises(InvalidInput, match=message):
+        fit(train.model.with_forces(JointForces()), train, **change)
+
+
+def test_a_dataset_of_another_robot_is_refused(train):
+    renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
+    with pytest.raises(InvalidInput, match="dataset are pan, lift, bend, those of the robot yaw, lift, bend"):
+        fit(train.model.with_robot(renamed).with_forces(JointForces()), train)
+
+
+def test_contradictory_contacts_are_refused(train):
+    contradiction = Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9))
+    model = Model(train.model.robot, (*train.model.contacts, contradiction), baumgarte=train.model.baumgarte)
+    with pytest.raises(ContactError, match="contradict"):
+        fit(model.with_forces(JointForces()), train)
+
+
+def test_a_surface_that_no_row_touches_is_refused(train):
+    raised = train.model.with_contacts((Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9)),))
+    with pytest.raises(ContactError, match=r"contact 0 \(frame 'hand'\).* 0\.49 m"):
+        fit(raised.with_forces(JointForces()), train, points=10, restarts=1, options=OptimizerOptions(iterations=1))
+
+
+def test_a_surface_that_most_rows_miss_is_pointed_out(train):
+    low = arm_data(20, 5, train.model)
+    high = arm_data(40, 6, arm_model(contacts=0))
+    mixed = {name: np.concatenate([getattr(low, name), getattr(high, name)]) for name in ("q", "v", "u", "a")}
+    data = Dataset(**mixed, time=np.arange(60.0), model=train.model, noise_std=train.noise_std)
+    with pytest.warns(DataWarning, match=r"half of the training points .* rows in contact only"):
+        fit(train.model.with_forces(JointForces()), data, restarts=1, options=OptimizerOptions(iterations=1))
+
+
+def test_parts_of_the_wrong_kind_are_named(train):
+    with pytest.raises(InvalidInput, match="model is a Robot; give a Model"):
+        fit(train.model.robot, train)
+    with pytest.raises(InvalidInput, match="Noise acceleration is 'loud'"):
+        train.model.with_forces(JointForces(), noise="loud")
+    assert train.model.with_forces(JointForces(), noise=0.2).noise == Noise(0.2)
+    assert Noise(np.array([0.1, 0.2])).acceleration == (0.1, 0.2)
+
+
+def test_a_fit_that_cannot_start_names_the_cause(train):
+    broken = train.rows(slice(0, 10))
+    huge = Dataset(
+        **{
+            name: getattr(broken, name)
+            for name in ("q", "v", "u", "time", "joint_names", "units", "model", "noise_std")
+        },
+        a=np.full((10, 3), 1e200),
+    )
+    with pytest.raises(FitError, match="none of 2 restarts"):
+        fit(train.model.with_forces(JointForces()), huge, restarts=2)
+
+
+def test_states_that_make_no_sense_are_refused(posterior, test):
+    with pytest.raises(InvalidInput, match="last dimension must be 3"):
+        posterior.predict(test.q[:, :2], test.v, test.u)
+    with pytest.raises(InvalidInput, match="not finite"):
+        posterior.predict(np.full(3, np.nan), np.zeros(3), np.zeros(3))
+    with pytest.raises(InvalidInput, match="do not broadcast"):
+        posterior.predict(test.q[:2], test.v[:3], test.u[:3])
+    with pytest.raises(InvalidInput, match=r"is not an array of real numbers|must be an array of real numbers"):
+        posterior.predict(["a", "b", "c"], test.v, test.u)

@@ -1,0 +1,358 @@
+"""`posterior.update`: against conditioning on all rows at once, with the standardization of the fit."""
+
+import dataclasses
+import json
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.atomic_files import write_digests
+from forcegp.errors import ContactError, DataWarning, FileFormatError, InvalidInput, NotEnoughMemory
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies
+from forcegp.inference import OptimizerOptions, likelihood
+from forcegp.inference import memory as memory_module
+from forcegp.mechanics import Contact, Plane
+from forcegp.noise import Noise
+from forcegp.posterior import load_posterior, save_posterior
+from forcegp.robots import Robot
+
+QUICK = OptimizerOptions(iterations=8)
+
+
+def learned(data, first=12, model=None, **how):
+    """From the first rows."""
+    model = model or data.model.with_forces(JointForces())
+    return fit(model, data.rows(slice(0, first)), restarts=1, options=QUICK, **how)
+
+
+def at_once(posterior, data):
+    """The posterior of all rows of `data` at the parameters of `posterior`, which was fitted to the first of them."""
+    first = posterior.training
+    whole = type(first).of(data, torch.device("cpu"))
+    whole = dataclasses.replace(whole, reference=first)
+    settings = {"widening": posterior.widening}
+    return posterior.conditioned(posterior.trained, whole, posterior.hyperparameters, posterior.result, settings)
+
+
+def test_rows_that_count_as_one_do_so_after_an_update(tmp_path):
+    data = arm_data(20, 5)
+    few = learned(data)
+    settings = {**few.settings, "correlated_rows": 4.0}
+    alike = few.conditioned(few.trained, few.training, few.hyperparameters, few.result, settings)
+    updated = alike.update(data.rows(slice(12, 20)))
+    whole = dataclasses.replace(type(few.training).of(data, torch.device("cpu")), reference=few.training)
+    assert_same(updated, few.conditioned(few.trained, whole, few.hyperparameters, few.result, settings), data)
+    save_posterior(updated, tmp_path / "run")
+    assert_same(load_posterior(tmp_path / "run"), updated, data)
+
+
+def assert_same(one, other, data, tolerance=1e-8):
+    states = data.q, data.v, data.u
+    mine, theirs = one.predict(*states), other.predict(*states)
+    for name in ("acceleration", "multiplier", "contact_force", "unknown_force", "measurement"):
+        for part in ("mean", "covariance"):
+            ours, expected = (getattr(getattr(p, name), part) for p in (mine, theirs))
+            size = 1.0 + expected.abs().max() if expected.numel() else 1.0
+            torch.testing.assert_close(ours, expected, rtol=0.0, atol=float(tolerance * size), msg=f"{name} {part}")
+
+
+def uneven_noise(data):
+    return dataclasses.replace(data, noise_std=0.05 * np.linspace(0.5, 2.0, data.q.size).reshape(data.q.shape))
+
+
+def on_two_planes(rows, seed):
+    """The arm with its tool in the edge between two planes."""
+    model = arm_model()
+    model = model.with_contacts([*model.contacts, Contact("hand", (0.0, 0.0, 0.2), Plane((1.0, 0.2, 0.0), 0.25))])
+    data = arm_data(rows, seed)
+    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
+    for _ in range(20):
+        dynamics, kinematics = model.dynamics(q, 0.0 * v, u), model.robot.kinematics(q)
+        distance = torch.stack([contact.distance(kinematics) for contact in model.contacts], dim=-1)
+        q = q - (torch.linalg.pinv(dynamics.A) @ distance[..., None])[..., 0]
+    a = model.dynamics(q, v, u).acceleration(-0.8 * torch.tanh(v / 0.4)).numpy()
+    noise = np.random.default_rng(seed).normal(0.0, 0.05, a.shape)
+    return dataclasses.replace(data, q=q.numpy(), a=a + noise, model=model, truth={})
+
+
+MODELS = {
+    "joint forces": lambda model: model.with_forces(JointForces()),
+    "no analytical mean, noise of the forces": lambda model: model.with_forces(
+        JointForces(), noise=Noise(0.05, 0.02, learn=True)
+    ).without_mean(),
+    "friction under load and in the joints": lambda model: model.with_forces(
+        ContactFriction(load=True), JointFriction()
+    ),
+    "no unknown force": lambda model: model,
+}
+
+
+@pytest.mark.filterwarnings("ignore::forcegp.errors.NumericalWarning", "ignore::forcegp.errors.DataWarning")
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+def test_updates_are_conditioning_on_all_rows(make):
+    data, test = uneven_noise(arm_data(20, seed=1)), arm_data(5, seed=2)
+    posterior = learned(data, model=make(data.model))
+    grown = posterior.update(data.rows([12])).update(data.rows(slice(13, 20)))
+    expected = at_once(posterior, data)
+    assert_same(grown, expected, test)
+    assert grown.negative_log_likelihood == pytest.approx(expected.negative_log_likelihood, rel=1e-9)
+    for mine, theirs in zip(
+        grown.likelihood.standardization.shift, posterior.likelihood.standardization.shift, strict=True
+    ):
+        assert torch.equal(mine, theirs)
+    assert grown.settings["points"] == len(grown.training.q) == 20
+    assert grown.settings["rows_added"] == 8
+
+
+def test_what_is_kept_of_the_fit_are_its_numbers_by_the_parameters_own_meaning():
+    """Against the likelihood itself: W, residual and noise of all rows, features by hand from the first ones."""
+    data = uneven_noise(arm_data(18, seed=3))
+    posterior = learned(data)
+    grown = posterior.update(data.rows(slice(12, 18)))
+    features, W, residual, noise = grown.likelihood.terms(posterior.hyperparameters)
+    raw = np.hstack([data.q, data.v, data.u])
+    shift, scale = posterior.likelihood.standardization.shift[0], posterior.likelihood.standardization.scale[0]
+    torch.testing.assert_close(features[0], (torch.tensor(raw) - shift) / scale)
+    level = posterior.hyperparameters["noise.log_acceleration"].exp()
+    factor = torch.tensor(data.noise_std / np.sqrt((data.noise_std[:12] ** 2).mean(0)))
+    torch.testing.assert_close(noise, (level * factor).square())
+    dynamics = data.model.dynamics(*map(torch.tensor, (data.q, data.v, data.u)))
+    torch.testing.assert_close(W, dynamics.H)
+    matrices = posterior.kernels.matrices(posterior.hyperparameters, features)
+    with torch.no_grad():
+        expected = float(likelihood.negative_log_likelihood(W, residual, noise, matrices))
+    assert grown.negative_log_likelihood == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
+def test_bodies_that_were_estimated():
+    data = arm_data(26, seed=4)
+    posterior = learned(data, 20, data.model.with_forces(RigidBodies(learn=("hand",)), JointForces()))
+    grown = posterior.update(data.rows(slice(20, 26)))
+    assert_same(grown, at_once(posterior, data), data)
+    assert grown.estimates is posterior.estimates
+
+
+def test_two_contacts():
+    data = on_two_planes(16, seed=5)
+    posterior = learned(data)
+    grown = posterior.update(data.rows(slice(12, 16)))
+    assert grown.latent.system.deflation.rank == 1
+    assert_same(grown, at_once(posterior, data), data)
+
+
+def test_the_order_of_updates_does_not_matter_and_variances_never_grow():
+    data, test = arm_data(24, seed=6), arm_data(30, seed=7)
+    posterior = learned(data)
+    parts = [data.rows(slice(12, 17)), data.rows(slice(17, 24))]
+    forth, back = posterior.update(parts[0]).update(parts[1]), posterior.update(parts[1]).update(parts[0])
+    assert_same(forth, back, test)
+    before, between, after = (
+        p.predict(test.q, test.v, test.u).covariance for p in (posterior, posterior.update(parts[0]), forth)
+    )
+    assert torch.linalg.eigvalsh(before - between).min() > -1e-10
+    assert torch.linalg.eigvalsh(between - after).min() > -1e-10
+
+
+def test_the_old_posterior_predicts_as_before():
+    data, test = arm_data(20, seed=8), arm_data(5, seed=9)
+    posterior = learned(data)
+    before = posterior.predict(test.q, test.v, test.u)
+    posterior.update(data.rows(slice(12, 20)))
+    posterior.update(data.rows(slice(12, 20)), budget=6)
+    after = posterior.predict(test.q, test.v, test.u)
+    assert torch.equal(before.mean, after.mean)
+    assert torch.equal(before.covariance, after.covariance)
+    assert len(posterior.training.q) == 12
+    assert posterior.training.reference is None
+
+
+@pytest.mark.parametrize("budget", [8, 12, 15])
+def test_a_budget_is_kept_and_the_result_is_that_of_the_rows_kept(budget):
+    data, test = uneven_noise(arm_data(30, seed=10)), arm_data(5, seed=11)
+    posterior = learned(data)
+    grown = posterior.update(data.rows(slice(12, 25)), budget=budget).update(data.rows(slice(25, 30)), budget=budget)
+    assert grown.settings["points"] == len(grown.training.q) == budget
+    rows = [int(np.argmin(np.abs(data.q - q).sum(1))) for q in grown.training.q.numpy()]
+    assert len(set(rows)) == budget
+    torch.testing.assert_close(grown.training.a, torch.tensor(data.a[rows]))
+    assert_same(grown, at_once(posterior, data.rows(rows)), test)
+
+
+def test_another_rule_for_the_rows_that_stay():
+    data = arm_data(20, seed=12)
+    posterior = learned(data)
+    newest = posterior.update(
+        data.rows(slice(12, 20)), 6, keep=lambda latent, budget: torch.arange(len(latent.system.alpha))[-budget:]
+    )
+    assert torch.equal(newest.training.q, torch.tensor(data.q[-6:]))
+
+
+def test_everything_else_works_after_an_update(tmp_path):
+    data = arm_data(20, seed=13)
+    posterior = learned(data, model=data.model.with_forces(JointFriction()))
+    grown = posterior.update(data.rows(slice(12, 20)), budget=16)
+    moved = grown.with_contacts([])
+    assert_same(moved, at_once(posterior, _rows_of(grown, data)).with_contacts([]), data)
+    assert grown.leave_out().rows.tolist() == list(range(16))
+    name = grown.latent_names[0]
+    torch.testing.assert_close(
+        grown.curve(name, [0.1, 0.2]).mean, at_once(posterior, _rows_of(grown, data)).curve(name, [0.1, 0.2]).mean
+    )
+    motion = grown.rollout(data.q[0], data.v[0], np.zeros((3, 3)), 0.001, samples=2)
+    assert bool(torch.isfinite(motion.q).all())
+
+
+def _rows_of(posterior, data):
+    rows = [int(np.argmin(np.abs(data.q - q).sum(1))) for q in posterior.training.q.numpy()]
+    return data.rows(rows)
+
+
+# ---------------------------------------------------------------- on disk
+
+
+@pytest.mark.filterwarnings("ignore::forcegp.errors.NumericalWarning", "ignore::forcegp.errors.DataWarning")
+@pytest.mark.parametrize("prior", [JointForces(), ContactFriction(load=True)], ids=["joint forces", "load friction"])
+def test_what_comes_back_from_disk_predicts_the_same(tmp_path, prior):
+    data = uneven_noise(arm_data(20, seed=14))
+    grown = learned(data, model=data.model.with_forces(prior)).update(data.rows(slice(12, 20)), budget=10)
+    save_posterior(grown, tmp_path / "run")
+    loaded = load_posterior(tmp_path / "run")
+    assert_same(loaded, grown, data)
+    assert loaded.update(data.rows([11])).settings["rows_added"] == 9
+    assert_same(loaded.update(data.rows([11])), grown.update(data.rows([11])), data)
+    save_posterior(grown.with_contacts([]), tmp_path / "free")
+    assert_same(load_posterior(tmp_path / "free"), grown.with_contacts([]), data)
+
+
+def test_only_updated_models_declare_rows_of_reference(tmp_path):
+    data = arm_data(14, seed=15)
+    posterior = learned(data)
+    for name, saved, features in (("old", posterior, []), ("new", posterior.update(data.rows([12])), ["reference"])):
+        save_posterior(saved, tmp_path / name)
+        assert json.loads((tmp_path / name / "model.json").read_text())["features"] == features
+    assert not any(key.startswith("reference.") for key in load_file(tmp_path / "old" / "tensors.safetensors"))
+    (tmp_path / "old" / "model.json").write_bytes((tmp_path / "new" / "model.json").read_bytes())
+    write_digests(tmp_path / "old")
+    with pytest.raises(FileFormatError, match=r"reference\.q"):
+        load_posterior(tmp_path / "old")
+
+
+# ---------------------------------------------------------------- errors
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    return learned(arm_data(12, seed=16))
+
+
+@pytest.mark.parametrize("budget", [1, 0, -3, True])
+def test_budgets_that_mean_nothing_are_refused(posterior, budget):
+    with pytest.raises(InvalidInput, match="must be an integer of at least 2"):
+        posterior.update(arm_data(2, seed=17), budget)
+
+
+def test_other_joints_are_refused(posterior):
+    text = posterior.model.robot.urdf_text.replace('"pan"', '"swing"')
+    other = arm_data(3, seed=17, model=posterior.model.with_robot(Robot.from_urdf_text(text)))
+    with pytest.raises(InvalidInput, match="the joints of rows are swing, lift, bend"):
+        posterior.update(other)
+
+
+def test_rows_away_from_the_surface_are_refused(posterior):
+    rows = arm_data(3, seed=17)
+    away = dataclasses.replace(rows, q=rows.q - [0.0, 0.5, 0.0], truth={})
+    with pytest.raises(ContactError, match="no training point touches"):
+        posterior.update(away)
+
+
+def test_noise_of_every_row_must_be_stated_for_all_or_none(posterior):
+    with pytest.raises(InvalidInput, match="for all rows or for none"):
+        posterior.update(uneven_noise(arm_data(3, seed=17)))
+    data = uneven_noise(arm_data(16, seed=18))
+    uneven = learned(data)
+    silent = dataclasses.replace(data.rows(slice(12, 16)), noise_std=None)
+    with pytest.raises(InvalidInput, match="for all rows or for none"):
+        uneven.update(silent)
+    one_for_all = dataclasses.replace(silent, noise_std=np.full(3, 0.05))
+    every_row = dataclasses.replace(silent, noise_std=np.full((4, 3), 0.05))
+    assert_same(uneven.update(one_for_all), uneven.update(every_row), data)
+
+
+def stating(data, noise_std):
+    return dataclasses.replace(data, noise_std=noise_std)
+
+
+def test_rows_that_state_another_noise_than_the_fit_are_warned_of(posterior, tmp_path):
+    rows = arm_data(3, seed=17)
+    other = stating(rows, rows.noise_std * [1.0, 1.0, 2.0])
+    say = r"0.05 \(0.05\), 0.05 \(0.05\), 0.1 \(0.05\).*level of the fit is used.*noise_std of shape \(rows, nv\)"
+    with pytest.warns(DataWarning, match=say):
+        grown = posterior.update(other)
+    assert_same(grown, posterior.update(rows), rows)
+    assert_same(grown, posterior.update(stating(rows, rows.noise_std * 1.09)), rows)  # warnings are errors here
+    save_posterior(posterior, tmp_path / "run")
+    with pytest.warns(DataWarning, match="another noise"):
+        load_posterior(tmp_path / "run").update(other)
+
+
+@pytest.mark.parametrize("noise", [Noise(0.05), Noise(0.05, learn=True), Noise(None, learn=True)], ids=repr)
+def test_a_level_that_was_given_or_learned_is_meant(noise):
+    data = arm_data(15, seed=16)
+    posterior = learned(data, model=data.model.with_forces(JointForces(), noise=noise))
+    rows = data.rows(slice(12, 15))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grown = posterior.update(stating(rows, rows.noise_std * 10.0))
+    assert_same(grown, posterior.update(stating(rows, None)), data)
+
+
+def test_rows_that_state_their_own_noise_are_as_noisy_as_they_say():
+    data = arm_data(16, seed=18)
+    uneven = stating(data, np.tile(data.noise_std, (16, 1)))
+    posterior = learned(uneven)
+    rows = stating(uneven.rows(slice(12, 16)), 10.0 * data.noise_std)
+    noise = posterior.update(rows).likelihood.terms(posterior.hyperparameters).noise
+    torch.testing.assert_close(noise[12:].sqrt(), torch.full((4, 3), 10.0) * torch.tensor(data.noise_std))
+
+
+def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(posterior, monkeypatch):
+    few = arm_data(60, seed=17)
+    again = {name: np.tile(getattr(few, name), (1000, 1)) for name in ("q", "v", "u", "a")}
+    many = dataclasses.replace(few, **again, time=0.01 * np.arange(60_000), episode=np.zeros(60_000, int), truth={})
+    wide = posterior.update(arm_data(28, seed=18))
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 2**30)
+    with pytest.raises(NotEnoughMemory, match=r"12 \+ 60000 rows .*1\.0 GiB .*budget"):
+        posterior.update(many)
+    with pytest.raises(NotEnoughMemory, match=r"budget=40000 .*smaller budget"):
+        posterior.update(many, budget=40_000)
+    monkeypatch.setattr(memory_module, "free_memory", lambda device: 40_000)
+    with pytest.raises(NotEnoughMemory, match="give a budget"):
+        posterior.update(few)
+    assert posterior.update(few, budget=12).settings["points"] == 12
+    with pytest.raises(NotEnoughMemory, match=r"smaller budget.*\(it has 40\)"):
+        wide.update(few, budget=12)
+
+
+def test_a_posterior_that_was_carried_elsewhere_is_updated_before(posterior):
+    with pytest.raises(InvalidInput, match="before it is carried there"):
+        posterior.with_contacts([]).update(arm_data(3, seed=17))
+
+
+def test_posteriors_that_are_not_exact_say_what_to_do():
+    data = arm_data(20, seed=20)
+    posterior = fit(data.model.with_forces(JointForces()), data, restarts=1, options=QUICK, engine="inducing")
+    with pytest.raises(InvalidInput, match="engine='exact'"):
+        posterior.update(data)
+
+
+def test_models_that_would_have_to_be_trained_again_say_so():
+    data = arm_data(12, seed=19)
+    trained = fit(data.model.black_box(), data, restarts=1, options=QUICK)
+    with pytest.raises(InvalidInput, match="fit it again to all rows"):
+        trained.update(data)

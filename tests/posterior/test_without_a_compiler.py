@@ -1,0 +1,99 @@
+"""Predictors where nothing can be compiled: torch computes the same, and one warning says so."""
+
+import pickle
+import shutil
+import warnings
+
+import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp.errors import NumericalWarning
+from forcegp.fit import fit
+from forcegp.forces import JointForces, JointFriction
+from forcegp.inference import OptimizerOptions
+from forcegp.posterior import StructuredPosterior
+
+SLOWER = "predictions are computed by torch, some hundred times slower: "
+
+
+@pytest.fixture(scope="module")
+def posterior() -> StructuredPosterior:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
+        return fit(arm_model().with_forces(JointFriction(), JointForces()), arm_data(20, 0), **options)
+
+
+@pytest.fixture
+def states() -> list[torch.Tensor]:
+    data = arm_data(4, 1)
+    return [torch.tensor(x) for x in (data.q, data.v, data.u)]
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def test_everything_is_the_same_after_one_warning(posterior, states, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.warns(NumericalWarning, match=SLOWER + ".*no-such-compiler.*give compile=False") as given:
+        predictor = posterior.predictor()
+    assert len(given) == 1
+    assert "\n" not in str(given[0].message)
+    eager = posterior.predictor(compile=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for at in (states, [x[0] for x in states]):
+            for name, more in (("mean", ()), ("__call__", ()), ("linearize", ()), ("step", (0.01,))):
+                found, expected = (getattr(of, name)(*at, *more) for of in (predictor, eager))
+                assert type(found) is type(expected)
+                torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+        u = states[2][:, None].repeat(1, 5, 1)
+        for functions in (0, 2):
+            motions = [of.rollouts(*states[:2], u, 0.01, functions=functions) for of in (predictor, eager)]
+            torch.testing.assert_close(motions[0], motions[1])
+    torch.testing.assert_close(predictor.mean(*states), posterior.predict(*states).mean)
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+def test_what_was_compiled_stays_and_what_cannot_be_is_done_by_torch(posterior, states, monkeypatch, tmp_path):
+    predictor = posterior.predictor(covariance="none")
+    expected = predictor.mean(*states)
+    hangs = tmp_path / "hangs"
+    hangs.write_text("#!/bin/sh\necho >> $0.called\nexec sleep 60\n")
+    hangs.chmod(0o700)
+    monkeypatch.setenv("CC", str(hangs))
+    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
+    with pytest.warns(NumericalWarning, match=SLOWER + ".*did not end within"):
+        linear = predictor.linearize(*states)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        predictor.rollouts(*states[:2], states[2][:, None], 0.01)
+        assert torch.equal(predictor.mean(*states), expected)
+        q = states[0].clone().requires_grad_()
+        predictor.mean(q, *states[1:]).sum().backward()
+    torch.testing.assert_close(q.grad, linear.da_dq.sum(1))
+    assert (tmp_path / "hangs.called").read_text().count("\n") == 1  # it is not waited for again
+    torch.testing.assert_close(linear, posterior.predictor(covariance="none", compile=False).linearize(*states))
+
+
+def test_a_cache_that_others_may_write_to_is_not_used(posterior, states, tmp_path):
+    folder = tmp_path / "cache" / "forcegp" / "compiled"
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    with pytest.warns(NumericalWarning, match=SLOWER + ".*compiled can be written to by others.*chmod go-w"):
+        predictor = posterior.predictor(covariance="none")
+    assert list(folder.iterdir()) == []
+    torch.testing.assert_close(predictor.mean(*states), posterior.predict(*states).mean)
+
+
+def test_a_predictor_sent_to_a_process_without_compiler_works_there(posterior, states, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    predictor = posterior.predictor(covariance="none", compile=False)
+    with pytest.warns(NumericalWarning, match=SLOWER):
+        sent = pickle.loads(pickle.dumps(posterior.predictor(covariance="none")))
+    with pytest.warns(NumericalWarning, match=SLOWER):
+        found = sent.mean(*states)
+    torch.testing.assert_close(found, predictor.mean(*states))
