@@ -33,32 +33,33 @@ def prepared() -> tuple[dict[str, Callable[[], object]], list[float]]:
     """What is timed, and what the fit found: equal results are a condition of a fair comparison."""
     import torch
 
-    from forcegp import JointFriction, StructuredGP
+    from forcegp import JointFriction
+    from forcegp.fit import fit
+    from forcegp.fit.objective import FitObjective
     from forcegp.inference import OptimizerOptions
-    from forcegp.models.structured.search import FitObjective
     from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
     torch.set_num_threads(1)
     data = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=10.0, seed=1))
-    system = data.system
-    assert system is not None, "simulated data have one"
-    model = StructuredGP(system, JointFriction())
-    posterior = model.fit(data, points=60, restarts=1)
+    model = data.model
+    assert model is not None, "simulated data have one"
+    model = model.with_forces(JointFriction())
+    posterior = fit(model, data, points=60, restarts=1)
     fixed = posterior.model.split_noise[1]
     objective = FitObjective(posterior.likelihood, posterior.kernels, posterior.model.known_noise, fixed, True)
-    free = {name: x.clone().requires_grad_() for name, x in posterior.parameters.items() if name not in fixed}
-    predictor, compiled = posterior.predictor(), system.robot.compile()
+    free = {name: x.clone().requires_grad_() for name, x in posterior.hyperparameters.items() if name not in fixed}
+    predictor, compiled = posterior.predictor(), model.robot.compile()
     q, v, u = (torch.tensor(x[:1000]) for x in (data.q, data.v, data.u))
     one, arrays, rest = (q[0], v[0], u[0]), (data.q[0], data.v[0], data.u[0]), torch.zeros_like(v)
     short = OptimizerOptions(iterations=1)
     jobs: dict[str, Callable[[], object]] = {
-        "fit, 60 rows": lambda: model.fit(data, points=60, restarts=1),
-        "fit without its search": lambda: model.fit(data, points=60, restarts=1, options=short),
+        "fit, 60 rows": lambda: fit(model, data, points=60, restarts=1),
+        "fit without its search": lambda: fit(model, data, points=60, restarts=1, options=short),
         "objective and gradient": lambda: [torch.autograd.grad(objective(free), [*free.values()]) for _ in range(10)],
         "predict, 1,000 rows": lambda: posterior.predict(q, v, u),
         "predict, one row": lambda: [posterior.predict(*one) for _ in range(40)],
-        "dynamics, 1,000 rows": lambda: [system.dynamics(q, v, u).acceleration(rest) for _ in range(40)],
-        "dynamics, one row": lambda: [system.dynamics(*one).acceleration(rest[0]) for _ in range(400)],
+        "dynamics, 1,000 rows": lambda: [model.dynamics(q, v, u).acceleration(rest) for _ in range(40)],
+        "dynamics, one row": lambda: [model.dynamics(*one).acceleration(rest[0]) for _ in range(400)],
         "predictor, one row of tensors": lambda: [predictor(*one) for _ in range(4000)],
         "predictor, one row of arrays": lambda: [predictor(*arrays) for _ in range(2000)],
         "compiled dynamics, one row": lambda: [compiled.forward_dynamics(*one) for _ in range(4000)],

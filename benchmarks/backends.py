@@ -14,8 +14,9 @@ import time
 
 import torch
 
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
-from forcegp.models import StructuredGP
 from forcegp.parallel import Backend, Joblib, Serial
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -29,14 +30,14 @@ OPTIONS = OptimizerOptions(iterations=20)
 def run() -> dict[str, float]:
     """Measure and print; returns the keys of results.json that this question answers."""
     train = simulate_kuka_surface(KukaSurfaceConfig(seconds=20.0, seed=11))
-    model = StructuredGP(train.system)
+    model = train.model.with_forces(JointForces())
     backends = {"serial": Serial(), "joblib": Joblib(PROCESSES)}
     found: dict[str, dict[str, torch.Tensor]] = {}
 
     def seconds(name: str, backend: Backend) -> float:
         start = time.perf_counter()
-        posterior = model.fit(train, points=POINTS, restarts=RESTARTS, options=OPTIONS, backend=backend)
-        found[name] = dict(posterior.parameters)
+        posterior = fit(model, train, points=POINTS, restarts=RESTARTS, options=OPTIONS, backend=backend)
+        found[name] = dict(posterior.hyperparameters)
         return time.perf_counter() - start
 
     cold = {name: seconds(name, backend) for name, backend in backends.items() if name != "serial"}

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from benchmarks.tracking import CONFIG, FINE, GAINS, RATE, Reference, excitation, fits, followed, robot_of, rows_of
-from forcegp import ContactMonitor, MechanicalSystem, PDGravity, Robot, ViscousJointFriction
+from forcegp import ContactMonitor, Model, PDGravity, Robot, Viscous
 from forcegp.control.monitor import ContactState
-from forcegp.mechanics import StribeckJointFriction
+from forcegp.forces import Stribeck
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -30,7 +30,7 @@ NOISE_V, NOISE_U = 0.002, 0.05
 
 def moved(robot: Robot, seed: int, seconds: float, newton: float = 0.0) -> dict[str, np.ndarray]:
     """q, v, u (T, 7) as measured, and the joint torques of the pushes."""
-    plant, law, reference = robot.compile(), JointFrictionLaw(CONFIG), Reference.random(seed, 0.4, 3.5)
+    plant, law, reference = robot.compile(), JointFrictionLaw(CONFIG, robot), Reference.random(seed, 0.4, 3.5)
     control, rng = PDGravity(plant, **GAINS), np.random.default_rng(seed)
     (q, v, _), rows, push = reference(0.0), [], np.zeros(7)
     for k in range(round(seconds * RATE)):
@@ -61,12 +61,13 @@ def qvu(motion: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return motion["q"], motion["v"], motion["u"]
 
 
-def true_system(robot: Robot) -> MechanicalSystem:
+def true_system(robot: Robot) -> Model:
     """With the friction of the simulation."""
-    dry = (CONFIG.joint_coulomb, CONFIG.joint_static, CONFIG.joint_stribeck_velocity, CONFIG.joint_smoothing)
-    plain = MechanicalSystem(robot)
-    known = (*plain.known_forces, ViscousJointFriction(CONFIG.joint_viscous), StribeckJointFriction(*dry))
-    return MechanicalSystem(robot, known_forces=known)
+    more = tuple(np.subtract(CONFIG.joint_static, CONFIG.joint_coulomb))
+    dry = (CONFIG.joint_coulomb, more, CONFIG.joint_breakaway_velocity, CONFIG.joint_smoothing)
+    plain = Model(robot)
+    known = (*plain.forces, Viscous(CONFIG.joint_viscous), Stribeck(*dry))
+    return Model(robot, forces=known)
 
 
 def scores(state: ContactState, motion: dict[str, np.ndarray]) -> tuple[float, float]:
@@ -91,7 +92,7 @@ def recordings(seed: int) -> dict[str, dict[str, np.ndarray]]:
 def monitors(seed: int, calibration: dict[str, np.ndarray]) -> dict[str, ContactMonitor]:
     """Name -> monitor, calibrated."""
     robot = robot_of()
-    given = MechanicalSystem(robot)
+    given = Model(robot)
     motion = followed(robot, excitation(seed), PDGravity(robot.compile(), **GAINS), 20.0)
     models = {name: fit.predictor() for name, fit in fits(rows_of(motion, given, seed), given, seed).items()}
     made = {name: (model, None) for name, model in models.items()} | {"true model": (true_system(robot), None)}

@@ -32,7 +32,7 @@ from benchmarks.tracking import (
     rows_of,
     task_of,
 )
-from forcegp import MechanicalSystem, PDGravity, Robot
+from forcegp import Model, PDGravity, Robot
 from forcegp.evaluation import contacts_figure, excitation_figure
 from forcegp.evaluation.plots.style import (
     IDENTIFIED,
@@ -48,7 +48,7 @@ from forcegp.evaluation.plots.style import (
     quiet,
     save_figure,
 )
-from forcegp.models import StructuredPosterior
+from forcegp.posterior import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
@@ -66,7 +66,7 @@ COLORS = {
 def motions() -> tuple[Robot, StructuredPosterior, dict[str, dict[str, np.ndarray]]]:
     """The arm, the model that learned, and controller -> what the arm did."""
     robot = robot_of()
-    given, task = MechanicalSystem(robot), task_of(SEED)
+    given, task = Model(robot), task_of(SEED)
     rows = rows_of(followed(robot, excitation(SEED), PDGravity(robot.compile(), **GAINS), 20.0), given, SEED)
     found = controllers(rows, given, robot, SEED)
     done = {name: followed(robot, task, control, SECONDS) for name, control in found.items()}
@@ -189,7 +189,9 @@ def draw_friction(
     mean, half = curve.mean.numpy(), QUANTILE * curve.std.numpy()
     law = np.zeros((len(v), robot.nv))
     law[:, joint] = v
-    axes.plot(v, JointFrictionLaw(CONFIG).curve(law)[:, joint], color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
+    axes.plot(
+        v, JointFrictionLaw(CONFIG, robot).curve(law)[:, joint], color=TRUTH, linewidth=3.5, alpha=0.3, label="true"
+    )
     draw_band(axes, v, mean, half, alpha=0.4, label="95 % interval")
     axes.plot(v, mean, color=PREDICTION, linewidth=1.2, label="learned friction (green on the arm)")
     (dot,) = axes.plot(velocity[:1], now[:1], "o", color=IDENTIFIED, markersize=6.0, zorder=5)

@@ -43,9 +43,9 @@ from benchmarks.tracking import (
     robot_of,
     task_of,
 )
-from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, MechanicalSystem, PDGravity, StructuredGP
+from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, Model, PDGravity, fit
 from forcegp.data import farthest_rows
-from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.posterior.structured import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SECONDS, LOST = 600, 0.3
@@ -60,7 +60,7 @@ class Plant:
 
     def __init__(self) -> None:
         self.robot = robot_of()
-        self.arm, self.law, self.system = self.robot.compile(), JointFrictionLaw(CONFIG), MechanicalSystem(self.robot)
+        self.arm, self.law, self.model = self.robot.compile(), JointFrictionLaw(CONFIG, self.robot), Model(self.robot)
 
     @staticmethod
     def share(t: float) -> float:
@@ -91,7 +91,7 @@ class Plant:
         a = np.diff(v, axis=0) * RATE + NOISE * generator.standard_normal(u.shape)
         middle = [0.5 * (x[1:] + x[:-1]) for x in (q, v)]
         return Dataset(
-            q=middle[0], v=middle[1], u=u, a=a, time=begin + np.arange(len(u)) / RATE, system=self.system,
+            q=middle[0], v=middle[1], u=u, a=a, time=begin + np.arange(len(u)) / RATE, model=self.model,
             noise_std=np.full(7, NOISE),
         )  # fmt: skip
 
@@ -110,17 +110,17 @@ def first_model(plant: Plant, seed: int) -> tuple[StructuredPosterior, Structure
     """Of all rows of a motion by inducing points, and of 100 of them, exact."""
     motion = followed(plant.robot, excitation(seed), PDGravity(plant.arm, **GAINS), 20.0)
     log = plant.rows(motion["q"], motion["v"], motion["u"][:-1], -100.0, seed)
-    return fitted(log, seed), StructuredGP(plant.system, JointFriction()).fit(farthest_rows(log, 100), restarts=1)
+    return fitted(log, seed), fit(plant.model.with_forces(JointFriction()), farthest_rows(log, 100), restarts=1)
 
 
 def fitted(log: Dataset, seed: int) -> StructuredPosterior:
-    model = StructuredGP(log.system, JointFriction())
-    return model.fit(log, points=len(log), learning_points=100, engine=ENGINE, restarts=1, seed=seed)
+    model = log.model.with_forces(JointFriction())
+    return fit(model, log, points=len(log), learning_points=100, engine=ENGINE, restarts=1, seed=seed)
 
 
 def merged(parts: list[Dataset]) -> Dataset:
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("q", "v", "u", "a", "time")}
-    return Dataset(**arrays, system=parts[0].system, noise_std=parts[0].noise_std)
+    return Dataset(**arrays, model=parts[0].model, noise_std=parts[0].noise_std)
 
 
 def drifted(seed: int, seconds: int = SECONDS, horizons: tuple[float, ...] = ()) -> dict[str, tuple[float, ...]]:

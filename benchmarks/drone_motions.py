@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from forcegp import AerodynamicForce, Dataset, StructuredGP
+from forcegp import AerodynamicForce, Dataset, fit
 from forcegp.data import recorded_motions
 from forcegp.data.delay import lagged
-from forcegp.models import Posterior, observing
+from forcegp.posterior import Posterior, observing
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0)
@@ -51,7 +51,7 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     train = flight(1, 4.0)
-    fitted = StructuredGP(train.system, AerodynamicForce()).fit(train, points=options.points, restarts=1)
+    fitted = fit(train.model.with_forces(AerodynamicForce()), train, points=options.points, restarts=1)
     models = {"calibrated": fitted.calibrated_on_motions(train)}
     if options.refine:
         models["refined"] = fitted.refined_on_motions(train, 1.0)

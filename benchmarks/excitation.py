@@ -38,7 +38,7 @@ from benchmarks.tracking import (
     rows_of,
     task_of,
 )
-from forcegp import ComputedTorque, Dataset, JointFriction, MechanicalSystem, PDGravity, StructuredGP, excitation
+from forcegp import ComputedTorque, Dataset, JointFriction, Model, PDGravity, excitation, fit
 from forcegp.control.informative_motions import Excitation, LearnedForces, Motion
 from forcegp.errors import ContactWarning
 from forcegp.simulation.joint_friction import JointFrictionLaw
@@ -52,13 +52,13 @@ def joined(*parts: Dataset) -> Dataset:
     """The rows of several Datasets of one robot."""
     q, v, u, a = (np.vstack([getattr(part, name) for part in parts]) for name in "qvua")
     count = np.arange(len(q)) / RATE
-    return Dataset(q=q, v=v, u=u, a=a, time=count, system=parts[0].system, noise_std=np.full(7, NOISE))
+    return Dataset(q=q, v=v, u=u, a=a, time=count, model=parts[0].model, noise_std=np.full(7, NOISE))
 
 
 def fitted(rows: Dataset):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactWarning)  # of a motion so small that the tool seems to stay on a sphere
-        return StructuredGP(rows.system, JointFriction()).fit(rows, restarts=1, seed=0)
+        return fit(rows.model.with_forces(JointFriction()), rows, restarts=1, seed=0)
 
 
 class Sampled:
@@ -92,7 +92,7 @@ class Learner:
 
     def __init__(self, seed: int) -> None:
         self.seed, self.robot = seed, robot_of()
-        self.given, self.law = MechanicalSystem(self.robot), JointFrictionLaw(CONFIG)
+        self.given, self.law = Model(self.robot), JointFrictionLaw(CONFIG, self.robot)
         pd = PDGravity(self.robot.compile(), **GAINS)
         slow = followed(self.robot, Reference.random(seed + 300, 0.1, 1.5), pd, SECONDS)
         self.rows = rows_of(slow, self.given, seed, FEW)

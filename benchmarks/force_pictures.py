@@ -1,7 +1,7 @@
 """The pictures of docs/how-to/forces.md: what every prior learns from few points, beside the truth.
 
 python -m benchmarks.force_pictures                          all of them, into docs/how-to/forces
-python -m benchmarks.force_pictures payload joint-ripple     these
+python -m benchmarks.force_pictures joint-forces joint-ripple     these
 python -m benchmarks.force_pictures --out elsewhere
 
 The KUKA of `forcegp simulate kuka-surface`. Where that scenario has no such force, the states of a recording keep their
@@ -18,20 +18,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from threadpoolctl import threadpool_limits
 
 from benchmarks.force_recordings import (
     F64,
-    TOOL,
     Law,
     across_the_strip,
     fitted,
-    mass_and_place,
     plane_of,
     recording,
     roughness,
-    slow_motions,
     turntable,
     visited,
     with_force,
@@ -42,8 +38,6 @@ from forcegp import (
     JointForces,
     JointFriction,
     KukaSurfaceConfig,
-    NoForces,
-    Payload,
     PeriodicJointForces,
     ToolForces,
 )
@@ -58,7 +52,7 @@ from forcegp.evaluation.plots.style import (
     quiet,
     window,
 )
-from forcegp.priors.contact_friction import ExpectedFriction
+from forcegp.forces.contact_friction import ExpectedFriction
 
 BAND = 1.959963984540054
 
@@ -177,7 +171,7 @@ def contact_friction() -> Any:
     low, high = config.coulomb_coefficient, config.static_coefficient
 
     def coefficient(v: torch.Tensor) -> torch.Tensor:
-        level = low + (high - low) * torch.exp(-((v / config.stribeck_velocity) ** 2))
+        level = low + (high - low) * torch.exp(-((v / config.breakaway_velocity) ** 2))
         return level * v / torch.sqrt(v**2 + config.friction_smoothing**2)
 
     nominal = fitted(data, ContactFriction(load=True, expected=ExpectedFriction.of(0.0)), 60).curve("sliding")
@@ -211,40 +205,6 @@ def joint_ripple() -> Any:
     return finish(figure, *grid)
 
 
-def payload() -> Any:
-    """Mass and place of a body that the model does not know, from slow motions in which its inertia acts, too."""
-    mass, place = 1.5, torch.tensor([0.04, -0.02, 0.10], dtype=F64)
-    data = slow_motions(mass, place)
-    counts = [3, 5, 10, 20, 50, 100]
-    found = [mass_and_place(fitted(data, Payload(TOOL), count)) for count in counts]
-    figure = new_figure(10.0, 3.2)
-    left, right = figure.subplots(1, 2)
-    left.axhline(mass, color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
-    style: dict[str, Any] = {"capsize": 3, "linewidth": 1.2, "markersize": 5}
-    left.errorbar(
-        range(len(counts)),
-        [mean[0] for mean, _ in found],
-        [BAND * std[0] for _, std in found],
-        fmt="o",
-        color=PREDICTION,
-        label="learned, 95 % interval",
-        **style,
-    )
-    left.set_xticks(range(len(counts)), [str(count) for count in counts])
-    left.set_ylim(1.4, 1.6)
-    quiet(left, title="mass of the load", x="training points", y="mass [kg]")
-    for axis in range(3):
-        right.plot([-0.3 + axis, 0.3 + axis], [100.0 * place[axis]] * 2, color=TRUTH, linewidth=3.5, alpha=0.3)
-    for number, (mean, std) in enumerate(found[:4]):
-        at = np.arange(3) + 0.14 * (number - 1.5)
-        label = f"{counts[number]} points"
-        color = colormaps["viridis"](0.88 * number / 3)  # its yellow end vanishes on white
-        right.errorbar(at, 100.0 * mean[1:], 100.0 * BAND * std[1:], fmt="o", color=color, label=label, **style)
-    right.set_xticks(range(3), ["x", "y", "z"])
-    quiet(right, title="its centre of mass in the axes of link 7", x="axis", y="position [cm]")
-    return finish(figure, left, right)
-
-
 def joint_accelerations() -> Any:
     """Two joints over the same seconds as in the picture of `no_forces`."""
     test = window(recording(2), 4.0, 2.5)
@@ -263,7 +223,7 @@ def joint_accelerations() -> Any:
 def no_forces() -> Any:
     """What known physics leaves unexplained."""
     test = window(recording(2), 4.0, 2.5)
-    predicted = fitted(recording(1), NoForces(), 100).predict(test.q, test.v, test.u).mean.numpy()
+    predicted = fitted(recording(1), (), 100).predict(test.q, test.v, test.u).mean.numpy()
     figure = new_figure(10.0, 3.2)
     grid = figure.subplots(1, 2)
     seconds = test.time - test.time[0]
@@ -320,7 +280,6 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "contact-friction": contact_friction,
     "friction-map": friction_map,
     "joint-ripple": joint_ripple,
-    "payload": payload,
     "joint-accelerations": joint_accelerations,
     "no-forces": no_forces,
     "friction-curves": friction_curves,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from forcegp import Dataset, KukaSurfaceConfig, MechanicalSystem, Robot, StructuredGP, simulate_kuka_surface
+from forcegp import Dataset, KukaSurfaceConfig, Model, Robot, fit, simulate_kuka_surface
+from forcegp.forces import Unknown
 from forcegp.mechanics import surface_axes
-from forcegp.priors import ForcePrior
 from forcegp.robots import parameters_from_physical
 
 NOISE = 0.1
@@ -29,19 +29,20 @@ def recording(seed: int, **options: Any) -> Dataset:
     return simulate_kuka_surface(KukaSurfaceConfig(seconds=40.0, seed=seed, **options))
 
 
-def with_force(data: Dataset, prior: ForcePrior, *laws: Law, seed: int = 5) -> Dataset:
+def with_force(data: Dataset, prior: Unknown, *laws: Law, seed: int = 5) -> Dataset:
     """The states and torques of `data` with the acceleration under another unknown force, one law per latent."""
-    assert data.system is not None
+    assert data.model is not None
     q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
-    dynamics = data.system.dynamics(q, v, u)
+    dynamics = data.model.dynamics(q, v, u)
     latents = [law(z[:, 0]) for law, z in zip(laws, prior.features(dynamics), strict=True)]
-    a = dynamics.acceleration((prior.mixing(dynamics) @ torch.stack(latents, -1)[..., None])[..., 0]).numpy()
+    a = dynamics.acceleration((prior.direction(dynamics) @ torch.stack(latents, -1)[..., None])[..., 0]).numpy()
     return replace(data, a=a + NOISE * np.random.default_rng(seed).standard_normal(a.shape), truth={"a": a})
 
 
-def fitted(data: Dataset, prior: ForcePrior, points: int, mean: str = "analytical", **options: Any) -> Any:
-    assert data.system is not None
-    return StructuredGP(data.system, prior, mean).fit(data, points=points, restarts=1, **options)  # type: ignore[arg-type]  # one of the names in Mean
+def fitted(data: Dataset, prior: Unknown, points: int, mean: str = "analytical", **options: Any) -> Any:
+    assert data.model is not None
+    model = data.model.with_forces(prior)
+    return fit(model if mean == "analytical" else model.without_mean(), data, points=points, restarts=1, **options)  # type: ignore[arg-type]  # one of the names in Mean
 
 
 def turntable(torque: Law) -> Dataset:
@@ -50,7 +51,7 @@ def turntable(torque: Law) -> Dataset:
     rng = np.random.default_rng(0)
     q = torch.tensor(rng.uniform(-math.pi + 0.8, math.pi - 0.8, (25, 1)))
     a = robot.forward_dynamics(q, 0.0 * q, torque(q)).numpy()
-    return _dataset(MechanicalSystem(robot), q.numpy(), 0.0 * a, 0.0 * a, a, rng)
+    return _dataset(Model(robot), q.numpy(), 0.0 * a, 0.0 * a, a, rng)
 
 
 def slow_motions(mass: float, place: torch.Tensor) -> Dataset:
@@ -58,14 +59,14 @@ def slow_motions(mass: float, place: torch.Tensor) -> Dataset:
 
     Accelerations of some 0.1 rad/s^2: what shows is the weight, but the mass has its inertia, too.
     """
-    known = recording(1).system
+    known = recording(1).model
     assert known is not None
     carrying = known.robot.with_inertials({TOOL: _with_body(known.robot, mass, place)})
     rng = np.random.default_rng(3)
     q = np.deg2rad((85, 50, -10, -100, -170, -25, -100)) + rng.uniform(-0.8, 0.8, (300, 7))
     v, a = 0.1 * rng.standard_normal((2, 300, 7))
     u = carrying.inverse_dynamics(torch.tensor(q), torch.tensor(v), torch.tensor(a)).numpy()
-    return _dataset(MechanicalSystem(known.robot), q, v, u, a, rng)
+    return _dataset(Model(known.robot), q, v, u, a, rng)
 
 
 def across_the_strip() -> tuple[torch.Tensor, torch.Tensor]:
@@ -88,7 +89,7 @@ def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
 
 
 def visited(posterior: Any, latent: int, feature: int = 0) -> np.ndarray:
-    features = posterior.model.prior.features(posterior.likelihood.dynamics())
+    features = posterior.model.unknown.features(posterior.likelihood.dynamics())
     return features[latent][:, feature].numpy()
 
 
@@ -105,7 +106,7 @@ def mass_and_place(posterior: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _dataset(
-    system: MechanicalSystem, q: np.ndarray, v: np.ndarray, u: np.ndarray, a: np.ndarray, rng: np.random.Generator
+    model: Model, q: np.ndarray, v: np.ndarray, u: np.ndarray, a: np.ndarray, rng: np.random.Generator
 ) -> Dataset:
     """With noise on the acceleration."""
     return Dataset(
@@ -114,9 +115,9 @@ def _dataset(
         u=u,
         a=a + NOISE * rng.standard_normal(a.shape),
         time=0.01 * np.arange(len(q)),
-        joint_names=system.robot.joint_names,
+        joint_names=model.robot.joint_names,
         noise_std=np.full(q.shape[1], NOISE),
-        system=system,
+        model=model,
     )
 
 

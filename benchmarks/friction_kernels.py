@@ -21,13 +21,13 @@ from threadpoolctl import threadpool_limits
 from forcegp.data import farthest_rows
 from forcegp.errors import NumericalWarning
 from forcegp.evaluation import evaluate
-from forcegp.models import StructuredGP
-from forcegp.priors import KERNELS, ContactFriction, kernel_of
-from forcegp.priors.basic_kernels import SmoothSignKernel, float64, linear
+from forcegp.fit import fit
+from forcegp.forces import KERNELS, ContactFriction, kernel_of
+from forcegp.forces.basic_kernels import SmoothSignKernel, float64, linear
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 POINTS, SEEDS = 200, (401, 402)
-LAWS: dict[str, dict[str, Any]] = {"scenario": {}, "sharp": {"friction_smoothing": 0.02, "stribeck_velocity": 0.1}}
+LAWS: dict[str, dict[str, Any]] = {"scenario": {}, "sharp": {"friction_smoothing": 0.02, "breakaway_velocity": 0.1}}
 LEVELS = {
     "squared exponential": "squared-exponential",
     "Matern 5/2": "matern-5/2",
@@ -64,7 +64,7 @@ def run() -> dict[str, float]:
             prior = ContactFriction(load=True, kernel=name)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NumericalWarning)  # of fits that the table shows to be worse
-                scores = evaluate(StructuredGP(train.system, prior).fit(train), test)
+                scores = evaluate(fit(train.model.with_forces(prior), train), test)
             shown = f"{scores.mae_noise_free:15.4f} {scores.nlpd:7.2f} {scores.coverage_95:13.3f}"
             print(f"{law:9} {label:38} {seed:5d} {shown}")
     return {}

@@ -29,11 +29,13 @@ from torch import Tensor
 from forcegp.atomic_files import write_text
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
+from forcegp.evidence import MarginalLikelihood, TrainingData
+from forcegp.forces import JointForces
 from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
 from forcegp.jobs.job import machine
-from forcegp.models import MarginalLikelihood, Noise, StructuredGP, TrainingData
-from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.noise import Noise
+from forcegp.posterior.structured import StructuredPosterior
 from forcegp.robots.arguments import usable_device
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -76,12 +78,12 @@ class Questions:
 
     def __init__(self, data: Dataset, device: torch.device) -> None:
         self.data, self.device = data, device
-        self.model = StructuredGP(data.system.to(device), noise=Noise(0.1))  # type: ignore[union-attr]  # simulated data have a system
+        self.model = data.model.to(device).with_forces(JointForces(), noise=Noise(0.1))  # type: ignore[union-attr]  # simulated data have a model
 
     def likelihood(self, rows: int) -> Callable[[], Tensor]:
         training = TrainingData.of(self.data.rows(slice(0, rows)), self.device)
-        likelihood = MarginalLikelihood(self.model.system, self.model.prior, "analytical", training)
-        kernels = likelihood.kernels()
+        likelihood = MarginalLikelihood(self.model, training)
+        kernels = likelihood.kernels
         parameters = kernels.initial_parameters() | Noise(0.1).parameters(JOINTS, self.device)
         parameters = {name: value.clone().requires_grad_() for name, value in parameters.items()}
 
@@ -94,9 +96,9 @@ class Questions:
 
     def posterior(self, rows: int) -> StructuredPosterior:
         training = TrainingData.of(self.data.rows(slice(0, rows)), self.device)
-        likelihood = MarginalLikelihood(self.model.system, self.model.prior, "analytical", training)
-        parameters = likelihood.kernels().initial_parameters() | Noise(0.1).parameters(JOINTS, self.device)
-        return self.model.condition(training, parameters, NOT_SEARCHED, {})
+        likelihood = MarginalLikelihood(self.model, training)
+        parameters = likelihood.kernels.initial_parameters() | Noise(0.1).parameters(JOINTS, self.device)
+        return StructuredPosterior.conditioned(self.model, training, parameters, NOT_SEARCHED, {})
 
     def states(self, count: int) -> list[Tensor]:
         """Rows of the data, again and again."""
@@ -105,7 +107,7 @@ class Questions:
 
     def dynamics(self, count: int) -> Callable[[], Tensor]:
         states = self.states(count)
-        return lambda: self.model.system.dynamics(*states).acceleration_map().offset
+        return lambda: self.model.dynamics(*states).acceleration_map().offset
 
     def prediction(self, posterior: StructuredPosterior, count: int) -> Callable[[], Tensor]:
         states = self.states(count)

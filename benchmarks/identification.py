@@ -15,8 +15,9 @@ import warnings
 
 import torch
 
-from forcegp import KukaSurfaceConfig, StructuredGP, simulate_kuka_surface
+from forcegp import KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.errors import NumericalWarning
+from forcegp.forces import Body, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
 from forcegp.robots import parameters_from_physical
 from forcegp.simulation.kuka_motion import TOOL_LINK
@@ -34,7 +35,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[11])
     parser.add_argument("--iterations", type=int, default=60)
     parser.add_argument("--tolerance", type=float, default=OptimizerOptions.tolerance)
-    parser.add_argument("--start", choices=["wrong", "true"], default="wrong", help="values of the given system")
+    parser.add_argument("--start", choices=["wrong", "true"], default="wrong", help="values of the given model")
     parser.add_argument("--mean", choices=["analytical", "zero"], default="analytical")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -42,17 +43,19 @@ def main() -> None:
     covered, count = torch.zeros(4), torch.zeros(4)
     for seed in given.seeds:
         data = simulate_kuka_surface(KukaSurfaceConfig(seconds=100, seed=seed))
-        assert data.system is not None
-        link = data.system.robot.link(TOOL_LINK)
+        assert data.model is not None
+        link = data.model.robot.link(TOOL_LINK)
         mass, center, inertia = (torch.tensor(x, dtype=F64) for x in (link.mass, link.center_of_mass, link.inertia))
         off = float(given.start == "wrong")
         center_off = off * torch.tensor(TOO_FAR, dtype=F64)
         wrong = parameters_from_physical(mass + off * TOO_HEAVY, center + center_off, inertia)
-        robot = data.system.robot.with_inertials({TOOL_LINK: wrong})
+        robot = data.model.robot.with_inertials({TOOL_LINK: wrong})
         begin = time.process_time()
-        posterior = StructuredGP(data.system.with_robot(robot), mean=given.mean).identify(
+        body = RigidBodies({TOOL_LINK: Body(0.01, ("mass", "center_of_mass"))})
+        model = data.model.with_robot(robot).with_forces(JointForces(), body)
+        posterior = fit(
+            model if given.mean == "analytical" else model.without_mean(),
             data,
-            robot.link(TOOL_LINK).inertial("mass", "com"),
             points=given.points,
             restarts=1,
             options=OptimizerOptions(iterations=given.iterations, tolerance=given.tolerance),

@@ -27,10 +27,13 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset, farthest_point_sampling, farthest_rows
+from forcegp.evidence import MarginalLikelihood, TrainingData
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptions
 from forcegp.inference.cholesky_update import rows_to_keep, with_only
-from forcegp.models import Noise, StructuredGP, TrainingData
-from forcegp.models.structured.posterior import StructuredPosterior
+from forcegp.noise import Noise
+from forcegp.posterior.structured import StructuredPosterior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 SEEDS = (1, 2, 3)
@@ -50,10 +53,10 @@ def median_seconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
 
 def conditioned(data: Dataset) -> StructuredPosterior:
     """On all rows, at the start values of a search."""
-    model = StructuredGP(data.system, noise=Noise(0.1))
+    model = data.model.with_forces(JointForces(), noise=Noise(0.1))
     training = TrainingData.of(data, torch.device("cpu"))
-    parameters = StructuredGP(data.system)._likelihood(training).kernels().initial_parameters()
-    return model.condition(training, parameters | Noise(0.1).parameters(data.nv), NO_SEARCH, {})
+    parameters = MarginalLikelihood(model, training).kernels.initial_parameters()
+    return StructuredPosterior.conditioned(model, training, parameters | Noise(0.1).parameters(data.nv), NO_SEARCH, {})
 
 
 def update_speed(data: Dataset) -> float:
@@ -90,7 +93,7 @@ def deletion_speed(data: Dataset) -> float:
     kept = rows_to_keep(latent, BUDGET)
     rank = latent.system.deflation.rank
     entries = (kept[:, None] * rank + torch.arange(rank)).reshape(-1)
-    anew = with_only(latent, kept).system.factor.lower.tril()
+    anew = with_only(latent, kept).model.factor.lower.tril()
     lower = latent.system.factor.lower.tril()
     by_update = left_out_of_factor(lower, entries)
     torch.testing.assert_close(by_update @ by_update.mT, anew @ anew.mT, rtol=1e-9, atol=1e-9)
@@ -141,11 +144,11 @@ def streams() -> dict[str, float]:
         stream = simulate_kuka_surface(KukaSurfaceConfig(seconds=100.0, seed=seed)).rows(slice(0, 12 * STREAM, 12))
         test = simulate_kuka_surface(KukaSurfaceConfig(seconds=60.0, seed=1000 + seed)).rows(slice(0, None, 20))
         options = OptimizerOptions(iterations=60)
-        first = StructuredGP(stream.system).fit(stream.rows(slice(0, FIRST)), restarts=1, options=options)
+        first = fit(stream.model.with_forces(JointForces()), stream.rows(slice(0, FIRST)), restarts=1, options=options)
         hindsight = TrainingData.of(farthest_rows(stream, BUDGET), torch.device("cpu"))
         at_once = first.model.condition(
             TrainingData(hindsight.q, hindsight.v, hindsight.u, hindsight.a, reference=first.training),
-            first.parameters,
+            first.hyperparameters,
             NO_SEARCH,
             {},
         )

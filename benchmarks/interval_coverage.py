@@ -1,7 +1,7 @@
 """Do the 95 % intervals of one fit hold the true acceleration? Fits of `kuka-surface` by number of points and seed.
 
 python -m benchmarks.interval_coverage                       tool-friction, N = 10, 20, 100, seeds 501 to 514
-python -m benchmarks.interval_coverage --seeds 401 402 --points 20 --prior joint
+python -m benchmarks.interval_coverage --seeds 401 402 --points 20 --prior gp:joint
 
 Every fit learns from the rows of a minute that lie farthest apart, and is scored on another minute (every 15th row),
 without noise. "as fitted" is the posterior at the fitted hyper-parameters alone; "drawn" is the share of functions
@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from forcegp import KukaSurfaceConfig, StructuredGP
+from forcegp import KukaSurfaceConfig, fit
 from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
+from forcegp.forces import parse_forces
 from forcegp.inference.pathwise import draw_functions
-from forcegp.models import StructuredPosterior
-from forcegp.priors import named_prior
+from forcegp.posterior import StructuredPosterior
 from forcegp.simulation import simulate_kuka_surface
 
 SECONDS = 60.0
@@ -40,9 +40,9 @@ def drawn_below(posterior: StructuredPosterior) -> float:
     training = posterior.training
     with torch.no_grad():
         dynamics = posterior.dynamics(training.q, training.v, training.u)
-        features = posterior.likelihood.standardization(posterior.model.prior.features(dynamics))
+        features = posterior.likelihood.standardization(posterior.model.unknown.features(dynamics))
         values = draw_functions(posterior.latent, FUNCTIONS, 0)([z.expand(FUNCTIONS, *z.shape) for z in features])
-        W = dynamics.H @ posterior.model.prior.mixing(dynamics)
+        W = dynamics.H @ posterior.model.unknown.direction(dynamics)
         away = torch.einsum("nkc,snc->snk", W, values - posterior.latent.mean(features))
         std = (W @ posterior.latent.covariance(features) @ W.mT).diagonal(dim1=-2, dim2=-1).sqrt()
         inside = (away.abs() <= 1.96 * std).double().mean((1, 2))
@@ -52,7 +52,7 @@ def drawn_below(posterior: StructuredPosterior) -> float:
 def main() -> None:
     """Fit, score and print a line per fit and the summary."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--prior", default="tool-friction")
+    parser.add_argument("--prior", default="gp:tool-friction")
     parser.add_argument("--points", type=int, nargs="+", default=[10, 20, 100])
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(501, 515)))
     given = parser.parse_args()
@@ -61,8 +61,8 @@ def main() -> None:
     for seed in given.seeds:
         train, test = recording(seed), recording(1000 + seed).rows(slice(None, None, 15))
         for points in given.points:
-            model = StructuredGP(train.system, named_prior(given.prior, train.system))
-            posterior = model.fit(train, points=points)
+            model = train.model.with_forces(parse_forces(given.prior))
+            posterior = fit(model, train, points=points)
             scores = [evaluate(each, test) for each in (posterior, posterior.with_settings(widening=1.0))]
             inside, plain = (score.coverage_95_noise_free for score in scores)
             widened.append(inside)

@@ -1,4 +1,4 @@
-"""What the kernels of `forcegp.priors.KERNELS` are worth on functions that are smooth and on those that jump.
+"""What the kernels of `forcegp.forces.KERNELS` are worth on functions that are smooth and on those that jump.
 
 python -m benchmarks.kernels                                     four seeds, squared exponential, Matern 3/2 and deep
 python -m benchmarks.kernels 2 squared-exponential deep          two seeds, these kernels
@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
+from forcegp.fit.search import perturbed
+from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms, minimize_objective, negative_log_likelihood
-from forcegp.models.search import perturbed
-from forcegp.priors.kernels import kernel_of
 
 NOISE = 0.1
 STARTS = 3

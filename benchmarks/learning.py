@@ -12,7 +12,8 @@ import statistics
 import time
 
 from forcegp.evaluation import evaluate
-from forcegp.models import StructuredGP
+from forcegp.fit import fit
+from forcegp.forces import JointForces
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 SEEDS = (11, 12, 13, 14, 15)
@@ -28,8 +29,8 @@ def run() -> dict[str, float]:
         train = simulate_kuka_surface(KukaSurfaceConfig(seconds=SECONDS, seed=seed))
         test = simulate_kuka_surface(KukaSurfaceConfig(seconds=SECONDS, seed=1000 + seed)).rows(slice(0, None, 12))
         for mean, collected in scores.items():
-            start = time.process_time()
-            posterior = StructuredGP(train.system, mean=mean).fit(train, points=POINTS, seed=seed)
+            start, model = time.process_time(), train.model.with_forces(JointForces())
+            posterior = fit(model if mean == "analytical" else model.without_mean(), train, points=POINTS, seed=seed)
             seconds = time.process_time() - start
             score = evaluate(posterior, test).to_dict()
             collected.append(score)

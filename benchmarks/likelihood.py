@@ -28,11 +28,12 @@ import torch
 from gpytorch.kernels import Kernel, ScaleKernel
 from threadpoolctl import threadpool_limits
 
+from forcegp.forces import ToolForces
+from forcegp.forces.basic_kernels import squared_exponential_kernel
+from forcegp.forces.kernels import kernel_of
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.dense_kernels import taken_apart
 from forcegp.inference.likelihood import INNER, deflated_covariance, negative_log_likelihood
-from forcegp.priors import ToolForces
-from forcegp.priors.kernels import kernel_of, squared_exponential_kernel
 
 JOINTS, INPUTS, TANGENTS = 7, 21, 2
 

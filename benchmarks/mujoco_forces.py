@@ -21,7 +21,7 @@ import numpy as np
 from mujoco import rollout
 
 from benchmarks.tracking import GAINS, excitation, followed, robot_of, rows_of
-from forcegp import JointFriction, MechanicalSystem, PDGravity, Robot, StructuredGP
+from forcegp import JointFriction, Model, PDGravity, Robot, fit
 from forcegp.control.mujoco_forces import MujocoForces
 
 mujoco: Any = untyped
@@ -54,10 +54,10 @@ def ends(model: Any, begin: np.ndarray, threads: int) -> np.ndarray:
 
 def run() -> dict[str, float]:
     robot = robot_of()
-    given, rng = MechanicalSystem(robot), np.random.default_rng(SEED)
+    given, rng = Model(robot), np.random.default_rng(SEED)
     motion = followed(robot, excitation(SEED), PDGravity(robot.compile(), **GAINS), 20.0)
     rows = rows_of(motion, given, SEED, STATES)
-    posterior = StructuredGP(given, JointFriction()).fit(rows.rows(slice(100)), restarts=1)
+    posterior = fit(given.with_forces(JointFriction()), rows.rows(slice(100)), restarts=1)
     model = model_of(robot)
     forces, data = MujocoForces(posterior.predictor(covariance="none"), model), mujoco.MjData(model)
     expected, apart = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy(), []

@@ -12,14 +12,17 @@ import warnings
 import numpy as np
 import torch
 
-from forcegp import Preparation, identify_analytical
-from forcegp.analytical import LAWS
+from forcegp import Preparation
+from forcegp.evidence import Accelerations, Torques
+from forcegp.fit import fit
+from forcegp.forces import Coulomb, RigidBodies, Viscous
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 NOISE = 1e-3
 FILTERS = (4.0, 10.0, 20.0)  # Hz
 LIKELIHOODS = "torque,both"  # acceleration takes minutes
 ROWS = 1000
+EVIDENCE = {"torque": Torques(), "acceleration": Accelerations(), "both": Torques("both")}
 
 
 def main() -> None:
@@ -32,11 +35,11 @@ def main() -> None:
     test = simulate_quadruped(QuadrupedConfig(seconds=10.0, seed=77))
     at = tuple(torch.tensor(x) for x in (test.q, test.v, test.u))
 
-    def errors(system) -> np.ndarray:
-        wrong = (system.dynamics(*at).acceleration_map().offset.numpy() - test.truth["a"]) ** 2
+    def errors(model) -> np.ndarray:
+        wrong = (model.dynamics(*at).acceleration_map().offset.numpy() - test.truth["a"]) ** 2
         return np.sqrt([wrong[:, :6].mean(), wrong[:, 6:].mean()])
 
-    given = errors(test.system)
+    given = errors(test.model)
     logs = [simulate_quadruped(QuadrupedConfig(seconds=20.0, seed=seed)) for seed in range(1, options.seeds + 1)]
     for cutoff in FILTERS:
         for likelihood in options.likelihoods.split(","):
@@ -44,11 +47,12 @@ def main() -> None:
             for seed, log in enumerate(logs, start=1):
                 steps = NOISE * np.random.default_rng(seed).standard_normal(log.v.shape)
                 steps[:, 6:] *= 0.2
-                q = log.system.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
-                noisy = log.__class__(q=q, v=log.v, u=log.u, a=log.a, time=log.time, system=log.system)
+                q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
+                noisy = log.__class__(q=q, v=log.v, u=log.u, a=log.a, time=log.time, model=log.model)
                 prepared = Preparation(cutoff=cutoff, stance="auto", trim=0.3).apply(noisy).dataset
-                result = identify_analytical(prepared, friction=LAWS, likelihood=likelihood, rows=ROWS)
-                found.append((*result.total_mass, *(errors(result.system) / given)))
+                model = prepared.model.with_forces(RigidBodies("all"), Viscous(), Coulomb())
+                result = fit(model, prepared, EVIDENCE[likelihood], rows=ROWS)
+                found.append((*result.parameters.total_mass, *(errors(result.model) / given)))
             mass, deviation, base, joints = np.array(found).T
             seconds = (time.process_time() - begun) / options.seeds
             masses = ", ".join(f"{m:.2f} ± {d:.2f}" for m, d in zip(mass, deviation, strict=True))

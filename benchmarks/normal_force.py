@@ -3,6 +3,7 @@
 `kuka-surface` with Stribeck friction at the tool, in proportion to the load (PyBullet at 240 Hz, ideal contact). The
 tool follows the motion of another recording of the scenario for 8 s and presses with 15 N; gains omega = 10. Errors
 after the first second: root mean square of the normal force, and of the tool's distance to its path. The model learns
+from forcegp.forces import parse_forces
 from 100 rows of 40 s of the scenario's own motion (`load-friction`, analytical mean); of the same rows least squares
 finds a law with two numbers, mu = c + d s of the speed s. "noise": the controller reads positions with noise of 0.1
 mrad and velocities with 2 mrad/s. Five seeds, medians.
@@ -19,10 +20,9 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from forcegp import Dataset, HybridForce, KukaSurfaceConfig, NoForces, StructuredGP, simulate_kuka_surface
+from forcegp import Dataset, HybridForce, KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.data import farthest_rows
-from forcegp.models.predictor import Predictor
-from forcegp.priors import named_prior
+from forcegp.posterior.predictor import Predictor
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import IdealContact
 from forcegp.simulation.kuka_motion import kuka_urdf, tool_friction_of
@@ -43,8 +43,8 @@ NOISE_Q, NOISE_V = 1e-4, 2e-3
 
 def per_newton(dataset: Dataset, law: Law, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     """Joint torques (..., nv) of friction at the tool per newton of normal force."""
-    contact = dataset.system.contacts[0]
-    kinematics = dataset.system.robot.kinematics(q, v)
+    contact = dataset.model.contacts[0]
+    kinematics = dataset.model.robot.kinematics(q, v)
     J = kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
     velocity = (J @ v[..., None])[..., 0]
     normal = contact.surface.gradient(contact.position(kinematics))
@@ -68,7 +68,7 @@ class ByLaw(HybridForce):
 def fitted_law(data: Dataset) -> Law:
     """mu = c + d s, by least squares on the accelerations of the rows."""
     q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
-    at = data.system.dynamics(q, v, u)
+    at = data.model.dynamics(q, v, u)
     free, towards = (torch.linalg.solve(at.M, x) for x in (at.Q_K[..., None], at.A.mT))
 
     def residual(x: np.ndarray) -> np.ndarray:
@@ -84,7 +84,7 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
     """Error of the normal force [N] and of the tool's place [mm], root mean squares after the first second."""
     rng = np.random.default_rng(seed)
     forces, places = [], []
-    contact = task.system.contacts[0]
+    contact = task.model.contacts[0]
     with BulletArm(
         kuka_urdf(CONFIG), gravity=CONFIG.gravity, time_step=CONFIG.time_step, tool_point=CONFIG.tool_point
     ) as arm:
@@ -92,7 +92,7 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
         surface = IdealContact(
             table_of(CONFIG), tool_friction_of(CONFIG), CONFIG.baumgarte_omega, CONFIG.baumgarte_zeta, touched=True
         )
-        low, high = ([getattr(joint, end) for joint in task.system.robot.joints] for end in ("lower", "upper"))
+        low, high = ([getattr(joint, end) for joint in task.model.robot.joints] for end in ("lower", "upper"))
         reference = np.clip(task.q, low, high)  # the scenario begins on the limit of a joint
         for q_d, v_d, a_d in zip(reference, task.v, task.truth["a"], strict=True):
             state = ArmState.of(arm)
@@ -100,7 +100,7 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
             u = control(q, v, q_d, v_d, a_d, WANTED).numpy()
             forces.append(surface.step(arm, state, u).normal_force - WANTED)
             places.append(state.position)
-    wanted = contact.position(task.system.robot.kinematics(torch.tensor(task.q))).numpy()
+    wanted = contact.position(task.model.robot.kinematics(torch.tensor(task.q))).numpy()
     off = np.linalg.norm(np.array(places) - wanted, axis=1)
     first = round(1.0 / CONFIG.time_step)
     return tuple(float(np.sqrt(np.mean(np.square(x[first:])))) for x in (np.array(forces), 1e3 * off))
@@ -108,8 +108,8 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
 
 def controllers(data: Dataset, seed: int) -> dict[str, HybridForce]:
     """Name -> controller; the second and the third learn from the same rows."""
-    plain = StructuredGP(data.system, NoForces()).fit(data, restarts=1, seed=seed).predictor(covariance="none")
-    learned = StructuredGP(data.system, named_prior("load-friction", data.system)).fit(data, restarts=1, seed=seed)
+    plain = fit(data.model, data, restarts=1, seed=seed).predictor(covariance="none")
+    learned = fit(data.model.with_forces(parse_forces("gp:load-friction")), data, restarts=1, seed=seed)
     return {
         "URDF": HybridForce(plain, stiffness=100.0),
         "two numbers": ByLaw(data, plain, fitted_law(data)),

@@ -1,8 +1,8 @@
 """Payloads of a simulated UR5 from joint torques, and one command from its log to a validated model.
 
-Logs are those of `examples/ur5_log.py` (MuJoCo; Stribeck friction, rotors, noise, torques 6 ms late), with the columns
+Logs are those of `examples/ur5_log.py` (MuJoCo; dry friction, rotors, noise, torques 6 ms late), with columns
 right, 60 s each: one with a payload of .3 to 3 kg within 8 cm of the tool's frame, one without. Both are filtered and
-shifted by `Preparation(cutoff="auto", delay="auto")`; `identify_payload` sees the URDF alone, or the log without the
+shifted by `Preparation(cutoff="auto", delay="auto")`; the fit of a `Payload` sees the URDF alone, or the log without
 payload as well. Errors and whether 95 % intervals hold (of the mass and three coordinates), over 20 payloads.
 
 `forcegp auto` gets the example's log of 80 s as it is, with `--correct`: CPU seconds, and what it names.
@@ -26,11 +26,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from forcegp import Dataset, MechanicalSystem, Preparation, Robot
-from forcegp.analytical import identify_payload
+from forcegp import Dataset, Model, Preparation, Robot
 from forcegp.cli.main import main
+from forcegp.evidence import Torques
+from forcegp.fit import fit
+from forcegp.forces import Payload, Rotor
+from forcegp.forces.registry import usual_friction
 
 SEEDS, SECONDS = range(1, 21), 60.0
+NUMBERS = ("mass", "center_of_mass.x", "center_of_mass.y", "center_of_mass.z")
 ANSWER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "auto" / "answer.txt"
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "ur5_log.py"
 
@@ -52,7 +56,7 @@ def prepared(ur5: Any, seed: int, mass: float, center: np.ndarray) -> Dataset:
     q, v, u = np.deg2rad(logged[:, 1:7]), np.deg2rad(logged[:, 7:13]), logged[:, 13:] * [1, 1, -1, 1, 1, 1]
     robot = Robot.from_urdf_text(ur5.URDF)
     data = {"q": q, "v": v, "u": u, "a": np.gradient(v, rows[:, 0], axis=0), "time": rows[:, 0]}
-    raw = Dataset(**data, joint_names=robot.joint_names, system=MechanicalSystem(robot))
+    raw = Dataset(**data, joint_names=robot.joint_names, model=Model(robot))
     return Preparation(cutoff="auto", delay="auto", trim=0.5).apply(raw).dataset
 
 
@@ -65,14 +69,17 @@ def payloads(ur5: Any) -> dict[str, float]:
         rng = np.random.default_rng(seed)
         mass, center = rng.uniform(0.3, 3.0), rng.uniform(-0.08, 0.08, 3)
         loaded, empty = prepared(ur5, seed, mass, center), prepared(ur5, 100 + seed, 0.0, center)
+        model = loaded.model.with_forces(usual_friction(), Rotor(), Payload("tool0"))
         for name, baseline in (("urdf", None), ("baseline", empty)):
-            found = identify_payload(loaded, baseline=baseline, link="tool0")
-            masses[name].append(abs(found.mass / mass - 1.0))
-            places[name].append(1e3 * float(np.abs(found.center_of_mass - center).max()))
-            ends = list(found.intervals.values())[:4]
+            found = fit(model, loaded, Torques(), baseline=baseline).parameters
+            place = np.array([found[f"payload.{name}"].value for name in NUMBERS[1:]])
+            masses[name].append(abs(found["payload.mass"].value / mass - 1.0))
+            places[name].append(1e3 * float(np.abs(place - center).max()))
+            ends = [found[f"payload.{name}"].interval for name in NUMBERS]
             held[name] += [low <= true <= high for (low, high), true in zip(ends, [mass, *center], strict=True)]
             print(
-                f"seed {seed} {name:8s} {mass:.3f} kg: {found.mass / mass - 1.0:+.4f}, {places[name][-1]:.2f} mm",
+                f"seed {seed} {name:8s} {mass:.3f} kg: {found['payload.mass'].value / mass - 1.0:+.4f}, "
+                f"{places[name][-1]:.2f} mm",
                 flush=True,
             )
     out = {}

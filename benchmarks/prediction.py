@@ -18,10 +18,12 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from forcegp import KukaSurfaceConfig, Noise, StructuredGP, simulate_kuka_surface
+from forcegp import KukaSurfaceConfig, Noise, fit, simulate_kuka_surface
 from forcegp.data import Dataset, farthest_rows
-from forcegp.models import StructuredPosterior, TrainingData
-from forcegp.models.predictor import Predictor
+from forcegp.evidence import TrainingData
+from forcegp.forces import JointForces
+from forcegp.posterior import StructuredPosterior
+from forcegp.posterior.predictor import Predictor
 
 POINTS, FITTED, BATCH, COMPARED = 1000, 100, 10_000, 400
 SEEDS = 31, 1031
@@ -31,10 +33,10 @@ def trained() -> tuple[StructuredPosterior, Dataset, Dataset]:
     """The posterior, the trajectory of its points, and another one."""
     along, apart = (simulate_kuka_surface(KukaSurfaceConfig(seconds=100.0, seed=seed)) for seed in SEEDS)
     rows = farthest_rows(along, POINTS)
-    first = StructuredGP(along.system, noise=Noise(0.1)).fit(rows.rows(slice(FITTED)), restarts=1)
-    training = TrainingData.of(rows, along.system.robot.device)
+    first = fit(along.model.with_forces(JointForces(), noise=Noise(0.1)), rows.rows(slice(FITTED)), restarts=1)
+    training = TrainingData.of(rows, along.model.robot.device)
     settings = {**first.settings, "points": POINTS}
-    return first.model.condition(training, first.parameters, first.result, settings), along, apart
+    return first.model.condition(training, first.hyperparameters, first.result, settings), along, apart
 
 
 def states(dataset: Dataset, count: int) -> list[torch.Tensor]:

@@ -1,7 +1,7 @@
 """What do models cost as programs: predictors of all priors, motions, exported C, CasADi?
 
 `kuka-surface` (iiwa, 7 joints, one plane), 100 points unless said, one thread, both sides in one process; times of one
-call are medians of the wall clock. The recommended prior is `joint-friction+load-friction`; others beside it.
+call are medians of the wall clock. The recommended prior is `gp:joint-friction,gp:load-friction`; others beside it.
 
 * Motions: 512 of 25 steps (4 ms), symplectic Euler. "One by one" are calls of the predictor or of `posterior.rollout`
   for one motion after another, as a loop of a planner makes them; "in batches" the same with 512 states in every call.
@@ -28,28 +28,29 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from benchmarks.prediction import milliseconds, states
-from forcegp import KukaSurfaceConfig, Noise, StructuredGP, export_c, simulate_kuka_surface
+from forcegp import KukaSurfaceConfig, Noise, export_c, fit, simulate_kuka_surface
 from forcegp.data import Dataset, farthest_rows
+from forcegp.evidence import TrainingData
+from forcegp.forces import parse_forces
 from forcegp.integration import INTEGRATORS, integrate
-from forcegp.models import StructuredPosterior, TrainingData, casadi_function
-from forcegp.priors.named import named_prior
+from forcegp.posterior import StructuredPosterior, casadi_function
 
-RECOMMENDED = "joint-friction+load-friction"
-PRIORS = ("joint", "tool-friction", "joint-friction", RECOMMENDED)
+RECOMMENDED = "gp:joint-friction,gp:load-friction"
+PRIORS = ("gp:joint", "gp:tool-friction", "gp:joint-friction", RECOMMENDED)
 MOTIONS, STEPS, DT, FUNCTIONS = 512, 25, 0.004, 8
 PARITY_STATES = 10_000
 
 
 def fitted(train: Dataset, prior: str, points: int) -> StructuredPosterior:
     """With the hyper-parameters of 100 rows."""
-    system = train.system
-    assert system is not None, "simulated datasets have one"
-    first = StructuredGP(system, named_prior(prior, system), noise=Noise(0.1)).fit(train, points=100, restarts=1)
-    assert isinstance(first, StructuredPosterior), "of a StructuredGP"
+    model = train.model
+    assert model is not None, "simulated datasets have one"
+    first = fit(model.with_forces(parse_forces(prior), noise=Noise(0.1)), train, points=100, restarts=1)
+    assert isinstance(first, StructuredPosterior), "of processes on forces"
     if points == 100:
         return first
-    rows = TrainingData.of(farthest_rows(train, points), system.robot.device)
-    return first.model.condition(rows, first.parameters, first.result, {**first.settings, "points": points})
+    rows = TrainingData.of(farthest_rows(train, points), model.robot.device)
+    return first.model.condition(rows, first.hyperparameters, first.result, {**first.settings, "points": points})
 
 
 def seconds(call: Callable[[], Any], repeats: int) -> float:
@@ -90,8 +91,8 @@ def motions(posterior: StructuredPosterior, apart: Dataset) -> dict[str, float]:
         warnings.simplefilter("ignore")  # of drawn functions some motions diverge
         drawn = seconds(lambda: predictor.rollouts(q0, v0, u, DT, functions=FUNCTIONS), 10)
     two = seconds(lambda: predictor.rollouts(q0, v0, u, DT, threads=2), 20)
-    acceleration = posterior.accelerations(posterior.system.baumgarte).mean()
-    euler = INTEGRATORS["symplectic-euler"](posterior.system)
+    acceleration = posterior.accelerations(posterior.model.baumgarte).mean()
+    euler = INTEGRATORS["symplectic-euler"](posterior.model)
 
     def loop(q: torch.Tensor, v: torch.Tensor, forces: torch.Tensor) -> None:
         for k in range(STEPS):
@@ -185,9 +186,9 @@ def run() -> dict[str, float]:
     posteriors = {(prior, 100): fitted(train, prior, 100) for prior in PRIORS}
     posteriors[RECOMMENDED, 400] = fitted(train, RECOMMENDED, 400)
     results = predictors(posteriors, apart)
-    results |= motions(posteriors["joint-friction", 100], apart)
-    results |= exported(posteriors["joint", 100], apart, True)
-    results |= exported(fitted(train, "joint", 1000), apart, False)
+    results |= motions(posteriors["gp:joint-friction", 100], apart)
+    results |= exported(posteriors["gp:joint", 100], apart, True)
+    results |= exported(fitted(train, "gp:joint", 1000), apart, False)
     results |= casadi_parity(posteriors[RECOMMENDED, 100], apart)
     for key in ("c_mean_us", "c_cov_us", "c_compile_cpu_s", "c_parity", "c_parity_n1000"):
         print(f"{key:>44} {results[key]:.3g}")

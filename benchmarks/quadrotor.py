@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from forcegp import AerodynamicForce, Dataset, StructuredGP
+from forcegp import AerodynamicForce, Dataset, fit
 from forcegp.data import estimate_thruster_lag
 from forcegp.data.delay import lagged
-from forcegp.models import IndependentGP, Posterior, observing
+from forcegp.posterior import Posterior, observing
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 WINDS = (0.0, 3.0, 8.0, 12.0)
@@ -60,14 +60,14 @@ def seed_scores(seed: int, lag: float, points: int) -> dict[str, object]:
     ]
     models: dict[str, Posterior] = {}
     seconds = {}
-    for name, fit in {
-        "force prior": lambda: StructuredGP(train.system, AerodynamicForce()).fit(rows, points=points, restarts=1),
+    for name, learned in {
+        "force prior": lambda: fit(train.model.with_forces(AerodynamicForce()), rows, points=points, restarts=1),
         "parametric": lambda: parametric(rows, observe=0.0),
         "parametric in our wind": lambda: parametric(rows, observe=None),
-        "independent GP": lambda: IndependentGP(train.system).fit(rows, points=points, restarts=1),
+        "independent GP": lambda: fit(train.model.black_box(), rows, points=points, restarts=1),
     }.items():
         begun = time.process_time()
-        models[name] = fit()
+        models[name] = learned()
         seconds[name] = round(time.process_time() - begun, 1)
     usual = min(TIMES, key=lambda each: training_error(models["parametric"], rows, each))
     result: dict[str, object] = {"seed": seed, "lag": lag, "found lag": round(found, 4), "fit CPU s": seconds}
@@ -81,8 +81,8 @@ def seed_scores(seed: int, lag: float, points: int) -> dict[str, object]:
 
 def parametric(rows: Dataset, observe: float | None) -> Posterior:
     """Linear in the same features."""
-    model = StructuredGP(rows.system, AerodynamicForce(kernel="linear", observe=observe))
-    return model.fit(rows, points=1000, restarts=1)
+    model = rows.model.with_forces(AerodynamicForce(kernel="linear", observe=observe))
+    return fit(model, rows, points=1000, restarts=1)
 
 
 def training_error(posterior: Posterior, rows: Dataset, seconds: float) -> float:

@@ -11,22 +11,18 @@ import warnings
 import numpy as np
 import torch
 
-from forcegp import CoulombJointFriction, Dataset, JointFriction, StructuredGP, ViscousJointFriction
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias
-from forcegp.models import Coefficients, Posterior
-from forcegp.priors import NoForces
+from forcegp import Coulomb, Dataset, JointFriction, Viscous, fit
+from forcegp.forces import Body, RigidBodies
+from forcegp.posterior import Posterior
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
 def fits(train: Dataset) -> dict[str, Posterior]:
-    trunk = train.system.robot.link("trunk").inertial("mass", "com")
-    laws = (Actuation(), RigidBodyBias(), ViscousJointFriction(0.1), CoulombJointFriction(0.5, 0.02))
-    lawful = MechanicalSystem(train.system.robot, train.system.contacts, laws)
-    friction = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
-    how = {"points": 200, "restarts": 1}
+    trunk = RigidBodies({"trunk": Body(0.01, ("mass", "center_of_mass"))})
+    laws = train.model.with_forces(trunk, Viscous(), Coulomb())
     return {
-        "laws": StructuredGP(lawful, NoForces()).identify(train, [trunk, *friction], **how),
-        "force prior": StructuredGP(train.system, JointFriction()).identify(train, [trunk], **how),
+        "laws": fit(laws, train, rows=200),
+        "force prior": fit(train.model.with_forces(trunk, JointFriction()), train, points=200, restarts=1),
     }
 
 
@@ -41,12 +37,12 @@ def main() -> None:
         test = simulate_quadruped(QuadrupedConfig(seconds=10.0, seed=100 + seed))
         q, v, u = (torch.tensor(x) for x in (test.q, test.v, test.u))
         a, forces = test.truth["a"], test.truth["lambda"]
-        plain = np.square(test.system.dynamics(q, v, u).acceleration_map().offset.numpy() - a)
+        plain = np.square(test.model.dynamics(q, v, u).acceleration_map().offset.numpy() - a)
         for name, posterior in fits(train).items():
             found = posterior.predict(q, v, u, covariance=False)
             error = np.square(found.mean.numpy() - a)
             parts = [float(np.sqrt(error[:, k].sum() / plain[:, k].sum())) for k in (slice(6), slice(6, None))]
-            load = posterior.identification.values["trunk.mass"] - train.system.robot.link("trunk").mass
+            load = posterior.parameters["trunk.mass"].value - train.model.robot.link("trunk").mass
             feet = np.sqrt(np.square(found.multiplier.mean.numpy() - forces).sum() / np.square(forces).sum())
             print(f"{seed:>4} {name:12} {parts[0]:7.4f} {parts[1]:7.4f} {load:10.4f} {feet:12.4f}", flush=True)
 

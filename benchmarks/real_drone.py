@@ -25,24 +25,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.quadrotor import TIMES, training_error
-from forcegp import AerodynamicForce, Dataset, MechanicalSystem, Preparation, Robot, StructuredGP
+from forcegp import AerodynamicForce, Dataset, Model, Preparation, Robot, fit
 from forcegp.data import differentiate
-from forcegp.mechanics import Actuation, RigidBodyBias, Thrusters
-from forcegp.models import IndependentGP, Posterior, observing
+from forcegp.forces import Actuation, RigidBodies, Thrusters
+from forcegp.posterior import Posterior, observing
 
 GRAVITY, HORIZON, STRIDE, BEGUN = 9.81, 25, 5, 10  # m/s^2, rows: of .5 s, between starts, of the observer's begin
 STRETCH = 200  # rows
 
 
-def system_of(mass: float) -> MechanicalSystem:
+def model_of(mass: float) -> Model:
     inertia = f'ixx="{0.012 * mass}" iyy="{0.012 * mass}" izz="{0.02 * mass}" ixy="0" ixz="0" iyz="0"'
     body = f'<inertial><mass value="{mass}"/><inertia {inertia}/></inertial>'
     robot = Robot.from_urdf_text(f'<robot name="drone"><link name="body">{body}</link></robot>', base="floating")
     push = Thrusters("body", [(0.0, 0.0, 0.0)], mass * GRAVITY)  # u is thrust over that at hover
-    return MechanicalSystem(robot, (), (Actuation(), push, RigidBodyBias()))
+    return Model(robot, (), (Actuation(), push, RigidBodies()))
 
 
-def flight(given: str, system: MechanicalSystem, cutoff: float) -> Dataset:
+def flight(given: str, model: Model, cutoff: float) -> Dataset:
     path, at, first = given.partition("@")
     with Path(path).open() as file:
         lines = list(csv.DictReader(file))
@@ -60,7 +60,7 @@ def flight(given: str, system: MechanicalSystem, cutoff: float) -> Dataset:
         u=column("T_sp") / column("hover_throttle"),
         a=differentiate(v, time),
         time=time,
-        system=system,
+        model=model,
     )
     return Preparation(cutoff=cutoff, trim=0.1, differentiate="v").apply(log).dataset
 
@@ -81,13 +81,13 @@ def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
     return float(share.mean()), float(np.sqrt(np.square(away).sum(1).mean()))
 
 
-def compared(system: MechanicalSystem, train: Dataset, test: Dataset, points: int) -> dict[str, tuple[float, float]]:
-    linear = StructuredGP(system, AerodynamicForce(kernel="linear", observe=0.0))
+def compared(model: Model, train: Dataset, test: Dataset, points: int) -> dict[str, tuple[float, float]]:
+    linear = model.with_forces(AerodynamicForce(kernel="linear", observe=0.0))
     usual = replace(linear, prior=AerodynamicForce(kernel="linear"))
-    parametric, own = (each.fit(train, points=min(1000, len(train)), restarts=1) for each in (linear, usual))
+    parametric, own = (fit(each, train, points=min(1000, len(train)), restarts=1) for each in (linear, usual))
     seconds = min(TIMES, key=lambda each: training_error(parametric, train, each))
-    force = StructuredGP(system, AerodynamicForce()).fit(train, points=min(points, len(train)), restarts=1)
-    independent = IndependentGP(system).fit(train, points=min(points, len(train)), restarts=1)
+    force = fit(model.with_forces(AerodynamicForce()), train, points=min(points, len(train)), restarts=1)
+    independent = fit(model.black_box(), train, points=min(points, len(train)), restarts=1)
     return {
         "force prior": scores(*observing(force, test)),
         "parametric with our observers": scores(*observing(own, test)),
@@ -105,12 +105,12 @@ def main() -> None:
     parser.add_argument("--cutoff", type=float, default=6.0, help="of the filter in Hz")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    system = system_of(options.mass)
-    flights = [flight(path, system, options.cutoff) for path in options.flights]
+    model = model_of(options.mass)
+    flights = [flight(path, model, options.cutoff) for path in options.flights]
     results = []
     for k, test in enumerate(flights):
         train = joined([each for other, each in enumerate(flights) if other != k])
-        found = compared(system, train, test, options.rows)
+        found = compared(model, train, test, options.rows)
         results.append(found)
         for name, (share, away) in found.items():
             print(f"{Path(options.flights[k]).stem:32} {name:30} {share:.3f} {away:.3f} m", flush=True)

@@ -10,32 +10,32 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tests.analytical.realdata import dfki, dfki_system, multiarm, multiarm_system, panda, panda_system
+from tests.evidence.realdata import dfki, dfki_system, multiarm, multiarm_system, panda, panda_system
 
-from forcegp.analytical import identify_analytical, motion_residuals, residual_scores
 from forcegp.data import Dataset
-from forcegp.mechanics import MechanicalSystem, ViscousJointFriction
+from forcegp.evidence import Accelerations, Evidence, Torques, motion_residuals, residual_scores
+from forcegp.fit import fit
+from forcegp.forces import Viscous, parse_forces
+from forcegp.model import Model
 
-DRIVEN: tuple[dict[str, Any], ...] = (
-    {"friction": ("viscous", "coulomb"), "rotors": "rotor", "likelihood": "torque"},
-    {"friction": ("viscous", "coulomb"), "rotors": "rotor", "likelihood": "acceleration"},
-    {"friction": ("viscous", "coulomb"), "rotors": "rotor", "likelihood": "acceleration", "robust": True},
-    {"friction": ("viscous", "stribeck"), "rotors": "rotor", "likelihood": "acceleration"},
-    {"friction": ("viscous", "load"), "rotors": "rotor", "likelihood": "acceleration"},
-    {"friction": ("viscous", "load"), "rotors": "armature", "likelihood": "acceleration"},
+DRIVEN = (
+    ("bodies,viscous,coulomb,coupled-rotors", Torques()),
+    ("bodies,viscous,coulomb,coupled-rotors", Accelerations()),
+    ("bodies,viscous,coulomb,coupled-rotors", Accelerations(robust=True)),
+    ("bodies,viscous,stribeck,coupled-rotors", Accelerations()),
+    ("bodies,viscous,load,coupled-rotors", Accelerations()),
+    ("bodies,viscous,load,rotor", Accelerations()),
 )
-MANIPULATOR: tuple[dict[str, Any], ...] = (
-    {"friction": ("viscous", "coulomb", "offset"), "inertias": "free"},
-    {"friction": ("viscous", "coulomb", "offset"), "inertias": "consistent"},
-    {"friction": ("viscous", "coulomb", "offset"), "inertias": "consistent", "rotors": None},
-    {"friction": ("viscous", "stribeck", "offset"), "inertias": "consistent"},
-    {"friction": ("viscous", "coulomb", "offset"), "inertias": "consistent", "prior_strength": 0.1},
-    {"friction": ("viscous", "coulomb", "offset"), "inertias": "consistent", "robust": True},
+MANIPULATOR = (
+    ("bodies,viscous,coulomb,offset,rotor", Torques()),
+    ("bodies,viscous,coulomb,offset", Torques()),
+    ("bodies,viscous,stribeck,offset,rotor", Torques()),
+    ("bodies,viscous,coulomb,offset,rotor", Torques(robust=True)),
 )
 
 
@@ -47,7 +47,7 @@ def main(words: list[str]) -> None:
     if not (folder / "README.md").exists():
         sys.exit(f"{folder} holds no recordings; name the folder realdata that is kept beside this checkout.")
     if "multiarm" in names:
-        published = multiarm_system(ViscousJointFriction([2.37142783e-4, 1.00000019e-5]))
+        published = multiarm_system(Viscous([2.37142783e-4, 1.00000019e-5]))
         data = multiarm(folder, published)
         force, acceleration = (x.cumsum(1) for x in motion_residuals(data, published))
         absolute = replace(data, a=data.a.cumsum(1))
@@ -55,30 +55,28 @@ def main(words: list[str]) -> None:
             "multiarm, published, absolute angles", residual_scores(force, acceleration, absolute), "acceleration_nrmse"
         )
     if "dfki" in names:
-        system = dfki_system(folder)
-        train, test = (dfki(folder, system, *runs) for runs in ((143524, 143601, 143704, 144115), (143339, 143747)))
-        compared("dfki", system, train, test, DRIVEN, "acceleration_nrmse")
+        model = dfki_system(folder)
+        train, test = (dfki(folder, model, *runs) for runs in ((143524, 143601, 143704, 144115), (143339, 143747)))
+        compared("dfki", model, train, test, DRIVEN, "acceleration_nrmse")
     if "panda" in names:
-        system = panda_system(folder)
-        train, test = panda(folder, system)
-        compared("panda", system, train, test, MANIPULATOR, "force_rms")
-        compared("panda", system, train, test, MANIPULATOR[1:2], "acceleration_nrmse")
+        model = panda_system(folder)
+        train, test = panda(folder, model)
+        compared("panda", model, train, test, MANIPULATOR, "force_rms")
+        compared("panda", model, train, test, MANIPULATOR[1:2], "acceleration_nrmse")
 
 
 def compared(
-    name: str, system: MechanicalSystem, train: Dataset, test: Dataset, choices: tuple[dict[str, Any], ...], key: str
+    name: str, model: Model, train: Dataset, test: Dataset, choices: Sequence[tuple[str, Evidence]], key: str
 ) -> None:
     """The system as given and every identification of it, by this score on the test rows."""
-    told(f"{name}, as given", residual_scores(*motion_residuals(test, system), test), key)
-    for choice in choices:
+    told(f"{name}, as given", residual_scores(*motion_residuals(test, model), test), key)
+    for forces, evidence in choices:
         begin = time.process_time()
-        found = identify_analytical(train, system, **choice)
+        found = fit(model.with_forces(parse_forces(forces)), train, evidence)
         seconds = time.process_time() - begin
-        words = " ".join("+".join(v) if isinstance(v, tuple) else f"{k}={v}" for k, v in choice.items())
-        state = "" if found.fit.settled else ", not settled"
-        told(
-            f"{name}, {words} ({seconds:.1f} s, condition {found.condition_number:.0f}{state})", found.scores(test), key
-        )
+        state = "" if found.parameters.settled else ", not settled"
+        scores = residual_scores(*motion_residuals(test, found.model), test)
+        told(f"{name}, {forces}, {evidence} ({seconds:.1f} s{state})", scores, key)
 
 
 def told(what: str, scores: dict[str, list[float]], key: str) -> None:

@@ -13,9 +13,10 @@ import time
 import numpy as np
 import torch
 
-from forcegp import Baumgarte, KukaSurfaceConfig, StructuredGP, simulate_kuka_surface
+from forcegp import Baumgarte, KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.data import recorded_motions
 from forcegp.evaluation import rollout_errors
+from forcegp.forces import JointForces
 
 HELD = Baumgarte(10.0, 1.0)
 RUNS = (("symplectic-euler", HELD, 0), ("symplectic-euler", None, 0), ("rk4", HELD, 0), ("projected", None, 0))
@@ -31,9 +32,9 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     train, test = (simulate_kuka_surface(KukaSurfaceConfig(seconds=20, seed=given.seed + k)) for k in (0, 1))
-    assert train.system is not None
-    assert test.system is not None
-    posterior = StructuredGP(train.system).fit(train, points=given.points, restarts=1)
+    assert train.model is not None
+    assert test.model is not None
+    posterior = fit(train.model.with_forces(JointForces()), train, points=given.points, restarts=1)
     recorded = recorded_motions(test, given.starts, given.seconds)
     header = ("integrator", "Baumgarte", "largest \\|c\\| [mm]", "median \\|c\\| [mm]")
     print("|", " | ".join((*header, "joint error [rad]: median, largest", "CPU")), "|")
@@ -50,7 +51,7 @@ def main() -> None:
             samples=samples,
         )
         seconds = time.process_time() - begin
-        errors = rollout_errors(rollout, recorded, posterior.system)
+        errors = rollout_errors(rollout, recorded, posterior.model)
         assert errors.constraint is not None
         if errors.inside is not None:
             share = f"{np.mean(errors.inside[:, 1:]):.1%} of the recorded positions"

@@ -23,11 +23,12 @@ import psutil
 import torch
 
 from benchmarks.large_data import RECORDINGS, in_own_process, peak_bytes, recording
-from forcegp import JointForces, StructuredGP, ToolForces, load_posterior, save_posterior
+from forcegp import JointForces, ToolForces, fit, load_posterior, save_posterior
 from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
+from forcegp.evaluation.plots.style import SMALL
+from forcegp.fit.refinement import on_all_rows
 from forcegp.inference import ENGINES, Inducing
-from forcegp.models.structured.refinement import on_all_rows
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "benchmarks" / "performance"
 SEED, SECONDS = 903, 420.0
@@ -49,7 +50,7 @@ def hyperparameters(engine: str) -> Path:
     if not folder.exists():
         data = recording(SEED, SECONDS)
         few = farthest_rows(data.rows(slice(0, None, 50)), 250)
-        save_posterior(StructuredGP(data.system, prior).fit(few, restarts=1), folder)
+        save_posterior(fit(data.model.with_forces(prior), few, restarts=1), folder)
     return folder
 
 
@@ -90,7 +91,7 @@ def run() -> dict[str, float]:
 
 def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     """Time and memory over the number of rows."""
-    from forcegp.evaluation.plots.style import SERIES, SMALL, new_figure, quiet, save_figure
+    from forcegp.evaluation.plots.style import SERIES, new_figure, quiet, save_figure
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2)

@@ -13,28 +13,36 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from benchmarks.large_data import recording
 from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODELS
-from forcegp import Dataset, StructuredGP
+from forcegp import Dataset
 from forcegp.data import farthest_rows
-from forcegp.priors import named_prior
+from forcegp.fit import fit
+from forcegp.forces import parse_forces
 
 SEEDS = (11, 12, 13, 14, 15)
 SECONDS = 60.0
 POINTS = 100
 COULOMB = {"joint_friction": "coulomb"}
 LOAD = {**COULOMB, "friction": "coulomb"}
-FRICTION = {"tool-friction": {}, "joint-friction": COULOMB, "joint-friction+load-friction:expected=0.3": LOAD}
+FRICTION = {
+    "gp:tool-friction": {},
+    "gp:joint-friction": COULOMB,
+    "gp:joint-friction,gp:load-friction:expected=0.3": LOAD,
+}
 
 
 def model_of(name: str, data: Dataset) -> Callable[..., object]:
     """The `fit` of a model of figure 2b, or with a prior."""
-    assert data.system is not None
+    assert data.model is not None
     if name in MODELS:
-        return MODELS[name].make(data.system).fit
-    return StructuredGP(data.system, named_prior(name, data.system)).fit
+        model = MODELS[name].make(data.model)
+    else:
+        model = data.model.with_forces(parse_forces(name))
+    return partial(fit, model)
 
 
 def measured() -> dict[tuple[str, int], tuple[int, float]]:

@@ -20,10 +20,10 @@ POSES, CUTOFF = (2e-4, 5e-4, 1e-3), 10.0  # m and rad of the base, a fifth of it
 
 def with_noise_of_poses(log: Dataset, noise: float, seed: int) -> Dataset:
     """The log as a filter leaves it."""
-    assert log.system is not None
+    assert log.model is not None
     steps = noise * np.random.default_rng(seed).standard_normal(log.v.shape)
     steps[:, 6:] *= 0.2
-    q = log.system.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
+    q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
     return Preparation(cutoff=CUTOFF).apply(replace(log, q=q, truth={}, noise_std=None)).dataset
 
 

@@ -18,20 +18,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from forcegp import (
-    MPPI,
-    Coefficients,
-    CoulombJointFriction,
-    Dataset,
-    JointFriction,
-    MechanicalSystem,
-    NoForces,
-    Noise,
-    Robot,
-    StribeckJointFriction,
-    StructuredGP,
-    ViscousJointFriction,
-)
+from forcegp import MPPI, Coulomb, Dataset, JointFriction, Model, Noise, Robot, Stribeck, Viscous, fit
+from forcegp.evidence import Accelerations
 
 SEEDS = (1, 2, 3, 4, 5)
 DT, STEPS, FINE = 0.02, 200, 20  # s, of the controller, and steps of the simulation in each
@@ -50,13 +38,13 @@ URDF = "".join(
         "</robot>",
     )
 )
-STRIBECK = StribeckJointFriction([0.6, 0.4], [1.0, 0.7], [0.3, 0.3], [0.05, 0.05])
-VISCOUS = ViscousJointFriction([0.1, 0.05])
+STRIBECK = Stribeck([0.6, 0.4], [1.0, 0.7], [0.3, 0.3], [0.05, 0.05])
+VISCOUS = Viscous([0.1, 0.05])
 
 
-def system_of(*friction: object) -> MechanicalSystem:
-    system = MechanicalSystem(Robot.from_urdf_text(URDF))
-    return replace(system, known_forces=(*system.known_forces, *friction))
+def model_of(*friction: object) -> Model:
+    model = Model(Robot.from_urdf_text(URDF))
+    return replace(model, forces=(*model.forces, *friction))
 
 
 class Arm:
@@ -90,7 +78,7 @@ def recorded(seed: int) -> Dataset:
             rows.append([arm.q, arm.v, u, noisy])
         arm.step(u)
     q, v, u, a = (torch.stack(x).numpy() for x in zip(*rows, strict=True))
-    return Dataset(q=q, v=v, u=u, a=a, time=0.2 * np.arange(len(q)), system=system_of())
+    return Dataset(q=q, v=v, u=u, a=a, time=0.2 * np.arange(len(q)), model=model_of())
 
 
 def running(q: torch.Tensor, v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
@@ -120,14 +108,13 @@ def swung_up(predictor: object, seed: int) -> tuple[float, float]:
 def models(data: Dataset, seed: int) -> dict[str, object]:
     """Name -> posterior, all of the same rows."""
     how = {"restarts": 1, "seed": seed}
-    laws = system_of(ViscousJointFriction(0.1), CoulombJointFriction(0.1, 0.05))
-    learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
+    laws = model_of(Viscous(), Coulomb(None, 0.05))
     noise = Noise(0.1, learn=False)
     return {
-        "URDF": StructuredGP(system_of(), NoForces(), noise=noise).fit(data, **how),
-        "Coulomb's and viscous friction": StructuredGP(laws, NoForces()).identify(data, learn, **how),
-        "learned": StructuredGP(system_of(), JointFriction(), noise=noise).fit(data, **how),
-        "true": StructuredGP(system_of(STRIBECK, VISCOUS), NoForces(), noise=noise).fit(data, **how),
+        "URDF": fit(model_of().with_forces(noise=noise), data, **how),
+        "Coulomb's and viscous friction": fit(laws, data, Accelerations(), seed=seed),
+        "learned": fit(model_of().with_forces(JointFriction(), noise=noise), data, **how),
+        "true": fit(model_of(STRIBECK, VISCOUS).with_forces(noise=noise), data, **how),
     }
 
 

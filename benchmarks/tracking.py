@@ -23,22 +23,22 @@ import numpy as np
 import torch
 
 from forcegp import (
-    Coefficients,
     ComputedTorque,
-    CoulombJointFriction,
+    Coulomb,
     Dataset,
     JointFriction,
     KukaSurfaceConfig,
-    MechanicalSystem,
-    NoForces,
+    Model,
     PDGravity,
     Robot,
-    StructuredGP,
-    ViscousJointFriction,
-    identify_analytical,
+    Viscous,
+    fit,
 )
 from forcegp.data import farthest_rows
-from forcegp.models import StructuredPosterior
+from forcegp.evidence import Accelerations
+from forcegp.forces import RigidBodies, Rotor
+from forcegp.forces.registry import usual_friction
+from forcegp.posterior import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 from forcegp.simulation.kuka_motion import kuka_urdf
 
@@ -87,7 +87,7 @@ def followed(
     robot: Robot, reference: Reference, control: Callable[..., torch.Tensor], seconds: float
 ) -> dict[str, np.ndarray]:
     """q, v, u at the beginning of every period of the controller, and the error there."""
-    plant, law = robot.compile(), JointFrictionLaw(CONFIG)
+    plant, law = robot.compile(), JointFrictionLaw(CONFIG, robot)
     (q, v, _), rows = reference(0.0), []
     for k in range(round(seconds * RATE)):
         q_d, v_d, a_d = reference(k / RATE)
@@ -100,37 +100,36 @@ def followed(
     return {name: np.array(x) for name, x in zip(("q", "v", "u", "e"), zip(*rows, strict=True), strict=True)}
 
 
-def rows_of(motion: dict[str, np.ndarray], system: MechanicalSystem, seed: int, count: int = ROWS) -> Dataset:
+def rows_of(motion: dict[str, np.ndarray], model: Model, seed: int, count: int = ROWS) -> Dataset:
     """What a user has of that motion: noisy accelerations, and rows far apart."""
     q, v, u = (motion[name] for name in "qvu")
     a = np.diff(v, axis=0) * RATE + NOISE * np.random.default_rng([seed, 9]).standard_normal((len(v) - 1, 7))
     middle = [0.5 * (x[1:] + x[:-1]) for x in (q, v)]
     data = Dataset(
-        q=middle[0], v=middle[1], u=u[:-1], a=a, time=np.arange(len(a)) / RATE, system=system,
+        q=middle[0], v=middle[1], u=u[:-1], a=a, time=np.arange(len(a)) / RATE, model=model,
         noise_std=np.full(7, NOISE),
     )  # fmt: skip
     return farthest_rows(data, count)
 
 
-def fits(data: Dataset, given: MechanicalSystem, seed: int) -> dict[str, StructuredPosterior]:
+def fits(data: Dataset, given: Model, seed: int) -> dict[str, StructuredPosterior]:
     """Name -> model; all but the first learn from the same rows."""
     laws = replace(
         given,
-        known_forces=(
-            *given.known_forces,
-            ViscousJointFriction(0.1),
-            CoulombJointFriction(0.1, CONFIG.joint_smoothing),
+        forces=(
+            *given.forces,
+            Viscous(),
+            Coulomb(None, CONFIG.joint_smoothing),
         ),
     )
-    learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
     return {
-        "URDF": StructuredGP(given, NoForces()).fit(data, restarts=1, seed=seed),
-        "Coulomb's and viscous friction": StructuredGP(laws, NoForces()).identify(data, learn, restarts=1, seed=seed),
-        "learned": StructuredGP(given, JointFriction()).fit(data, restarts=1, seed=seed),
+        "URDF": fit(given, data, restarts=1, seed=seed),
+        "Coulomb's and viscous friction": fit(laws, data, Accelerations(), seed=seed),
+        "learned": fit(given.with_forces(JointFriction()), data, restarts=1, seed=seed),
     }
 
 
-def controllers(data: Dataset, given: MechanicalSystem, true: Robot, seed: int) -> dict[str, Callable]:
+def controllers(data: Dataset, given: Model, true: Robot, seed: int) -> dict[str, Callable]:
     """Name -> controller."""
     made = {
         name: ComputedTorque(fit.predictor(covariance="none"), **GAINS) for name, fit in fits(data, given, seed).items()
@@ -142,8 +141,8 @@ class TrueModel(ComputedTorque):
     """Computed torque by the masses and the friction of the simulation."""
 
     def __init__(self, robot: Robot) -> None:
-        super().__init__(MechanicalSystem(robot), **GAINS)
-        self.plant, self.law = robot.compile(), JointFrictionLaw(CONFIG)
+        super().__init__(Model(robot), **GAINS)
+        self.plant, self.law = robot.compile(), JointFrictionLaw(CONFIG, robot)
 
     def _torques(self, q, v, v_d, a_d, e, e_v):
         return self.plant.inverse_dynamics(q, v_d, a_d + self.feedback(e, e_v)) + torch.from_numpy(
@@ -168,7 +167,7 @@ def excitation(seed: int) -> Reference:
 def by_rows(seed: int) -> dict[str, dict[str, float]]:
     """Rows of another motion and of the task itself -> controller -> error."""
     robot, task = robot_of(), task_of(seed)
-    given, found = MechanicalSystem(robot), {}
+    given, found = Model(robot), {}
     for name, reference in {"excitation": excitation(seed), "task": task}.items():
         motion = followed(robot, reference, PDGravity(robot.compile(), **GAINS), 20.0)
         rivals = controllers(rows_of(motion, given, seed), given, robot, seed)
@@ -178,11 +177,12 @@ def by_rows(seed: int) -> dict[str, dict[str, float]]:
 
 def with_payload(seed: int) -> dict[str, dict[str, float]]:
     """All inertias of the URDF 10 % too large, 0.5 kg at the tool that it lacks, 30 s under PD of the URDF."""
-    true, given, task = robot_of(payload=0.5), MechanicalSystem(robot_of(inertia=1.1)), task_of(seed)
+    true, given, task = robot_of(payload=0.5), Model(robot_of(inertia=1.1)), task_of(seed)
     motion = followed(true, excitation(seed), PDGravity(given.robot.compile(), **GAINS), 30.0)
     rows = rows_of(motion, given, seed, len(motion["q"]) - 1)
-    identified = identify_analytical(rows, likelihood="acceleration").system
-    learned = StructuredGP(identified, JointFriction()).fit(rows, points=200, restarts=1, seed=seed)
+    bodies = given.with_forces(RigidBodies("all"), usual_friction(), Rotor())
+    identified = fit(bodies, rows, Accelerations()).model
+    learned = fit(identified.with_forces(JointFriction()), rows, points=200, restarts=1, seed=seed)
     rivals = {
         "URDF": ComputedTorque(given, **GAINS),
         "identified": ComputedTorque(identified, **GAINS),

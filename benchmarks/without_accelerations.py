@@ -5,7 +5,7 @@
 
 Both sides learn the same forces from the same number of points of the same training runs, windows or rows, with one
 search from moments. Filtered rows: zero-phase Butterworth of order 4 on q and u, v and a by central differences, 0.12 s
-off both ends. Windows: `WeakForm` on the raw log. Seeds choose the points: where
+off both ends. WindowedRows: `Windows` on the raw log. Seeds choose the points: where
 farthest-point sampling of rows begins, where the first window of a run begins. Two scores on the test runs:
 
 * nRMSE of the acceleration against the reference filter of the rig, which favours the side that learned from it;
@@ -29,20 +29,15 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from forcegp.data import (
-    Dataset,
-    Preparation,
-    WeakForm,
-    farthest_rows,
-    resample,
-    units_for,
-)
+from forcegp.data import Dataset, Preparation, farthest_rows, resample, units_for
 from forcegp.data.motion_records import RecordedMotions, recorded_motions
 from forcegp.errors import DataWarning, NumericalWarning
-from forcegp.mechanics import Actuation, MechanicalSystem, RigidBodyBias, RotorInertia
-from forcegp.models import Noise, StructuredGP, StructuredPosterior
-from forcegp.models.structured.marginal_likelihood import Mean
-from forcegp.priors import ForcePrior, JointForces, JointFriction, NoForces
+from forcegp.evidence import Windows
+from forcegp.fit import fit
+from forcegp.forces import Actuation, CoupledRotors, JointForces, JointFriction, RigidBodies, Unknown
+from forcegp.model import Model
+from forcegp.noise import Noise
+from forcegp.posterior import StructuredPosterior
 from forcegp.robots import Robot
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -60,8 +55,8 @@ class Rig:
 
     train: Dataset
     test: Dataset
-    prior: ForcePrior
-    mean: Mean
+    forces: tuple[Unknown, ...]
+    mean: bool
     reference: float
     cutoffs: tuple[float, ...]
     seconds: tuple[float, ...]
@@ -73,8 +68,8 @@ def dfki(folder: Path) -> Rig:
     home = folder / "dfki_double_pendulum"
     robot = Robot.from_urdf(home / "model" / "double_pendulum_C1.urdf")
     gear, rotor = 6.0, 6.287203962819607e-05  # model_1.0.yml
-    rotors = RotorInertia((rotor, rotor), ((gear, 0.0), (1.0, -gear)))
-    system = MechanicalSystem(robot, known_forces=(Actuation(), RigidBodyBias(), rotors))
+    rotors = CoupledRotors((rotor, rotor), ((gear, 0.0), (1.0, -gear)))
+    model = Model(robot, forces=(Actuation(), RigidBodies(), rotors))
 
     def runs(*names: str) -> Dataset:
         episodes = []
@@ -84,11 +79,11 @@ def dfki(folder: Path) -> Rig:
                 table = dict(zip(columns, np.loadtxt(file, delimiter=",").T, strict=True))
             q, u = (np.stack([table[f"{what}{j}"] for j in (1, 2)], axis=1) for what in ("pos_meas", "tau_meas"))
             episodes.append((table["time"] - table["time"][0], q, u))
-        return resample(_dataset(system, episodes), 0.002)
+        return resample(_dataset(model, episodes), 0.002)
 
     train, test = runs("143524", "143601", "143704", "144115"), runs("143339", "143747")
-    prior = JointFriction() + JointForces(inputs=("q", "v"))
-    return Rig(train, test, prior, "analytical", 20.0, (10.0, 20.0, 30.0, 40.0), (0.06, 0.1, 0.15, 0.2), 0.05)
+    forces = JointFriction(), JointForces(inputs=("q", "v"))
+    return Rig(train, test, forces, True, 20.0, (10.0, 20.0, 30.0, 40.0), (0.06, 0.1, 0.15, 0.2), 0.05)
 
 
 def multiarm(folder: Path) -> Rig:
@@ -100,7 +95,7 @@ def multiarm(folder: Path) -> Rig:
     ]
     parts = "\n".join(PENDULUM_LINK.format(**link) for link in links)
     robot = Robot.from_urdf_text(f'<robot name="multiarm"><link name="base"/>{parts}</robot>', gravity=(0, 0, -9.80858))
-    system = MechanicalSystem(robot)
+    model = Model(robot)
 
     def runs(numbers: range) -> Dataset:
         episodes = []
@@ -108,21 +103,21 @@ def multiarm(folder: Path) -> Rig:
             angles = pieces[f"piece{number:02d}"][:, :2]
             q = np.stack([angles[:, 0], angles[:, 1] - angles[:, 0]], axis=1)
             episodes.append((float(pieces["dt"]) * np.arange(len(q)), q, np.zeros_like(q)))
-        return _dataset(system, episodes)
+        return _dataset(model, episodes)
 
-    train, test, prior = runs(range(0, 12, 2)), runs(range(1, 12, 2)), JointForces(inputs=("q", "v"))
-    return Rig(train, test, prior, "zero", 25.0, (15.0, 20.0, 25.0, 35.0, 50.0), (0.04, 0.06, 0.08, 0.12), None)
+    train, test, forces = runs(range(0, 12, 2)), runs(range(1, 12, 2)), (JointForces(inputs=("q", "v")),)
+    return Rig(train, test, forces, False, 25.0, (15.0, 20.0, 25.0, 35.0, 50.0), (0.04, 0.06, 0.08, 0.12), None)
 
 
 RIGS = {"dfki": dfki, "multiarm": multiarm}
 
 
-def _dataset(system: MechanicalSystem, episodes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Dataset:
+def _dataset(model: Model, episodes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Dataset:
     time, q, u = (np.concatenate(parts) for parts in zip(*episodes, strict=True))
     v = np.concatenate([np.gradient(q, time, axis=0) for time, q, _ in episodes])
     numbers = np.concatenate([np.full(len(time), k) for k, (time, *_) in enumerate(episodes)])
-    robot = system.robot
-    return Dataset(q=q, v=v, u=u, a=np.zeros_like(q), time=time, episode=numbers, units=units_for(robot), system=system)
+    robot = model.robot
+    return Dataset(q=q, v=v, u=u, a=np.zeros_like(q), time=time, episode=numbers, units=units_for(robot), model=model)
 
 
 def coarse(rig: Rig, counts: int) -> Rig:
@@ -142,7 +137,7 @@ MORE, MORE_WINDOWS = 6, 3
 class Source:
     """What is learned from: rows after a low-pass [Hz], windows, or nothing; `times` as many as there are points."""
 
-    how: float | Literal["auto"] | WeakForm | None
+    how: float | Literal["auto"] | Windows | None
     times: int = 1
 
 
@@ -154,22 +149,23 @@ def sources(rig: Rig) -> Iterator[tuple[str, Source]]:
         yield f"filtered at {cutoff:g} Hz", Source(cutoff)
     yield f"filtered at {rig.reference:g} Hz, {MORE} x the points", Source(rig.reference, MORE)
     for seconds in rig.seconds:
-        yield f"weak form, q, {seconds:g} s", Source(WeakForm(seconds))
-    short = WeakForm(min(rig.seconds), nodes=2)
+        yield f"weak form, q, {seconds:g} s", Source(Windows(seconds))
+    short = Windows(min(rig.seconds), nodes=2)
     yield f"weak form, {short.seconds:g} s, {MORE_WINDOWS} x the points", Source(short, MORE_WINDOWS)
 
 
 def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPosterior:
     how, points = source.how, source.times * points
     if how is None:
-        return StructuredGP(rig.train.system, NoForces(), noise=Noise(1.0)).fit(rig.train, points=2)
-    model = StructuredGP(rig.train.system, rig.prior, rig.mean)
-    if isinstance(how, WeakForm):
+        return fit(rig.train.model.with_forces(noise=Noise(1.0)), rig.train, points=2)
+    model = rig.train.model.with_forces(rig.forces)
+    model = model if rig.mean else model.without_mean()
+    if isinstance(how, Windows):
         noise = None if rig.force_noise is None else Noise(None, rig.force_noise, learn=True)
-        return replace(model, noise=noise).fit_windows(_later(rig.train, 5 * seed), how, points=points, restarts=1)
+        return fit(replace(model, noise=noise), _later(rig.train, 5 * seed), how, points=points, restarts=1)
     rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train).dataset
     noise = Noise(1.0, rig.force_noise, learn=True)
-    return replace(model, noise=noise).fit(farthest_rows(rows, points, seed=seed), restarts=1)
+    return fit(replace(model, noise=noise), farthest_rows(rows, points, seed=seed), restarts=1)
 
 
 def _later(raw: Dataset, rows: int) -> Dataset:

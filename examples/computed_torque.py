@@ -5,7 +5,7 @@ import torch
 from two_links import NOMINAL, TRUE
 from two_links_log import recorded
 
-from forcegp import ComputedTorque, JointFriction, NoForces, StructuredGP
+from forcegp import ComputedTorque, JointFriction, fit
 
 DT, PACE, SIZE = 0.01, np.array([3.0, 4.0]), np.array([0.5, 0.4])
 
@@ -17,9 +17,9 @@ def reference(time):
 
 
 log = recorded()
-arm = StructuredGP(TRUE, NoForces()).fit(log, points=20).predictor(covariance="none")  # stands for the robot
-for name, prior in {"URDF": NoForces(), "learned friction": JointFriction()}.items():
-    model = StructuredGP(NOMINAL, prior).fit(log, points=100, restarts=1)
+arm = fit(TRUE, log, points=20).predictor(covariance="none")  # stands for the robot
+for name, prior in {"URDF": (), "learned friction": JointFriction()}.items():
+    model = fit(NOMINAL.with_forces(prior), log, points=100, restarts=1)
     control = ComputedTorque(model.predictor(covariance="none"), stiffness=100.0, torque_limits=2.0)
     q, v, _ = map(torch.tensor, reference(0.0))
     errors = []

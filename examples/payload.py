@@ -6,14 +6,14 @@ Needs `pip install 'forcegp[mujoco]'`.
 import numpy as np
 from ur5_log import URDF, recorded
 
-from forcegp import Dataset, MechanicalSystem, Preparation, Robot
-from forcegp.analytical import identify_payload
+from forcegp import Dataset, Model, Offset, Payload, Preparation, Robot, Rotor, Stribeck, Viscous, fit
 
 time, q, v, u = np.split(recorded(seconds=12.0), [1, 7, 13], axis=1)
 a = np.gradient(v, time[:, 0], axis=0)
-log = Dataset(q=q, v=v, u=u, a=a, time=time[:, 0], system=MechanicalSystem(Robot.from_urdf_text(URDF)))
+log = Dataset(q=q, v=v, u=u, a=a, time=time[:, 0], model=Model(Robot.from_urdf_text(URDF)))
 data = Preparation(cutoff=12.0, every=13, trim=0.1).apply(log).dataset
 
-found = identify_payload(data, link="tool0")
-x, y, z = 1e3 * found.center_of_mass
-print(f"{found.mass:.3f} +- {2 * found.standard_errors['mass']:.3f} kg at ({x:.0f}, {y:.0f}, {z:.0f}) mm")
+model = data.model.with_forces(Viscous(), Stribeck(), Offset(), Rotor(), Payload("tool0"))
+found = fit(model, data).parameters
+x, y, z = (1e3 * found[f"payload.center_of_mass.{axis}"].value for axis in "xyz")
+print(f"{found['payload.mass'].value:.3f} +- {2 * found['payload.mass'].std:.3f} kg at ({x:.0f}, {y:.0f}, {z:.0f}) mm")

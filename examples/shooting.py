@@ -11,12 +11,12 @@ from true_arm import TrueArm
 from two_links import DT, HANGING, LIMIT, NOMINAL, UPRIGHT
 from two_links_log import recorded
 
-from forcegp import JointFriction, StructuredGP
+from forcegp import JointFriction, fit
 
 MOTIONS, STEPS, SPREAD, KEPT = 512, 25, 0.15, 0.8  # Nm, and how much of a random torque the next step keeps
 torch.set_num_threads(1)
 data, generator = recorded(), torch.Generator().manual_seed(0)
-learned = StructuredGP(NOMINAL, JointFriction()).fit(data, points=120, restarts=1)
+learned = fit(NOMINAL.with_forces(JointFriction()), data, points=120, restarts=1)
 predictor, arm = learned.predictor(covariance="none"), TrueArm(data)
 state, torques, taken = HANGING, torch.zeros(STEPS, 2, dtype=torch.float64), []
 for _ in range(round(3.0 / DT)):

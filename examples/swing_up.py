@@ -9,11 +9,11 @@ from true_arm import TrueArm
 from two_links import HANGING, NOMINAL
 from two_links_log import recorded
 
-from forcegp import JointFriction, NoForces, StructuredGP
+from forcegp import JointFriction, fit
 
 data = recorded()
-learned = StructuredGP(NOMINAL, JointFriction()).fit(data, points=120, restarts=1)
-nominal = StructuredGP(NOMINAL, NoForces()).fit(data, points=20, restarts=1)
+learned = fit(NOMINAL.with_forces(JointFriction()), data, points=120, restarts=1)
+nominal = fit(NOMINAL, data, points=20, restarts=1)
 arm, plans = TrueArm(data), {}
 for title, posterior in (("planned without friction", nominal), ("planned with learned friction", learned)):
     u, states, iterations = plan(posterior)

@@ -4,7 +4,7 @@ import casadi
 import numpy as np
 from two_links import DT, HANGING, LIMIT, UPRIGHT
 
-from forcegp.models import casadi_function
+from forcegp.posterior import casadi_function
 
 STEPS = 75
 SLOW = 1e-3  # what (rad/s)^2 cost beside Nm^2

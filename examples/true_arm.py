@@ -3,14 +3,14 @@
 import torch
 from two_links import DT, TRUE
 
-from forcegp import NoForces, StructuredGP
+from forcegp import fit
 
 
 class TrueArm:
     """Moves in steps ten times shorter than those of plans."""
 
     def __init__(self, data):
-        self.predictor = StructuredGP(TRUE, NoForces()).fit(data, points=20, restarts=1).predictor(covariance="none")
+        self.predictor = fit(TRUE, data, points=20, restarts=1).predictor(covariance="none")
 
     def __call__(self, state, u):
         """States (T + 1, 4) from one under torques (T, 2), each held for DT."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from forcegp import Actuation, MechanicalSystem, RigidBodyBias, Robot, StribeckJointFriction
+from forcegp import Actuation, Model, RigidBodies, Robot, Stribeck
 
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="0.1"/>
 <inertia ixx="0.003" iyy="0.003" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
@@ -17,9 +17,9 @@ URDF = '<robot name="two links"><link name="base"/>' + "".join(
     ]
 )
 ROBOT = Robot.from_urdf_text(URDF + "</robot>")
-NOMINAL = MechanicalSystem(ROBOT, (), (Actuation(), RigidBodyBias()))
-FRICTION = StribeckJointFriction(coulomb=0.1, static=0.15, stribeck_velocity=0.1, velocity_scale=0.1)  # Nm, rad/s
-TRUE = MechanicalSystem(ROBOT, (), (Actuation(), RigidBodyBias(), FRICTION))
+NOMINAL = Model(ROBOT, (), (Actuation(), RigidBodies()))
+FRICTION = Stribeck(level=0.1, breakaway=0.05, stribeck_velocity=0.1, velocity_scale=0.1)  # Nm, rad/s
+TRUE = Model(ROBOT, (), (Actuation(), RigidBodies(), FRICTION))
 HANGING, UPRIGHT = np.array([np.pi / 2, 0.0, 0.0, 0.0]), np.array([-np.pi / 2, 0.0, 0.0, 0.0])  # [q, v]
 DT = 0.02  # s
 LIMIT = 0.45  # Nm; gravity needs 0.39 Nm at the shoulder where the arm is level

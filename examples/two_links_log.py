@@ -28,4 +28,4 @@ def recorded(count=12, steps=100, noise=0.2):
     a = acceleration(q, v, u).numpy() + generator.normal(0.0, noise, q.shape)
     given = {"time": np.tile(time[::2], count), "episode": np.repeat(np.arange(count), steps // 2)}
     q, v, u = (x.numpy() for x in (q, v, u))
-    return Dataset(q=q, v=v, u=u, a=a, system=NOMINAL, noise_std=np.full(2, noise), **given)
+    return Dataset(q=q, v=v, u=u, a=a, model=NOMINAL, noise_std=np.full(2, noise), **given)

@@ -36,12 +36,12 @@ from forcegp.evaluation.plots.style import (
     quiet,
 )
 from forcegp.jobs import JobStore
-from forcegp.models import load_posterior
+from forcegp.posterior import load_posterior
 
 EFFICIENT = {
-    "joint forces on (q, v, u), the paper's": "joint",
-    "tool friction": "tool-friction",
-    "contact friction, isotropic": "contact-friction",
+    "joint forces on (q, v, u), the paper's": "gp:joint",
+    "tool friction": "gp:tool-friction",
+    "contact friction, isotropic": "gp:contact-friction",
 }
 
 
@@ -100,17 +100,17 @@ class DataEfficiency(ForceExperiment):
 
 JOINT_FORCES = "joint forces (the paper's)"
 TOOL = {
-    JOINT_FORCES: "joint",
-    "tool friction": "tool-friction",
-    "tool forces on velocity and place": "tool-forces",
-    "contact friction": "contact-friction",
-    "load friction": "load-friction",
+    JOINT_FORCES: "gp:joint",
+    "tool friction": "gp:tool-friction",
+    "tool forces on velocity and place": "gp:tool-forces",
+    "contact friction": "gp:contact-friction",
+    "load friction": "gp:load-friction",
 }
 WITH_JOINTS = {
-    JOINT_FORCES: "joint",
-    "joint + tool friction": "joint-friction+tool-friction",
-    "joint + contact friction": "joint-friction+contact-friction",
-    "joint + load friction": "joint-friction+load-friction",
+    JOINT_FORCES: "gp:joint",
+    "joint + tool friction": "gp:joint-friction,gp:tool-friction",
+    "joint + contact friction": "gp:joint-friction,gp:contact-friction",
+    "joint + load friction": "gp:joint-friction,gp:load-friction",
 }
 PRIORS = dict.fromkeys(("viscous", "coulomb", "stribeck"), TOOL)
 PRIORS |= dict.fromkeys(("viscous-joints", "stribeck-joints"), WITH_JOINTS)
@@ -177,9 +177,9 @@ RIVALS = {
     "known physics alone": KNOWN_PHYSICS,
     "Coulomb's and viscous friction of every joint": LAWS,
     "independent GP": BLACK_BOX,
-    "GP on what known physics leaves": "joint-accelerations",
-    JOINT_FORCES: "joint",
-    "joint friction": "joint-friction",
+    "GP on what known physics leaves": "gp:joint-accelerations",
+    JOINT_FORCES: "gp:joint",
+    "joint friction": "gp:joint-friction",
 }
 
 
@@ -294,9 +294,9 @@ class UnilateralContact(ForceExperiment):
 
 
 KERNELS = {
-    "squared exponential": "friction-map",
-    "Matérn 3/2": "friction-map:kernel=matern-3/2",
-    "deep": "friction-map:kernel=deep",
+    "squared exponential": "gp:friction-map",
+    "Matérn 3/2": "gp:friction-map:kernel=matern-3/2",
+    "deep": "gp:friction-map:kernel=deep",
 }
 STRIP = ("patch", "viscous")
 

@@ -1,7 +1,6 @@
 """Jobs of the experiments on force priors: simulate one trajectory, fit one model, score it on several."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +8,20 @@ import numpy as np
 import torch
 
 from benchmarks.paper.data import farthest, simulated
-from benchmarks.paper.fits import MODEL, START_FRICTION, search_report
+from benchmarks.paper.fits import MODEL, search_report
 from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import curve_coverage, evaluate, force_scores
+from forcegp.evidence import Accelerations
+from forcegp.fit import fit as fit_model
+from forcegp.forces import ContactFriction, Coulomb, JointFriction, Viscous, parse_forces
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
-from forcegp.mechanics import CoulombJointFriction, ViscousJointFriction
-from forcegp.models import Coefficients, IndependentGP, StructuredGP, save_posterior
-from forcegp.models.structured.components import term_slices
-from forcegp.priors import ContactFriction, JointFriction, NoForces, named_prior
+from forcegp.posterior import save_posterior
+from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
-from forcegp.simulation.joint_friction import OF_VELOCITY, JointFrictionLaw
+from forcegp.simulation.joint_friction import JointFrictionLaw
 from forcegp.simulation.kuka_motion import tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]
@@ -29,9 +29,9 @@ TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first
 
 
 def _tool_x(dataset: Dataset) -> np.ndarray:
-    assert dataset.system is not None
-    kinematics = dataset.system.robot.kinematics(torch.tensor(dataset.q), torch.tensor(dataset.v))
-    return dataset.system.contacts[0].position(kinematics)[:, 0].numpy()
+    assert dataset.model is not None
+    kinematics = dataset.model.robot.kinematics(torch.tensor(dataset.q), torch.tensor(dataset.v))
+    return dataset.model.contacts[0].position(kinematics)[:, 0].numpy()
 
 
 def true_curves(posterior: Any) -> dict[str, Law]:
@@ -39,19 +39,18 @@ def true_curves(posterior: Any) -> dict[str, Law]:
 
     Those are priors that differ from the simulation, for example a friction that does not grow with the load.
     """
-    system = getattr(posterior.model, "system", None)
-    prior = getattr(posterior.model, "prior", None)
-    if prior is None or system is None:
+    if not posterior.predicts_forces:
         return {}
+    model = posterior.model
     given: Mapping[str, Any] = posterior.settings["data"]["metadata"]["config"]
     values: Any = {name: tuple(x) if isinstance(x, list | tuple) else x for name, x in given.items()}
     config = KukaSurfaceConfig(**values)
     out: dict[str, Law] = {}
     names = posterior.latent_names
-    for _, term, which in term_slices(prior, system.robot):
+    for _, term, which in model.unknown.named(model.robot):
         if isinstance(term, JointFriction):
-            for joint, name in zip(term.latent_names(system.robot), names[which], strict=True):
-                law = _joint_law(config, system.robot.joint_names.index(joint))
+            for joint, name in zip(term.latent_names(model.robot), names[which], strict=True):
+                law = _joint_law(config, model.robot, model.robot.joint_names.index(joint))
                 out |= {} if law is None else {name: law}
         elif isinstance(term, ContactFriction) and term.axes == "isotropic" and term.inputs == ("velocity",):
             law = _tool_law(config, term.load)
@@ -60,12 +59,12 @@ def true_curves(posterior: Any) -> dict[str, Law]:
     return out
 
 
-def _joint_law(config: KukaSurfaceConfig, joint: int) -> Law | None:
+def _joint_law(config: KukaSurfaceConfig, robot: Robot, joint: int) -> Law | None:
     if config.joint_friction == "none":
         return np.zeros_like
-    if config.joint_friction not in OF_VELOCITY:
+    law = JointFrictionLaw(config, robot)
+    if not law.of_velocity:
         return None
-    law = JointFrictionLaw(config)
     return lambda v: law.curve(np.asarray(v)[:, None] * np.ones(len(law.coulomb)))[:, joint]
 
 
@@ -133,26 +132,25 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
 
 def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
     """The model of `spec` fitted to these rows."""
-    system = train.system
-    assert system is not None, "simulated data carry their system"
+    model = train.model
+    assert model is not None, "simulated data carry their model"
     options = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
     how = {"seed": spec["seed"], "restarts": spec["restarts"], "options": options}
     if spec["prior"] == BLACK_BOX:
-        return IndependentGP(system).fit(train, **how)
+        return fit_model(model.black_box(), train, **how)
     if spec["prior"] == LAWS:
         smoothing = train.metadata["config"]["joint_smoothing"]
-        laws = ViscousJointFriction(START_FRICTION), CoulombJointFriction(START_FRICTION, smoothing)
-        with_laws = replace(system, known_forces=(*system.known_forces, *laws))
-        learn = [Coefficients("viscous-joint-friction"), Coefficients("coulomb-joint-friction")]
-        return StructuredGP(with_laws, NoForces()).identify(train, learn, **how)
-    return StructuredGP(system, named_prior(spec["prior"], system), spec["mean"]).fit(train, **how)
+        return fit_model(model.with_forces(Viscous(), Coulomb(None, smoothing)), train, Accelerations())
+    known = () if spec["prior"] == KNOWN_PHYSICS else parse_forces(spec["prior"])
+    whole = model.with_forces(known)
+    return fit_model(whole if spec["mean"] == "analytical" else whole.without_mean(), train, **how)
 
 
 def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     """Errors of the acceleration and, where the model has them, of the forces; plain JSON values."""
-    assert test.system is not None, "simulated data carry their system"
+    assert test.model is not None, "simulated data carry their model"
     if posterior.predicts_forces:
-        posterior = posterior.with_contacts(test.system.contacts)  # what was identified stays
+        posterior = posterior.with_contacts(test.model.contacts)  # what was identified stays
     out = evaluate(posterior, test).to_dict()
     names = ("mae", "mae_noise_free", "nlpd", "coverage_95", "coverage_95_noise_free", "known_physics_mae")
     kept = {name: out[name] for name in names}

@@ -55,7 +55,7 @@ TASKS, CODE = "benchmarks.force_priors.jobs", ("benchmarks.paper.fits",)
 class Trial:
     """One model on one scenario.
 
-    prior: expression of `forcegp.priors.named_prior`, or a model of `benchmarks.force_priors.jobs`
+    prior: expression of `forcegp.forces.parse_forces`, or a model of `benchmarks.force_priors.jobs`
     tests: label -> scenario that the model is scored on, under that scenario's contacts
     region: train at tool x < 0, test at x > 0.1 m
     """
@@ -77,7 +77,7 @@ class Trial:
     def name(self) -> str:
         """Unique among the trials of all experiments with the same data."""
         place = "-extrapolation" if self.region else ""
-        prior = self.prior.replace("/", "-").replace(" ", "")
+        prior = self.prior.replace("/", "-").replace(" ", "").replace("gp:", "").replace(",", "+")
         tested = "-".join(sorted({scenario for scenario in self.tests.values() if scenario != self.scenario}))
         return f"{self.scenario}{place}/{prior}-{self.mean}{f'-on-{tested}' if tested else ''}/n{self.points}"
 

@@ -16,7 +16,7 @@ from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings
 from forcegp.errors import InvalidInput
 from forcegp.evaluation.metrics import interval_coverage, markdown_table, number
 from forcegp.jobs import Job, JobStore
-from forcegp.models import load_posterior
+from forcegp.posterior import load_posterior
 
 ARRAYS = "prediction.npz"
 

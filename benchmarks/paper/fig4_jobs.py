@@ -16,8 +16,9 @@ from forcegp.data import Dataset
 from forcegp.data.motion_records import recorded_motions
 from forcegp.integration import Feedback, SymplecticEuler, integrate
 from forcegp.jobs import JobStore
-from forcegp.mechanics import Baumgarte, MechanicalSystem
-from forcegp.models import load_posterior
+from forcegp.mechanics import Baumgarte
+from forcegp.model import Model
+from forcegp.posterior import load_posterior
 
 BAUMGARTE = Baumgarte(10.0, 1.0)  # as in the paper, K = 100 and D = 20, and as in the simulation itself
 OFFSET = 1e-3  # how far off the surface the displaced motions begin [m]
@@ -37,7 +38,7 @@ def roll(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, 
     """Roll a fitted model out from evenly spaced rows of its test trajectory."""
     posterior = load_posterior(results.place(spec["fit"]) / MODEL)
     recorded = _Recorded(test_trajectory(results, spec["data"]), spec["starts"], max(spec["seconds"]))
-    q0 = _displaced(posterior.system, recorded.q[:, 0]) if spec["variant"] == "off-surface" else recorded.q[:, 0]
+    q0 = _displaced(posterior.model, recorded.q[:, 0]) if spec["variant"] == "off-surface" else recorded.q[:, 0]
     rollout = posterior.rollout(
         q0,
         recorded.v[:, 0],
@@ -58,12 +59,12 @@ def truth(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
     """The true dynamics, friction included, from the recorded states with a tiny change, under the recorded torques."""
     trajectory = test_trajectory(results, spec["data"])
     recorded = _Recorded(trajectory, spec["starts"], max(spec["seconds"]))
-    assert trajectory.system is not None
-    system = replace(trajectory.system, baumgarte=BAUMGARTE)
-    contact, friction = system.contacts[0], trajectory.metadata["config"]["viscous_coefficient"]
+    assert trajectory.model is not None
+    model = replace(trajectory.model, baumgarte=BAUMGARTE)
+    contact, friction = model.contacts[0], trajectory.metadata["config"]["viscous_coefficient"]
 
     def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        dynamics = system.dynamics(q, v, u)
+        dynamics = model.dynamics(q, v, u)
         J = dynamics.state.kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
         return dynamics.acceleration(-friction * (J.mT @ (J @ v[..., None]))[..., 0])
 
@@ -76,7 +77,7 @@ def truth(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
             motion = integrate(SymplecticEuler(), acceleration, *start, recorded.u.movedim(0, 1), recorded.dt)
             error = (motion.q.movedim(0, 1) - recorded.q).abs().mean(-1).numpy()
             errors[f"{size:g}"] = {f"{x:g}": _finite(error[:, round(x / recorded.dt)]) for x in spec["seconds"]}
-    c = contact.distance(system.robot.kinematics(recorded.q)).abs().numpy()
+    c = contact.distance(model.robot.kinematics(recorded.q)).abs().numpy()
     constraint = {"largest": float(c.max()), "median": float(np.median(c))}
     return {"joint_error": errors, "recorded_constraint": constraint}
 
@@ -85,15 +86,15 @@ class _Recorded:
     """Motions cut out of a trajectory: q, v (n, T+1, nv), u (n, T, nv)."""
 
     def __init__(self, trajectory: Dataset, starts: int, seconds: float) -> None:
-        assert trajectory.system is not None
-        self.system = trajectory.system
+        assert trajectory.model is not None
+        self.model = trajectory.model
         motions = recorded_motions(trajectory, starts, seconds)
         self.dt = motions.dt
         self.q, self.v, self.u = (torch.tensor(np.asarray(x)) for x in (motions.q, motions.v, motions.u))
 
     def feedback(self) -> Feedback:
         """M (omega^2 (q_recorded - q) + 2 omega (v_recorded - v)) with the recorded M: the same for every model."""
-        M = self.system.robot.mass_matrix(self.q)
+        M = self.model.robot.mass_matrix(self.q)
 
         def feedback(k: int, at: Tensor, rate: Tensor) -> Tensor:
             wanted = FREQUENCY**2 * (self.q[:, k] - at) + 2.0 * FREQUENCY * (self.v[:, k] - rate)
@@ -116,11 +117,11 @@ def _finite(errors: Float[np.ndarray, " n"]) -> list[float | None]:
     return [float(error) if np.isfinite(error) else None for error in errors]
 
 
-def _displaced(system: MechanicalSystem, q: Float[Tensor, "n nv"]) -> Float[Tensor, "n nv"]:
+def _displaced(model: Model, q: Float[Tensor, "n nv"]) -> Float[Tensor, "n nv"]:
     """The nearest postures with the first contact's point OFFSET off its surface, by Newton's method."""
-    contact, rest = system.contacts[0], torch.zeros_like(q)
+    contact, rest = model.contacts[0], torch.zeros_like(q)
     for _ in range(20):
-        A = system.dynamics(q, rest, rest).A[:, :1]
-        missing = contact.distance(system.robot.kinematics(q)) - OFFSET
+        A = model.dynamics(q, rest, rest).A[:, :1]
+        missing = contact.distance(model.robot.kinematics(q)) - OFFSET
         q = q - (torch.linalg.pinv(A) @ missing[:, None, None])[..., 0]
     return q

@@ -9,8 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from benchmarks.paper import published
-from benchmarks.paper.fig2c_jobs import CENTER_BOUND, MASS_BOUND, MEANS
-from benchmarks.paper.fig2c_jobs import MODELS as ESTIMATING_MODELS
 from benchmarks.paper.fits import MODELS
 from forcegp.evaluation.plots.style import (
     LARGE,
@@ -25,7 +23,7 @@ from forcegp.evaluation.plots.style import (
     quiet,
 )
 
-COLORS = dict(zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[6], QUIET), strict=True))
+COLORS = dict(zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[3], QUIET), strict=True))
 """One colour per model, the same in every figure."""
 
 PANELS = (
@@ -69,38 +67,6 @@ def draw_range(axes: Axes, values: Mapping[int, Mapping[str, float]], color: str
     least, middle, largest = ([each[part] for each in values.values()] for part in ("min", "median", "max"))
     axes.fill_between(list(values), least, largest, color=color, alpha=0.15, linewidth=0)
     axes.plot(list(values), middle, color=color, marker="o", markersize=3.5, label=label)
-
-
-ESTIMATES = (
-    ("mass_error", "|mass error| of the tool [kg]", MASS_BOUND),
-    ("center_error", "error of its centre of mass [m]", CENTER_BOUND),
-    ("mae", "MAE against noisy accelerations [rad/s²]", None),
-)
-LINES = {"analytical": "-", "zero": ":"}
-
-
-def estimation_figure(summary: Mapping[str, Any]) -> Figure:
-    """Figure 2c: ours as lines, the published values as crosses."""
-    figure = new_figure(11.0, 4.0)
-    panels = figure.subplots(1, len(ESTIMATES))
-    for axes, (name, title, bound) in zip(panels, ESTIMATES, strict=True):
-        for model, means in summary["traces"].items():
-            for mean, trace in means.items():
-                style = {"color": COLORS[model], "linestyle": LINES[mean], "linewidth": 1.4}
-                axes.plot(np.abs(trace[name]), label=f"{ESTIMATING_MODELS[model]} {MEANS[mean]}", **style)
-        if bound is not None:
-            axes.axhline(bound, color=QUIET, linewidth=0.8, label="counts as found")
-        for model, values in published.FIG2C.items():
-            points = values.get(name, {})
-            axes.plot(list(points), np.abs(list(points.values())), "x", color=COLORS[model], markersize=6)
-        axes.set_yscale("log")
-        axes.set_xscale("symlog", linthresh=10)
-        axes.set_xlim(0, 450)
-        axes.set_xticks([0, 5, 10, 40, 100, 400], ["0", "5", "10", "40", "100", "400"])
-        quiet(axes, title=title, x="iteration")
-    panels[0].plot([], [], "x", color=QUIET, label="published (2021)")
-    legend_below(figure, panels[0])
-    return figure
 
 
 SHOWN_JOINTS = (0, 3, 6)

@@ -4,7 +4,7 @@ Fits to more points begin where the fit to fewer ended, because the training set
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,52 +13,36 @@ from torch import Tensor
 from benchmarks.paper.data import scored_rows, training_rows
 from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
+from forcegp.evidence import Accelerations
+from forcegp.fit import fit as fit_model
+from forcegp.forces import JointAccelerations, JointForces, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import Job, JobStore
-from forcegp.mechanics import MechanicalSystem, ViscousJointFriction
-from forcegp.models import Coefficients, IndependentGP, Noise, StructuredGP, load_posterior, save_posterior
-from forcegp.priors import JointAccelerations, NoForces
-from forcegp.simulation.kuka_motion import TOOL_LINK
-
-START_FRICTION = 0.1  # where the estimation of the joints' viscous friction begins [Nms/rad]
+from forcegp.model import Model
+from forcegp.noise import Noise
+from forcegp.posterior import load_posterior, save_posterior
 
 
 @dataclass(frozen=True)
 class ModelKind:
-    """A model's label in the paper's figures, how it is made for a system, and further arguments of its fit."""
+    """A model's label in the paper's figures, and how it is made of a simulated one."""
 
     label: str
-    make: Callable[[MechanicalSystem], Any]
-    fit_arguments: Callable[[MechanicalSystem], Mapping[str, Any]] = field(default=lambda system: {})
-
-
-def _analytical(system: MechanicalSystem) -> StructuredGP:
-    return StructuredGP(system, NoForces(), noise=Noise(0.1, learn=True))
-
-
-def _analytical_with_friction(system: MechanicalSystem) -> StructuredGP:
-    return _analytical(replace(system, known_forces=(*system.known_forces, ViscousJointFriction(START_FRICTION))))
-
-
-def _physical_parameters(system: MechanicalSystem) -> Mapping[str, Any]:
-    tool = system.robot.link(TOOL_LINK).inertial("mass", "com")
-    return {"learn": [tool, Coefficients("viscous-joint-friction")]}
+    make: Callable[[Model], Model]
 
 
 MODELS = {
-    "gp": ModelKind("GP", IndependentGP),
-    "s-gp-38": ModelKind("S-GP [38]", lambda system: StructuredGP(system, JointAccelerations(), "zero")),
-    "s-gp": ModelKind("S-GP", lambda system: StructuredGP(system, mean="zero")),
-    "s-gp-mean": ModelKind("S-GP + analytical mean", StructuredGP),
-    "analytical": ModelKind("analytical model", _analytical),
-    "analytical-fitted": ModelKind("analytical model, fitted", _analytical_with_friction, _physical_parameters),
+    "gp": ModelKind("GP", Model.black_box),
+    "s-gp-38": ModelKind("S-GP [38]", lambda model: model.with_forces(JointAccelerations()).without_mean()),
+    "s-gp": ModelKind("S-GP", lambda model: model.with_forces(JointForces()).without_mean()),
+    "s-gp-mean": ModelKind("S-GP + analytical mean", lambda model: model.with_forces(JointForces())),
+    "s-gp-tool": ModelKind("S-GP, tool friction", lambda model: model.with_forces(ToolForces())),
+    "analytical": ModelKind("analytical model", lambda model: model.with_forces(noise=Noise(0.1, learn=True))),
 }
-"""The analytical model has the true parameters; fitted, its tool's mass and centre of mass and a viscous friction of
-every joint are estimated by maximum likelihood. The level of the noise is learned by both.
-"""
+"""The analytical model has the true parameters; the level of its noise is learned."""
 
 GAUSSIAN_PROCESSES = ("gp", "s-gp-38", "s-gp", "s-gp-mean")
-ANALYTICAL = ("analytical", "analytical-fitted")
+ANALYTICAL = ("analytical",)
 MODEL = "model"  # the folder of the fitted model inside its job
 
 
@@ -116,7 +100,7 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
     train = training_rows(results, spec["data"], spec["points"])
     start = None
     if spec["start"] is not None:
-        start = load_posterior(results.place(spec["start"]) / MODEL).parameters
+        start = load_posterior(results.place(spec["start"]) / MODEL).hyperparameters
     posterior = fitted(spec, train, start)
     save_posterior(posterior, folder / MODEL)
     scores = evaluate(posterior, scored_rows(results, spec["data"])).to_dict()
@@ -126,14 +110,12 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
 def fitted(spec: Mapping[str, Any], train: Dataset, start: Mapping[str, Tensor] | None = None) -> Any:
     """The model of `spec` fitted to these rows; "restarts", "iterations" and "tolerance" where its search has them."""
     kind = MODELS[spec["model"]]
-    assert train.system is not None
-    model = kind.make(train.system)
-    more = dict(kind.fit_arguments(model.system))
+    assert train.model is not None
+    more: dict[str, Any] = {}
     if "iterations" in spec:
         more["options"] = OptimizerOptions(iterations=spec["iterations"], tolerance=spec["tolerance"])
         more |= {"restarts": spec["restarts"], "start": start}
-    learn = model.identify if "learn" in more else model.fit
-    return learn(train, seed=spec["seed"], **more)
+    return fit_model(kind.make(train.model), train, Accelerations(), seed=spec["seed"], **more)
 
 
 def search_report(posterior: Any) -> dict[str, Any]:

@@ -25,11 +25,5 @@ FIG2B_CONSTRAINT_ERROR = {
 MAE_10000 = {"analytical": 0.57}
 """The same error with 10,000 points."""
 
-FIG2C: dict[str, dict[str, dict[int, float]]] = {
-    "s-gp": {"mass_error": {40: -0.003, 399: -0.017}, "center_error": {399: 1e-4}, "mae": {380: 0.091}},
-    "analytical": {"mass_error": {40: -0.38, 399: -0.052}, "mae": {399: 0.62}},
-}
-"""Errors of the tool's mass [kg] and centre of mass [m], and MAE [rad/s^2], by iteration (the centre's at the end)."""
-
 NOISE_STD = 0.1
 """Of the measured acceleration [rad/s^2]; a perfect model has the MAE 0.1 sqrt(2 / pi) = 0.0798."""

@@ -40,13 +40,13 @@ SMOKE: dict[str, Any] = {"data": SMOKE_DATA, "settings": SMOKE_SEARCH, "seeds": 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "paper": (
         Fig2b(points=PAPER_POINTS, seeds=PAPER_SEEDS, seeds_many_points=PAPER_SEEDS[:2], few_points=400, **PAPER),
-        Fig2c(PAPER_DATA, 300, 101, points_interval=300, seeds=tuple(range(101, 111)), iterations=150, tolerance=1e-7),
+        Fig2c(PAPER_DATA, 100, tuple(range(101, 104)), iterations=150, tolerance=1e-7),
         Fig3(points=PAPER_POINTS[:1], seed=101, start=5.0, seconds=3.0, **PAPER),
         Fig4(points=PAPER_POINTS, seeds=PAPER_SEEDS[:2], starts=10, seconds=(1.0, 5.0), **PAPER),
     ),
     "smoke": (
         Fig2b(points=SMOKE_POINTS, seeds_many_points=(101,), few_points=SMOKE_POINTS[-1], **SMOKE),
-        Fig2c(SMOKE_DATA, 40, 101, points_interval=30, seeds=(101,), iterations=8, tolerance=1e-6),
+        Fig2c(SMOKE_DATA, 30, (101,), iterations=8, tolerance=1e-6),
         Fig3(SMOKE_DATA, SMOKE_POINTS, 101, start=1.0, seconds=1.0, settings=SMOKE_SEARCH),
         Fig4(points=SMOKE_POINTS, starts=2, seconds=(0.1, 0.2), **SMOKE),
     ),
