@@ -334,14 +334,9 @@ class Posterior(Summary, ABC):
         if self.model.memory.names:
             given = _tensor("u", u, self.model.sizes[2], self.model.robot.device)
             u, feedback = remembering(self.model, given, dt, feedback)
-        how: dict[str, Any] = {
-            "feedback": feedback,
-            "samples": samples,
-            "seed": seed,
-            "grad": grad,
-            "progress": progress,
-        }
-        return replace(roll_out(model, q0, v0, u, dt, integrator=integrator, **how), intervals=self.motion_intervals)
+        how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed, "progress": progress}
+        moved = roll_out(model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
+        return replace(moved, intervals=self.motion_intervals)
 
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
         """How well training rows are predicted from those outside their block: in closed form, without another fit.
