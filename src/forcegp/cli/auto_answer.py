@@ -10,12 +10,12 @@ import forcegp
 import forcegp.checks
 import forcegp.data
 from forcegp.cli.import_log import stance_text
+from forcegp.cli.payload import DRY, LAWS
 from forcegp.cli.terminal import number
 from forcegp.summary import listed
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
-LAWS = "viscous+stribeck+offset+rotor"
 
 
 def short_name(name: str) -> str:
@@ -27,7 +27,7 @@ def short_name(name: str) -> str:
 
 def identification(model: forcegp.Model) -> str:
     """What is found of the robot by itself, as `forcegp validate --identification` takes it."""
-    laws = f"+{LAWS}" if model.robot.single_joint_names else ""
+    laws = f"+{'+'.join(LAWS)}" if model.robot.single_joint_names else ""
     return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
 
 
@@ -68,7 +68,7 @@ def answer_lines(
     kinds = [robot.joint(name).type == "prismatic" for name in joints]
     q, force = (" or ".join(dict.fromkeys(two[kind] for kind in kinds)) for two in (("rad", "m"), ("Nm", "N")))
     of_joints = [
-        ("dry friction", f"{each('stribeck.level')} {force}, near rest {each('stribeck.breakaway')} more"),
+        ("dry friction", f"{each(f'{DRY}.level')} {force}, near rest {each(f'{DRY}.breakaway')} more"),
         ("viscous", f"{each('viscous')} {force} per {q}/s"),
         ("rotors", f"{each('rotor')} {INERTIA.get(q, 'kg m² or kg')}"),
     ]

@@ -58,7 +58,7 @@ class Fit(BackendOptions, RobotOptions, Overwriting):
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
     forces: Annotated[tuple[str, ...], listed("FORCE,...", CHOSEN, goes_on=FIELDS)] = ()
-    """What is found, beside the forces that the model has. Laws: viscous, coulomb, stribeck, rotor, offset, spring,
+    """What is found, beside the forces that the model has. Laws: viscous, coulomb, rotor, offset, spring,
     payload:LINK, bodies; their numbers are estimated unless they are given, as in viscous:.1. Unknown forces: gp:joint,
     gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
     gp:independent is without physics, none the noise alone. See docs/how-to/forces.md."""

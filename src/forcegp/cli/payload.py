@@ -21,7 +21,8 @@ from forcegp.cli.terminal import Terminal
 
 WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
-LAWS = "viscous", "stribeck", "offset", "rotor"
+DRY = "stribeck"
+LAWS = "viscous", DRY, "offset", "rotor"
 
 
 @dataclass(frozen=True, kw_only=True)
