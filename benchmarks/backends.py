@@ -1,6 +1,6 @@
 """What do several processes save for the restarts of one fit?
 
-The same fit of `StructuredGP` to 200 points of `kuka-surface`, eight restarts of at most 20 iterations, by each
+The same fit of `JointForces` to 200 points of `kuka-surface`, eight restarts of at most 20 iterations, by each
 backend: this process, and two processes of joblib. Wall-clock seconds,
 medians of three fits each in turn; every process on one thread. The pool has done the fit once before (cold).
 

@@ -56,8 +56,3 @@ def _one(word: str) -> Evidence:
             except ValueError:
                 raise InvalidInput(f"evidence {name!r} has {key}={value}; give a number.") from None
     return kind(**given)
-
-
-def evidence_to_dict(evidence: Evidence) -> dict[str, Any]:
-    """Plain JSON values."""
-    return {"type": evidence.name, **vars(evidence)}

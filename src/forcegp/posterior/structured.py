@@ -371,21 +371,6 @@ class StructuredPosterior(Posterior):
     def _physics(self, model: Model) -> PredictorPhysics:
         return PredictorPhysics(model, self.trained.unknown, self.likelihood.standardization)
 
-    def at_iteration(self, iteration: int) -> "StructuredPosterior":
-        """The posterior as it was after that iteration of the search (0: the start).
-
-        Raises InvalidInput unless the fit kept its iterates: `OptimizerOptions(keep_iterates=True)`.
-        """
-        kept = self.result.iterates
-        if not 0 <= iteration < len(kept):
-            raise InvalidInput(
-                f"iteration {iteration} was not kept; there are {len(kept)}, from 0. Give "
-                "options=OptimizerOptions(keep_iterates=True)"
-            )
-        point = {**self.hyperparameters, **kept[iteration]}
-        given = self.training, point, self.result, self.settings, self.engine
-        return replace(self.conditioned(self.trained, *given, estimates=self.estimates), target=self.target)
-
     @override
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
         with torch.no_grad(), blas_threads(self.training.q.numel()):
