@@ -33,8 +33,9 @@ from benchmarks.tracking import (
     task_of,
 )
 from forcegp import Model, PDGravity, Robot
-from forcegp.evaluation import contacts_figure, excitation_figure
-from forcegp.evaluation.plots.style import (
+from forcegp.posterior import StructuredPosterior
+from forcegp.scores import contacts_figure, excitation_figure
+from forcegp.scores.figures.style import (
     IDENTIFIED,
     KNOWN_PHYSICS,
     MEASUREMENT,
@@ -48,7 +49,6 @@ from forcegp.evaluation.plots.style import (
     quiet,
     save_figure,
 )
-from forcegp.posterior import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"

@@ -28,11 +28,10 @@ from forcegp import (
     Noise,
     Viscous,
     check,
-    compare_priors,
-    evaluate,
     fit,
     load_posterior,
     save_posterior,
+    score,
 )
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
@@ -62,10 +61,11 @@ def whole_way() -> None:
         check(data)
         free = replace(data, model=data.model.with_contacts(()), truth={}) if compiled else data
         fit(free.model.with_forces(Viscous()), free).predict(free.q, free.v, free.u)
-        compare_priors(data, {"one": prior, "none": ()}, points=20, restarts=1, options=QUICK)
-        evaluate(fit(data.model.black_box(), data, points=20, restarts=1, options=QUICK), data)
+        models = {"one": data.model.with_forces(prior), "none": data.model.with_forces()}
+        score(models, data, split="leave-out", points=20, restarts=1, iterations=3)
+        score(fit(data.model.black_box(), data, points=20, restarts=1, options=QUICK), data, horizons=())
         posterior = fit(data.model.with_forces(prior, noise=Noise(0.05)), data, points=40, restarts=1, options=QUICK)
-        evaluate(posterior, data)
+        score(posterior, data, horizons=())
         with tempfile.TemporaryDirectory() as folder:
             data.save(f"{folder}/data.h5")
             save_posterior(posterior, f"{folder}/model")

@@ -7,7 +7,7 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 from tests.posterior.raw_log import motion
 
-from forcegp import Viscous, check, evaluate, fit
+from forcegp import Viscous, check, fit, score
 from forcegp.errors import ForceGPError
 from forcegp.forces import Actuation, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
@@ -33,7 +33,7 @@ def shown(data):
         "IndependentPosterior": fit(data.model.black_box(), data, **quick),
         "Prediction": prediction,
         "Gaussian": prediction.unknown_force,
-        "Evaluation": evaluate(posterior, arm_data(10, 1)),
+        "Scores": score(posterior, arm_data(10, 1), horizons=()),
         "Robot": data.model.robot,
         "Model": data.model,
         "Estimates": learned.estimates,
@@ -50,7 +50,7 @@ FACTS = {
     "IndependentPosterior": ["learned from: 20 rows"],
     "Prediction": ["batch: (20,)", "entries: 3", "forces: multiplier, contact_force, unknown_force"],
     "Gaussian": ["batch: (20,)", "largest std"],
-    "Evaluation": ["rows: 10", "mae: ", "noise floor 0.0399", "coverage 95: ", "warnings: "],
+    "Scores": ["mae: ", "noise floor: 0.0399", "coverage 95: ", "warnings: "],
     "Robot": ["name: 'arm'", "nv: 3", "pan (revolute), lift (revolute), bend (revolute)"],
     "Model": ["contacts: hand on Plane", "forces: Actuation, RigidBodies", "omega=5.0"],
     "Estimates": ["estimated: viscous.pan", "from: 20 rows, "],

@@ -23,9 +23,10 @@ from benchmarks.force_priors.trials import (
 from benchmarks.paper import published
 from benchmarks.paper.experiment import medians
 from benchmarks.paper.figures import draw_range
-from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.evaluation.metrics import formatted, markdown_table
-from forcegp.evaluation.plots.style import (
+from forcegp.jobs import JobStore
+from forcegp.posterior import load_posterior
+from forcegp.scores import friction_curves_figure, normal_force_figure
+from forcegp.scores.figures.style import (
     MEASUREMENT,
     PREDICTION,
     QUIET,
@@ -35,8 +36,7 @@ from forcegp.evaluation.plots.style import (
     plain_ticks,
     quiet,
 )
-from forcegp.jobs import JobStore
-from forcegp.posterior import load_posterior
+from forcegp.scores.tables import formatted, markdown_table
 
 EFFICIENT = {
     "joint forces on (q, v, u), the paper's": "gp:joint",

@@ -35,7 +35,7 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     words = (*words, "--restarts", 1, "--iterations", 20, "--out", "run")
     done = forcegp(*words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    words = ("evaluate", "run", "log.h5", "--every", 40, "--friction-coefficient", 0.6, "--plots", "plots")
+    words = ("score", "run", "log.h5", "--every", 40, "--friction-coefficient", 0.6, "--out", "plots", "--json")
     scored = forcegp(*words, folder=tmp_path)
     assert scored.returncode == 0, scored.stderr
     assert "margin of rear_left_foot to slipping" in scored.stdout

@@ -14,7 +14,7 @@ from tests.data.samples import assert_equal, complete, dataset, model
 
 from forcegp.data import Dataset, preparation_report
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.validation.run import preparation_lines
+from forcegp.scores.page import preparation_lines
 
 
 @pytest.fixture

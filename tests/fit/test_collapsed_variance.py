@@ -1,7 +1,7 @@
 """A latent whose variance has collapsed leaves nothing out at any point; its posterior must still be usable."""
 
 import torch
-from tests.validation.moving_arm import moving_arm
+from tests.scores.moving_arm import moving_arm
 
 from forcegp import JointFriction, Noise, fit
 from forcegp.inference import Inducing

@@ -9,13 +9,13 @@ from scipy.stats import norm
 
 from forcegp import JointFriction, fit
 from forcegp.errors import ContactError, InvalidInput
-from forcegp.evaluation import friction_margins_figure, normal_force_figure, slip_scores
 from forcegp.forces import foot_friction
 from forcegp.mechanics import Contact, Plane
 from forcegp.model import Model
 from forcegp.posterior import friction_margins
 from forcegp.posterior.friction_margin import margin_moments
 from forcegp.posterior.prediction import Gaussian
+from forcegp.scores import friction_margins_figure, normal_force_figure, slip_scores
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 

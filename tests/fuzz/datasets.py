@@ -184,7 +184,7 @@ def check_commands(case: DataFile, folder: Path) -> None:
         "check data.h5",
         lag,
         "prepare data.h5 --cutoff 20 --out o.h5",
-        f"evaluate {INPUTS.folder / 'carried'} data.h5",
+        f"score {INPUTS.folder / 'carried'} data.h5",
     )
     require_ended_well(words[number % 4].split(), folder)
 

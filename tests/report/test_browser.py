@@ -36,12 +36,12 @@ def browser():
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory, swinging, friction):
-    from forcegp import evaluate
-    from forcegp.report import evaluation_sentence, evaluation_table, model_page, write_page
+    from forcegp import score
+    from forcegp.report import joint_table, model_page, scores_sentence, write_page
 
-    evaluation = evaluate(friction, swinging)
-    best = evaluation_sentence(evaluation, "rad/s²")
-    page = model_page(friction, swinging, title="A pendulum", best=best, tables=[evaluation_table(evaluation)])
+    scores = score(friction, swinging, horizons=())
+    best = scores_sentence(scores, "rad/s²")
+    page = model_page(friction, swinging, title="A pendulum", best=best, tables=[joint_table(scores)])
     path = tmp_path_factory.mktemp("browser") / "report.html"
     write_page(path, page)
     return path

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from forcegp import Dataset, evaluate
+from forcegp import Dataset, score
 from forcegp.errors import InvalidInput
 from forcegp.report import (
     Finding,
     Page,
     Table,
-    evaluation_sentence,
-    evaluation_table,
     is_page,
+    joint_table,
     model_page,
     recorded_scene,
+    scores_sentence,
     serve,
     write_page,
     write_rerun,
@@ -29,9 +29,9 @@ from forcegp.report import (
 
 @pytest.fixture(scope="module")
 def page(swinging, friction):
-    evaluation = evaluate(friction, swinging)
-    best = evaluation_sentence(evaluation, "rad/s²")
-    return model_page(friction, swinging, title="pendulum", best=best, tables=[evaluation_table(evaluation)])
+    scores = score(friction, swinging, horizons=())
+    best = scores_sentence(scores, "rad/s²")
+    return model_page(friction, swinging, title="pendulum", best=best, tables=[joint_table(scores)])
 
 
 def test_a_page_needs_no_network_and_is_small(page, tmp_path):
@@ -86,10 +86,10 @@ def test_what_cannot_be_drawn_is_named(swinging, friction):
 
 
 def test_the_sentence_is_true(swinging, friction):
-    evaluation = evaluate(friction, swinging)
-    sentence = evaluation_sentence(evaluation, "rad/s²")
-    assert f"is {evaluation.mae:.3g} rad/s²" in sentence
-    assert f"a factor {evaluation.known_physics_mae / evaluation.mae:.3g} less" in sentence
+    scores = score(friction, swinging, horizons=())
+    sentence = scores_sentence(scores, "rad/s²")
+    assert f"is {scores.value('mae'):.3g} rad/s²" in sentence
+    assert f"a factor {scores.value('known_physics_mae') / scores.value('mae'):.3g} less" in sentence
 
 
 def test_the_viewer_serves_and_moves(swinging, friction):

@@ -13,8 +13,8 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
-import forcegp.evaluation
 import forcegp.recordings
+import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import LOG, MAPPING, MODEL, Overwriting, unless_given
 from forcegp.cli.input_options import require_same_joints
@@ -95,8 +95,8 @@ class Monitor(Overwriting):
             time, _, state = max(parts, key=lambda part: len(part[0]))
             shown = [(each["start"], each["end"]) for each in contacts if time[0] <= each["start"] <= time[-1]]
             arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
-            figure = forcegp.evaluation.contacts_figure(*arrays, shown, log.joint_names, title)
-            forcegp.evaluation.save_figure(figure, folder / "contacts.png")
+            figure = forcegp.scores.contacts_figure(*arrays, shown, log.joint_names, title)
+            forcegp.scores.save_figure(figure, folder / "contacts.png")
         terminal.note(f"figure: {self.out / 'contacts.png'}")
         limit = monitor.threshold
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
-import forcegp.evaluation
+import forcegp.scores
 from forcegp.atomic_files import atomic_file
 from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.import_log import stance_text
@@ -58,8 +58,8 @@ class Prepare(PreparationOptions, RobotOptions, Overwriting):
             if self.plots is not None:  # plots that fail leave no dataset behind
                 content = {"data": str(self.data), "preparation": prepared.report}
                 with self.folder(self.plots, content) as folder:
-                    figure = forcegp.evaluation.preparation_figure(dataset, prepared.preparation)
-                    forcegp.evaluation.save_figure(figure, folder / "spectra.png")
+                    figure = forcegp.scores.preparation_figure(dataset, prepared.preparation)
+                    forcegp.scores.save_figure(figure, folder / "spectra.png")
                 terminal.note(f"plots: {self.plots}")
         terminal.show(*_report(self.out, dataset, prepared))
         return {"out": str(self.out), "data": str(self.data), **prepared.report}

@@ -4,9 +4,8 @@ from .page import (
 )
 from .rerun_log import write_rerun as write_rerun
 from .results import (
-    scene_notes as scene_notes,
-    evaluation_sentence as evaluation_sentence, evaluation_table as evaluation_table, model_page as model_page,
-    validation_pictures as validation_pictures, validation_table as validation_table,
+    joint_table as joint_table, model_page as model_page, scene_notes as scene_notes,
+    scores_pictures as scores_pictures, scores_sentence as scores_sentence, scores_table as scores_table,
 )
 from .robot_picture import robot_figure as robot_figure, still_scene as still_scene
 from .scene import recording as recording

@@ -9,13 +9,13 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.plots import style
 from forcegp.forces import Actuation, BaseWrench, CoupledRotors, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
+from forcegp.scores.figures import style
 
 FRAMES_PER_SECOND = 30.0
 MOST_FRAMES = 450
