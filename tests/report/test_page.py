@@ -17,10 +17,10 @@ from forcegp.report import (
     Page,
     Table,
     is_page,
-    joint_table,
     model_page,
     recorded_scene,
     scores_sentence,
+    scores_table,
     serve,
     write_page,
     write_rerun,
@@ -31,7 +31,7 @@ from forcegp.report import (
 def page(swinging, friction):
     scores = score(friction, swinging, horizons=())
     best = scores_sentence(scores, "rad/s²")
-    return model_page(friction, swinging, title="pendulum", best=best, tables=[joint_table(scores)])
+    return model_page(friction, swinging, title="pendulum", best=best, tables=[scores_table(scores)])
 
 
 def test_a_page_needs_no_network_and_is_small(page, tmp_path):

@@ -20,9 +20,9 @@ import forcegp.simulation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import Command
 from forcegp.cli.fit import fit_summary
-from forcegp.cli.score import NORMAL_FORCES, draw
+from forcegp.cli.score import NORMAL_FORCES, comparison, draw
 from forcegp.cli.simulate import simulate_with_progress
-from forcegp.cli.terminal import NONE, Terminal, columns, nats, number, percent
+from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
 NOISE = 0.1  # rad/s^2, as in the paper
@@ -30,12 +30,6 @@ SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so 
 
 MODELS = {"S-GP": ("s-gp", False), "S-GP + analytical mean": ("s-gp-analytical-mean", True)}
 """Name in the paper -> (folder, whether known forces are the mean)."""
-
-PUBLISHED_MAE = {
-    "S-GP": {100: 0.5856, 200: 0.2092, 400: 0.1193, 600: 0.1049, 800: 0.1006, 1000: 0.0977},
-    "S-GP + analytical mean": {100: 0.1051, 200: 0.0936, 400: 0.0868, 600: 0.0855, 800: 0.0847, 1000: 0.0844},
-}
-"""Mean absolute error against noisy accelerations by number of points [rad/s^2], as in `benchmarks.paper.published`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,28 +80,28 @@ class Demo(Command):
                 scores = forcegp.score(models, test, horizons=(), progress=report)
             for warning in scores.warnings:
                 terminal.warn(warning)
-            pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-            terminal.note(f"drew {', '.join(pictures)}")
-            wall_seconds = time.monotonic() - start
-            results = {
+            best = models["S-GP + analytical mean"]
+            terminal.note(f"drew {', '.join(draw(terminal, folder, best, test))}")
+            results: dict[str, Any] = {
                 "out": str(self.out),
                 "seeds": seeds,
-                **{name: options[name] for name in ("seconds", "points")},
-                "models": {
-                    name: {
-                        "run": str(self.out / place),
-                        "fit": fits[name],
-                        "published_mae": PUBLISHED_MAE[name].get(self.points),
-                    }
-                    for name, (place, _) in MODELS.items()
-                },
-                "scores": scores.to_dict(),
-                "wall_seconds": wall_seconds,
-                "machine": machine,
+                "points": self.points,
+                "seconds": self.seconds,
             }
+            results["models"] = {
+                name: {"run": str(self.out / place), "fit": fits[name]} for name, (place, _) in MODELS.items()
+            }
+            results |= {"scores": scores.to_dict(), "wall_seconds": time.monotonic() - start, "machine": machine}
             write_json(folder / "results.json", results)
-            best = self._write_report(terminal, folder, models["S-GP + analytical mean"], test, results)
-        self._show(terminal, scores, wall_seconds, best)
+            sentence = self._write_report(terminal, folder, best, test, results)
+        title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
+        terminal.show(
+            *comparison(scores, title),
+            f"Contact force: {NORMAL_FORCES}.",
+            f"Models, data, pictures and results.json are in {self.out}. Open the report:",
+            f"  {self.out}/report.html",
+            sentence,
+        )
         return results
 
     def _write_report(
@@ -119,8 +113,7 @@ class Demo(Command):
         results: Mapping[str, Any],
     ) -> str:
         """The page with everything, whose best sentence is returned."""
-        name = "S-GP + analytical mean"
-        scores = forcegp.score(posterior, test, horizons=())
+        scores = forcegp.score(posterior, test)
         best = forcegp.report.scores_sentence(scores, "rad/s²")
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
@@ -130,10 +123,10 @@ class Demo(Command):
                 best=best,
                 findings=[
                     forcegp.report.Finding("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
-                    forcegp.report.Finding("model", f"{name} of Rath, Geist and Trimpe (CoRL 2021)"),
+                    forcegp.report.Finding("model", "S-GP with analytical mean of Rath, Geist and Trimpe (CoRL 2021)"),
                     forcegp.report.Finding("tested on", f"{len(test)} rows of a trajectory with another seed"),
                 ],
-                tables=[forcegp.report.joint_table(scores)],
+                tables=[forcegp.report.scores_table(scores)],
                 next_steps=[
                     forcegp.report.Finding(
                         "The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"
@@ -165,27 +158,3 @@ class Demo(Command):
         iterations = len(posterior.result.history) - 1
         terminal.note(f"fitted {name}: {iterations} iterations ({seconds:.1f} s)")
         return posterior, fit_summary(posterior, seconds)
-
-    def _show(self, terminal: Terminal, scores: forcegp.Scores, wall_seconds: float, best: str) -> None:
-        header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
-        true, forces, rows = "true acceleration", [], []
-        for name in scores.models:
-            errors = [number(scores.value("mae", model=name)), number(PUBLISHED_MAE[name].get(self.points))]
-            errors += [number(scores.value("mae", true, name)), number(scores.value("rmse", model=name))]
-            density, inside = scores.value("nlpd", "all joints", name), scores.value("coverage_95", model=name)
-            calibration = [nats(density), percent(inside)]
-            rows.append([name, *errors, *calibration, number(scores.value("mae", "constraint", name))])
-            error, inside = (scores.value(score, "contact force", name) for score in ("mae", "coverage_95"))
-            forces.append(f"{name} MAE {number(error)} N, {percent(inside)} in the 95 % band")
-        name = next(iter(scores.models))
-        known = [scores.value("known_physics_mae", each, name) for each in ("acceleration", true)]
-        rows.insert(0, ["known physics alone", number(known[0]), NONE, number(known[1]), *[NONE] * 4])
-        rows.append(["noise floor", number(scores.value("noise_floor", model=name)), NONE, number(0.0), *[NONE] * 4])
-        title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
-        terminal.show(
-            columns(title, header, rows),
-            f"Contact force (multiplier): {'; '.join(forces)}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}.",
-            f"Models, data, pictures and results.json are in {self.out} ({wall_seconds:.0f} s). Open the report:",
-            f"  {self.out}/report.html",
-            best,
-        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ from forcegp.cli.input_options import (
     require_same_joints,
 )
 from forcegp.cli.terminal import Terminal, columns, facts, nats, number, percent
-from forcegp.errors import InvalidInput
+from forcegp.errors import ForceGPError, InvalidInput
 
 THERE = InputPath(" does not exist; give folders of forcegp fit, and a dataset (.h5) after them.", Path.exists)
 IDENTIFICATION = "bodies+viscous+coulomb+rotor@accelerations, @torques:both where the base moves"
@@ -228,11 +229,6 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
         if self.out is not None:
             draw(terminal, self.out, posterior, rows, mu)
         if self.report is not None:
-            pictures = []
-            if mu is not None:
-                figure = forcegp.scores.friction_margins_figure(posterior, rows, mu)
-                caption = "How much more force along the ground every foot could bear."
-                pictures.append(forcegp.report.Picture(caption, figure))
             with terminal.progress("writing the report") as progress:
                 page = forcegp.report.model_page(
                     posterior,
@@ -240,15 +236,17 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
                     title=f"{name} on {self.paths[-1].name}: {posterior.description}",
                     best=forcegp.report.scores_sentence(scores, unit_of_a(rows)),
                     findings=[forcegp.report.Finding("warning", each) for each in content["warnings"]],
-                    tables=[forcegp.report.joint_table(scores)],
-                    pictures=pictures,
+                    tables=[forcegp.report.scores_table(scores)],
+                    mu=mu,
                     details={key: value for key, value in content.items() if key != "runs"},
                     shapes=self.shapes,
                     progress=progress,
                 )
                 forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
             terminal.note(f"report: {self.report}")
-        terminal.show(joint_table(title, scores), facts("", force_facts(scores, why) | slip_facts(slips)))
+        terminal.show(joint_table(title, scores), quantity_table(scores), facts("", slip_facts(slips)))
+        if "contact force" in scores.quantities():
+            terminal.show(f"Contact force: {why}.")
         return {"normal_force_rests_on_prior": rests} | ({} if mu is None else {"slip": slips})
 
 
@@ -260,18 +258,14 @@ def draw(
     mu: float | None = None,
 ) -> list[str]:
     """Write every plot of one model that these data allow to `folder`; returns the names of the files."""
-    figures = {"prediction.png": lambda: forcegp.scores.prediction_figure(posterior, dataset)}
-    if posterior.model.contacts and posterior.predicts_forces:
-        figures["normal_force.png"] = lambda: forcegp.scores.normal_force_figure(posterior, dataset)
-    if mu is not None:
-        figures["friction_margins.png"] = lambda: forcegp.scores.friction_margins_figure(posterior, dataset, mu)
-    if forcegp.scores.curve_panels(posterior):
-        figures["forces.png"] = lambda: forcegp.scores.friction_curves_figure(posterior, dataset)
+    figures, drawn = forcegp.scores.model_figures(posterior, dataset, mu), []
     with terminal.progress("drawing") as report:
-        for done, (name, figure) in enumerate(figures.items()):
+        for done, (name, (_, figure)) in enumerate(figures.items()):
             report(done, len(figures), name)
-            forcegp.scores.save_figure(figure(), folder / name)
-    return list(figures)
+            with contextlib.suppress(ForceGPError):  # what these data do not allow
+                forcegp.scores.save_figure(figure(), folder / f"{name}.png")
+                drawn.append(f"{name}.png")
+    return drawn
 
 
 def unit_of_a(dataset: forcegp.Dataset) -> str:
@@ -292,6 +286,7 @@ def comparison(scores: forcegp.Scores, title: str) -> list[Any]:
             *scores.failures, *answers]  # fmt: skip
 
 
+QUANTITY = {"mae": number, "rmse": number, "relative_rmse": percent, "coverage_95": percent}
 BY_JOINT = (
     ("MAE", "acceleration", "mae", number),
     ("noise-\nfree", "true acceleration", "mae", number),
@@ -316,43 +311,14 @@ def joint_table(title: str, scores: forcegp.Scores) -> Any:
     return columns(title, ["joint", *(name for name, *_ in BY_JOINT)], rows[:-1], last=rows[-1])
 
 
-def force_facts(scores: forcegp.Scores, normal_forces: str) -> dict[str, str]:
-    """Errors beside those by joint: of the constraint, of motions, of every force whose truth is given.
-
-    `normal_forces` is a remark on what determines the force of contacts.
-    """
-    held = scores.quantities()
-    out = {"MAE": number(scores.value("mae"))}
-    if "noise_floor" in held["acceleration"]:
-        out["MAE"] += f" (a perfect model has {number(scores.value('noise_floor'))})"
-    out["known physics alone"] = number(scores.value("known_physics_mae"))
-    largest = [each or 0.0 for each in scores.columns("largest", "constraint")]
-    if largest:
-        mean = number(scores.value("mae", "constraint"))
-        out["constraint error |A a - b|"] = f"mean {mean}, largest {number(max(largest))}"
-    if "true force" in held:
-        out["force that moves the robot"] = f"MAE {number(scores.value('mae', 'true force'))} against the truth"
-    for name in held:
-        if name.endswith((" the joints", " its point")):
-            out[name] = _force_error(scores, name)
-        elif name == "contact force":
-            out[name] = f"MAE {number(scores.value('mae', name))} N, {_force_error(scores, name)}; {normal_forces}"
-        elif " after " in name:
-            unit = {"position": "q", "velocity": "v"}.get(name.partition(" ")[0], "")
-            unit = scores.units[unit] if unit and isinstance(scores.units[unit], str) else "m" if not unit else ""
-            inside = scores.value("coverage_95", name) if "coverage_95" in held[name] else None
-            text = f"RMS error {number(scores.value('rmse', name))} {unit}".strip()
-            out[name] = text if inside is None else f"{text}, {percent(inside)} in the 95 % interval"
-    return out
-
-
-def _force_error(scores: forcegp.Scores, quantity: str) -> str:
-    """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
-    inside = f"{percent(scores.value('coverage_95', quantity))} in the 95 % band"
-    if "relative_rmse" not in scores.quantities()[quantity]:
-        return f"RMS error {number(scores.value('rmse', quantity))} (the true force is zero), {inside}"
-    share = 100.0 * (scores.value("relative_rmse", quantity) or 0.0)
-    return f"RMS error {f'{share:.2g}' if share < 99.5 else f'{share:.0f}'} %, {inside}"
+def quantity_table(scores: forcegp.Scores) -> Any:
+    """What was scored beside accelerations by joint: of all columns together, in the units of each quantity."""
+    rows = []
+    for name, held in scores.quantities().items():
+        shown = {each: scores.value(each, name) if each in held else None for each in QUANTITY}
+        if name not in ("acceleration", "all joints") and any(value is not None for value in shown.values()):
+            rows.append([name, *(show(shown[each]) for each, show in QUANTITY.items())])
+    return columns("", ["all joints", "MAE", "RMSE", "RMSE /\nits size", "in 95 %\nband"], rows)
 
 
 def slip_facts(scores: Mapping[str, Mapping[str, float]]) -> dict[str, str]:

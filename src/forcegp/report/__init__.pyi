@@ -4,7 +4,7 @@ from .page import (
 )
 from .rerun_log import write_rerun as write_rerun
 from .results import (
-    joint_table as joint_table, model_page as model_page, scene_notes as scene_notes,
+    model_page as model_page, scene_notes as scene_notes,
     scores_pictures as scores_pictures, scores_sentence as scores_sentence, scores_table as scores_table,
 )
 from .robot_picture import robot_figure as robot_figure, still_scene as still_scene

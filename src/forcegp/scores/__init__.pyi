@@ -14,6 +14,7 @@ from .figures.friction_margins import (
 )
 from .figures.log import check_figure as check_figure, preparation_figure as preparation_figure
 from .figures.motion_bands import motion_bands_figure as motion_bands_figure
+from .figures.of_model import model_figures as model_figures
 from .figures.prediction import (
     normal_force_figure as normal_force_figure, prediction_figure as prediction_figure,
 )

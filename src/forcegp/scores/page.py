@@ -53,6 +53,7 @@ def columns_of(scores: Scores) -> list[Column]:
     """The scores that a page shows, as far as all models have them."""
     force, q = unit_of(scores, "u"), unit_of(scores, "q")
     wanted: list[Column] = [
+        (f"MAE [{unit_of(scores, 'a')}]", ACCELERATION, "mae", 4),
         ("nRMSE", ACCELERATION, "nrmse", 3),
         (f"force error [{force}]", FORCE, "rmse", 3),
         ("NLPD [nats]", ALL_JOINTS, "nlpd", 2),

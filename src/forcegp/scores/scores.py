@@ -131,12 +131,12 @@ class Scores(Summary):
         )
         return paired_difference(criterion, challenger, baseline, a, b, self.margin)
 
-    def best_of(self, kinds: Sequence[str], criterion: str) -> str | None:
+    def best_of(self, kinds: Sequence[str], criterion: str, but: str | None = None) -> str | None:
         """The model of these kinds with the lowest error, among those that failed least and diverged least."""
         found = []
         for name, model in self.models.items():
             errors = self.errors(criterion, name)
-            if model["kind"] not in kinds or not errors:
+            if model["kind"] not in kinds or not errors or name == but:
                 continue
             finite = {run: np.where(np.isfinite(each), each, np.nan) for run, each in errors.items()}
             every = np.concatenate([each.ravel() for each in finite.values()])
@@ -160,7 +160,10 @@ class Scores(Summary):
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
             if simple is None or other is None:
                 if (only := simple or other) is not None:
-                    out[criterion] = {"model": only, "why": f"the lowest {words}; there is no other kind of model"}
+                    second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
+                    found = None if second is None else self.difference(criterion, only, second)
+                    why = f"the lowest {words}{'' if found is None else f': {found.sentence}'}"
+                    out[criterion] = {"model": only, "why": why}
                 continue
             found = self.difference(criterion, other, simple)
             if found is not None and found.favours_challenger:

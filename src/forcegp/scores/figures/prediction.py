@@ -1,11 +1,9 @@
 """Plots: predicted accelerations and normal forces against the truth, and the course of the search."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -14,7 +12,6 @@ from forcegp.errors import InvalidInput
 from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.figures import style
-from forcegp.scores.figures.style import QUANTILE
 from forcegp.scores.predicted_rows import PredictedRows, predict_rows
 
 
@@ -70,45 +67,40 @@ def draw_error(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) 
         axes.set_ylim(-max(limit, 1.05 * largest), max(limit, 1.05 * largest))
 
 
-LARGEST_ERROR = 5.0
-"""Standard deviations at which the histogram of errors ends; what lies beyond is counted at the ends."""
-ERROR_ROWS = 2000
-
-
 def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
-    """One row per contact: force over `seconds` of the first episode; errors in standard deviations beside it.
+    """One row per contact: force over `seconds` of the first episode, with the truth where the Dataset holds "lambda".
 
     The force is |s_p| lambda in N, positive where the surface pushes along its gradient; where a point is held, the
-    part along each axis of the world. Where the Dataset holds
-    "lambda", it is drawn, with a histogram of (prediction - truth) / standard deviation over up to ERROR_ROWS rows of
-    the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
-    Raises InvalidInput without contacts, and for models without forces.
+    part along each axis of the world. Raises InvalidInput without contacts, and for models without forces.
     """
     if not posterior.model.contacts or not posterior.predicts_forces:
         raise InvalidInput(
             f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
             "forces."
         )
-    rows = style.window(dataset, start, seconds)
-    contacts = len(posterior.model.contacts)
-    known = "lambda" in dataset.truth and dataset.truth["lambda"].shape[1] == contacts
-    figure = style.new_figure(11.0 if known else 8.0, 1.2 + 2.4 * contacts)
-    grid = figure.subplots(contacts, 2 if known else 1, squeeze=False, width_ratios=(2.4, 1.0) if known else None)
-    forces = _normal_forces(posterior, rows)
-    every = None
-    if known:
-        spread = np.unique(np.linspace(0, len(dataset) - 1, ERROR_ROWS).astype(int))
-        every = _normal_forces(posterior, dataset.rows(spread))
-    for index, contact in enumerate(posterior.model.contacts):
+    rows, contacts = style.window(dataset, start, seconds), posterior.model.contacts
+    figure = style.new_figure(8.0, 1.2 + 2.4 * len(contacts))
+    grid: Any = figure.subplots(len(contacts), 1, squeeze=False)[:, 0]
+    q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
+    with torch.no_grad():
+        multiplier, dynamics = posterior.predict(q, v, u).multiplier, posterior.dynamics(q, v, u)
+        assert multiplier is not None, "models with forces predict lambda"
+        own = dynamics if rows.model is None else rows.model.dynamics(q, v, u)
+        size, other = (torch.linalg.vector_norm(each.normals, dim=-1).numpy() for each in (dynamics, own))
+        mean, spread = size * multiplier.mean.numpy(), style.QUANTILE * size * multiplier.std.numpy()
+        nominal, truth = size * dynamics.multiplier_map().offset.numpy(), rows.truth.get("lambda")
+    for index, (axes, contact) in enumerate(zip(grid, contacts, strict=True)):
+        style.draw_line(axes, rows.time, nominal[:, index], style.KNOWN_PHYSICS, 1.1, "known physics alone")
+        if truth is not None and truth.shape == other.shape == size.shape:
+            style.draw_line(axes, rows.time, (other * truth)[:, index], style.TRUTH, 3.5, "true", alpha=0.3)
+        style.draw_band(axes, rows.time, mean[:, index], spread[:, index], alpha=0.3, label="95 % band")
+        style.draw_line(axes, rows.time, mean[:, index], style.PREDICTION, 1.3, "predicted")
+        axes.margins(x=0)
         name, label = _contact_labels(contact)
-        title = f"Contact {index}: {name}" if contacts > 1 else name[0].upper() + name[1:]
-        _draw_force(grid[index, 0], rows, forces, index, known)
-        style.quiet(grid[index, 0], title=title, x="time [s]", y=label)
-        if every is not None:
-            title = _draw_errors(grid[index, 1], every, index, label.split()[-1].strip("[]"))
-            style.quiet(grid[index, 1], title=title, x="error / standard deviation", y="density")
-    style.legend_below(figure, *grid.ravel(), size=style.NORMAL)
-    held = any(isinstance(contact.surface, Held) for contact in posterior.model.contacts)
+        title = f"Contact {index}: {name}" if len(contacts) > 1 else name[0].upper() + name[1:]
+        style.quiet(axes, title=title, x="time [s]", y=label)
+    style.legend_below(figure, *grid, size=style.NORMAL)
+    held = any(isinstance(contact.surface, Held) for contact in contacts)
     style.heading(figure, f"{'Contact' if held else 'Normal'} force after {len(posterior.training)} training points")
     return figure
 
@@ -123,61 +115,3 @@ def _contact_labels(contact: Contact) -> tuple[str, str]:
         where = f"{contact.frame} with {contact.second_frame}"
         return (f"{where} about {axis}", "torque [Nm]") if contact.turning else (f"{where} along {axis}", "force [N]")
     return f"{contact.frame} along {axis}", "force [N]"
-
-
-@dataclass(frozen=True, eq=False)
-class _Forces:
-    """Normal forces (rows, m) in N: prediction, its standard deviation, the known forces alone, and the truth."""
-
-    mean: Float[np.ndarray, "rows m"]
-    std: Float[np.ndarray, "rows m"]
-    nominal: Float[np.ndarray, "rows m"]
-    truth: Float[np.ndarray, "rows m"] | None
-
-
-def _normal_forces(posterior: Posterior, rows: Dataset) -> _Forces:
-    q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
-    with torch.no_grad():
-        multiplier = posterior.predict(q, v, u).multiplier
-        assert multiplier is not None, "models with forces predict lambda"
-        dynamics = posterior.dynamics(q, v, u)
-        size = torch.linalg.vector_norm(dynamics.normals, dim=-1)
-        own = size if rows.model is None else torch.linalg.vector_norm(rows.model.dynamics(q, v, u).normals, dim=-1)
-        truth = rows.truth.get("lambda")
-        if truth is not None:
-            truth = own.numpy() * truth if truth.shape == own.shape == size.shape else None
-        parts = (size * multiplier.mean, size * multiplier.std, size * dynamics.multiplier_map().offset)
-    mean, std, nominal = (part.cpu().numpy() for part in parts)
-    return _Forces(mean, std, nominal, truth)
-
-
-def _draw_force(axes: Axes, rows: Dataset, forces: _Forces, index: int, known: bool) -> None:
-    time, mean, spread = rows.time, forces.mean[:, index], QUANTILE * forces.std[:, index]
-    axes.plot(time, forces.nominal[:, index], color=style.KNOWN_PHYSICS, linewidth=1.1, label="known physics alone")
-    if known and forces.truth is not None:
-        axes.plot(time, forces.truth[:, index], color=style.TRUTH, linewidth=3.5, alpha=0.3, label="true")
-    style.draw_band(axes, time, mean, spread, alpha=0.3, label="95 % band")
-    axes.plot(time, mean, color=style.PREDICTION, linewidth=1.3, label="predicted")
-    axes.margins(x=0)
-
-
-def _draw_errors(axes: Axes, forces: _Forces, index: int, unit: str) -> str:
-    """The histogram of errors; returns what their root mean square is, for its title."""
-    assert forces.truth is not None, "errors are drawn where the truth is known"
-    std = forces.std[:, index]
-    acts = std >= 1e-9 * std.max()  # a foot that is lifted has no force, and no error but rounding
-    errors = (forces.mean - forces.truth)[acts, index] / np.maximum(std[acts], np.finfo(float).tiny)
-    bins = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 41)
-    # half a bin inside of the ends, so that the errors beyond them are seen
-    kept = np.clip(errors, 0.5 * (bins[0] + bins[1]), 0.5 * (bins[-2] + bins[-1]))
-    axes.hist(kept, bins=list(bins), density=True, color=style.PREDICTION, alpha=0.45, linewidth=0)
-    at = np.linspace(-LARGEST_ERROR, LARGEST_ERROR, 201)
-    style.draw_line(axes, at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), style.TRUTH, 1.0, "standard normal")
-    axes.set_xlim(-LARGEST_ERROR, LARGEST_ERROR)
-    text = f"{100.0 * float((np.abs(errors) <= QUANTILE).mean()):.0f} % inside\nthe 95 % band"
-    corner: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
-    axes.annotate(text, (0.98, 0.95), fontsize=style.SMALL, color=style.TRUTH, **corner)
-    truth = forces.truth[:, index]
-    error, size = (float(np.sqrt(np.square(x).mean())) for x in (forces.mean[:, index] - truth, truth))
-    relative = f" ({100.0 * error / size:.2g} %)" if size else ""
-    return f"Errors: root mean square {error:.2g} {unit}{relative}"
