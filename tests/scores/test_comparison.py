@@ -11,7 +11,7 @@ from forcegp import JointFriction, score
 from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
 from forcegp.fit import fit as fit_model
 from forcegp.jobs import JobStore, code_digest
-from forcegp.scores import Candidate, Training, fitted_on_all_rows
+from forcegp.scores import Candidate, Training
 from forcegp.scores.candidates import candidate
 from forcegp.scores.score import KIND
 
@@ -218,7 +218,7 @@ def test_models_refined_on_motions_move_better_and_laws_stand_side_by_side():
     assert scores.models[viscous]["kind"] == "identified"
     assert viscous in scores.models[viscous]["summary"]
     assert scores.value("nrmse", model=dry) < scores.value("nrmse", model=viscous), "it has dry friction"
-    final = fitted_on_all_rows(dry, data, points=60, restarts=1)
+    final = scores.fitted_on_all_rows(dry)
     assert {"Viscous", "Coulomb"} <= {type(law).__name__ for law in final.model.laws}
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import t as student
 from scipy.stats import ttest_rel
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import FitError, InvalidInput
 from forcegp.scores import Scores
 from forcegp.scores.paired import paired_difference
 
@@ -149,6 +149,8 @@ def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():
     assert {each["model"] for each in alone.winners.values()} == {alone.recommended} == {"net"}
     nothing = scores({"net": [cell(0, None)]})
     assert (nothing.winners, nothing.recommended, nothing.rival, nothing.verdicts) == ({}, None, None, [])
+    with pytest.raises(FitError, match="no model was fitted: net failed in 1 of 1 runs"):
+        nothing.fitted_on_all_rows()
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from forcegp.cli.import_log import Import
 from forcegp.cli.input_options import CandidateOptions, forces_of
 from forcegp.cli.payload import payload_dict, with_payload
 from forcegp.cli.terminal import Terminal, facts, findings_table
-from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit, NumericalError
+from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 
 MOST_CORRECTIONS = 8
 SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "against_rival", "failures")
@@ -249,10 +249,7 @@ class Auto(CandidateOptions, Resuming, Import):
         for failure in scores.failures:
             terminal.warn(failure)
         with terminal.progress("learning from all rows"):
-            best = scores.recommended
-            if best is None:
-                raise FitError(f"no model was fitted; {self.out / 'scores' / 'report.md'} has the reasons.")
-            posterior = forcegp.scores.fitted_on_all_rows(best, rows, **how)
+            posterior = scores.fitted_on_all_rows()
         with terminal.progress("intervals of motions") as report:
             posterior, why_not = forcegp.scores.with_intervals_of_motions(posterior, recording, report)
         if why_not is not None:

@@ -147,13 +147,9 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
         for warning in scores.warnings if not fits else ():
             terminal.warn(warning)
         best = scores.recommended
-        if fits and best is not None and self.out is not None and best not in scores.posteriors:
+        if fits and best is not None and self.out is not None:
             with terminal.progress(f"learning {best} from all rows"):
-                how = {name: getattr(self, name) for name in SAME if name not in ("starts", "integrator")}
-                posterior = forcegp.scores.fitted_on_all_rows(
-                    best, rows, model=model, recording=recording, given=models.get(best), **how
-                )
-                forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
+                forcegp.save_posterior(scores.fitted_on_all_rows(), self.out / "model", overwrite=True)
             terminal.note(f"{best}, learned from all rows: {self.out / 'model'}")
         content = scores.to_dict() | {"warnings": [terminal.worded(each) for each in scores.warnings]}
         if not fits and len(runs) == 1:

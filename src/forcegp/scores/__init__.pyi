@@ -28,6 +28,6 @@ from .leave_out import choose_forces as choose_forces
 from .paired import CRITERIA as CRITERIA, PairedDifference as PairedDifference
 from .page import overall as overall
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows
-from .score import fitted_on_all_rows as fitted_on_all_rows, score as score
+from .score import score as score
 from .scores import Scores as Scores
 from .splits import Split as Split, Stretch as Stretch, split_named as split_named

@@ -186,8 +186,6 @@ def _presses_unseen(moving: Tensor, pressing: Tensor) -> bool:
 TRIED_ROWS = 200
 """Rows on which both systems are tried before one is advised."""
 
-KEPT = "; it stays as it is"
-
 WORTH_MOVING = 0.9
 """Error in the system of the data over that in the model's own, below which the model is worth carrying over."""
 
@@ -221,7 +219,11 @@ def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
 
 
 def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
-    """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy."""
+    """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy.
+
+    A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
+    data more than those of another recording: whether to carry the model over is decided by some rows, not by a rule.
+    """
     own, model = dataset.model, posterior.model
     if own is None:
         return
@@ -232,36 +234,33 @@ def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
         return
     what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
     are, those = ("are", "those") if contacts else ("is", "that")
-    measured = f"; the constraint error is measured on {those} of the data" if contacts else ""
-    tried = _tried(posterior, dataset, own)
-    if contacts or not tried.startswith(KEPT):  # a robot that serves these data better than theirs was identified
-        yield f"the {what} of the model {are} not {those} of the data{measured}{tried}"
+    sentence = f"the {what} of the model {are} not {those} of the data"
+    sentence += f"; the constraint error is measured on {those} of the data" if contacts else ""
+    errors = _errors_here_and_there(posterior, dataset, own)
+    if errors is not None and errors[1] < WORTH_MOVING * errors[0]:
+        sentence += f"; carried over to them, the error of its mean is {errors[1]:.3g} instead of {errors[0]:.3g} on "
+        sentence += "some of these rows: `posterior.with_model(dataset.model)`"
+    elif errors is not None:
+        sentence += f"; it stays as it is, for carried over to them its error would be {errors[1]:.3g} instead of "
+        sentence += f"{errors[0]:.3g}"
+    if contacts or errors is None or errors[1] < WORTH_MOVING * errors[0]:
+        yield sentence  # else a robot that serves these data better than theirs was identified
 
 
-def _tried(posterior: Posterior, dataset: Dataset, model: Model) -> str:
-    """What carrying the model over to the system of the data would do to its error, on some of these rows.
-
-    A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
-    data more than those of another recording: the rows decide, not a rule.
-    """
+def _errors_here_and_there(posterior: Posterior, dataset: Dataset, model: Model) -> tuple[float, float] | None:
+    """Errors of the mean on some rows as it is and carried over to that model; None where it cannot be."""
     if not isinstance(posterior, StructuredPosterior):
-        return ""
+        return None
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
-            moved = posterior.with_model(moved_model(posterior, model))
-            with torch.no_grad():
-                means = [model.predict(rows.q, rows.v, rows.u, covariance=False).mean for model in (posterior, moved)]
+            each = posterior, posterior.with_model(moved_model(posterior, model))
+            means = [one.predict(rows.q, rows.v, rows.u, covariance=False).mean for one in each]
     except ForceGPError:
-        return ""  # it cannot be carried there
+        return None
     here, there = (float(np.abs(mean.cpu().numpy() - rows.a).mean()) for mean in means)
-    if there < WORTH_MOVING * here:
-        return (
-            f"; carried over to them, the error of its mean is {there:.3g} instead of {here:.3g} on "
-            f"{len(rows)} of these rows: `posterior.with_model(dataset.model)`"
-        )
-    return f"{KEPT}, for carried over to them its error would be {there:.3g} instead of {here:.3g}"
+    return here, there
 
 
 def moved_model(posterior: Posterior, model: Model) -> Model:

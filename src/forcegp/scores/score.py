@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,15 @@ from forcegp.model import Model
 from forcegp.parallel import Backend, backend_for
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.candidates import (
+    Candidate,
     Given,
-    Training,
-    candidate,
     candidates,
     default_models,
     fitted_before,
     identified_model,
     kind_and_summary,
-    usual_identification,
 )
-from forcegp.scores.experiment import Experiment, fingerprint, training_subset
+from forcegp.scores.experiment import Experiment, fingerprint
 from forcegp.scores.jobs import jobs_of, kept
 from forcegp.scores.leave_out import leave_out
 from forcegp.scores.motions import STARTS, held_out_motions
@@ -131,9 +130,8 @@ def score(
     if split == LEAVE_OUT:
         return leave_out(given, log, robot, points=points, restarts=restarts, iterations=iterations, about=about)
     splits = split_named(log, split or "auto") if split is None or isinstance(split, str) else tuple(split)
-    rows, whole = log, recording or log
     settings: Any = (points, horizons, starts, integrator, identification, restarts, iterations)
-    experiment = Experiment(rows, whole, robot, splits, *settings)
+    experiment = Experiment(log, recording or log, robot, splits, *settings)
     chosen = candidates(default_models(robot) if given is None else given, robot, experiment.identifies)
     workers = backend_for(backend, jobs)
     with tempfile.TemporaryDirectory() as nowhere:
@@ -151,38 +149,20 @@ def score(
             "seeds": list(range(seeds)),
             "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
         }
-        scores = _scores(log, runs, {name: (each.kind, each.summary) for name, each in chosen.items()}, margin, about)
+        kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
+        scores = replace(_scores(log, runs, kinds, margin, about), fit=partial(_on_all_rows, experiment, chosen))
         if folder is not None:
             with store.locked():
                 write(scores, store.folder)
     return scores
 
 
-def fitted_on_all_rows(
-    name: str,
-    log: Dataset,
-    *,
-    model: Model | None = None,
-    recording: Dataset | None = None,
-    given: Given | None = None,
-    points: int = 100,
-    identification: str | None = None,
-    restarts: int | None = None,
-    iterations: int | None = None,
-) -> Posterior:
-    """The posterior of a named model from all rows of a log, nothing of which is held out any more; as for `score`.
-
-    `given` is what the name stands for where it is no expression. Raises InvalidInput and FitError.
-    """
-    robot = log.model if model is None else model
-    assert robot is not None, "it was scored"
-    identifies = identification or usual_identification(robot)
-    work = candidate(name, name if given is None else given, robot, identifies)
+def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: str) -> Posterior:
+    work, rows = chosen[name], experiment.rows
     if isinstance(work.fit, Posterior):
         return work.fit
-    identified = None if work.identification is None else identified_model(work.identification, robot, log)
-    rows = training_subset(log, points, 0)
-    return work.fit(Training(rows, robot, log, recording or log, identified, 0, restarts, iterations))
+    identified = None if work.identification is None else identified_model(work.identification, experiment.model, rows)
+    return work.fit(experiment.training(rows, experiment.recording, identified, 0))
 
 
 def write(scores: Scores, folder: Path) -> None:

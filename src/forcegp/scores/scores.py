@@ -1,6 +1,6 @@
 """`Scores`: what was found of several models on the same rows, by quantity, score, joint, stretch of time and seed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, require_known
+from forcegp.errors import FitError, InvalidInput, require_known
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, over_columns
 from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference, paired_difference
@@ -38,6 +38,7 @@ class Scores(Summary):
     margin: ratios of errors within it of 1 are no difference.
     about: what was done, for the page.
     posteriors: models that were fitted only once, and those that were given.
+    fit: how a model by this name is fitted to all rows.
     """
 
     models: Mapping[str, Mapping[str, str]]
@@ -47,6 +48,7 @@ class Scores(Summary):
     margin: float = MARGIN
     about: Mapping[str, Any] = field(default_factory=dict)
     posteriors: Mapping[str, Posterior] = field(default_factory=dict)
+    fit: Callable[[str], Posterior] | None = field(default=None, compare=False)
 
     # ------------------------------------------------------------------ numbers
 
@@ -179,6 +181,16 @@ class Scores(Summary):
     def recommended(self) -> str | None:
         """The model to take, by motions, else forces, else accelerations; None where no model was scored."""
         return next((self.winners[name]["model"] for name in ORDER if name in self.winners), None)
+
+    def fitted_on_all_rows(self, model: str | None = None) -> Posterior:
+        """The recommended model (or another one by name) from all rows, of which nothing is held out any more.
+
+        Raises FitError where no model was scored, or its fit fails.
+        """
+        name = self.recommended if model is None else self._named(model)
+        if name is None:
+            raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
+        return self.posteriors[name] if self.fit is None else self.fit(name)
 
     @cached_property
     def rival(self) -> str | None:
