@@ -16,7 +16,7 @@ from forcegp.fit import fit
 from forcegp.forces import Payload, Rotor
 from forcegp.forces.registry import force_name, usual_friction
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 ROWS = 1_000
 SURE = 4.0  # standard errors from zero
@@ -43,7 +43,7 @@ def dynamics_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     yield _friction(found)
 
 
-def _payload(found: StructuredPosterior) -> Iterator[Finding]:
+def _payload(found: Posterior) -> Iterator[Finding]:
     held = next(law for law in found.model.laws if isinstance(law, Payload))
     assert held.link is not None, "it was found"
     mass, link = found.parameters["payload.mass"], found.model.robot.link(held.link)
@@ -61,7 +61,7 @@ def _payload(found: StructuredPosterior) -> Iterator[Finding]:
     )
 
 
-def _rotors(inputs: CheckInput, found: StructuredPosterior) -> Iterator[Finding]:
+def _rotors(inputs: CheckInput, found: Posterior) -> Iterator[Finding]:
     rotors, robot = found.parameters.of("rotor"), found.model.robot
     values, errors = (np.array([getattr(rotors[name], what) for name in inputs.names]) for what in ("value", "std"))
     q = torch.tensor(inputs.rows().q[::50], device=robot.device)
@@ -81,7 +81,7 @@ def _rotors(inputs: CheckInput, found: StructuredPosterior) -> Iterator[Finding]
     )
 
 
-def _friction(found: StructuredPosterior) -> Finding:
+def _friction(found: Posterior) -> Finding:
     laws = [force_name(law) for law in usual_friction()]
     parts = {name: each for name, each in found.parameters.items() if name.partition(".")[0] in laws}
     joints = found.model.robot.joint_names

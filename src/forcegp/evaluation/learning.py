@@ -26,7 +26,7 @@ from forcegp.forces import (
 from forcegp.inference import Inducing
 from forcegp.model import Model
 from forcegp.noise import Noise
-from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.posterior import Posterior
 
 Report = Callable[[int, int, str], None]
 """Called as report(done, total, what happens)."""
@@ -256,8 +256,8 @@ def with_force_noise(model: Model, dataset: Dataset) -> Model:
 
 
 def allowing_for_correlation(
-    posterior: StructuredPosterior, dataset: Dataset, hyperprior: bool = True
-) -> tuple[StructuredPosterior, str | None]:
+    posterior: Posterior, dataset: Dataset, hyperprior: bool = True
+) -> tuple[Posterior, str | None]:
     """The posterior from all rows of a log, learned from them as the independent rows that they are worth; and a note.
 
     Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would
