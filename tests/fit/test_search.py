@@ -79,6 +79,7 @@ def test_who_is_compared_with_whom_does_not_depend_on_the_backend_or_the_number_
     assert all(before == [] for _, before in run_restarts(seen, 5, 0, Serial(), None))
 
 
+@pytest.mark.nightly
 def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
     how = {"points": 15, "restarts": 4, "seed": 3, "options": OptimizerOptions(iterations=25, patience=2)}
     one, two = (fit(train.model.with_forces(JointForces()), train, jobs=jobs, **how) for jobs in (1, 2))
