@@ -34,7 +34,7 @@ GROUPS: Mapping[str, str] = {
     "Fit": "points learning_points rows engine restarts iterations hyperprior checks correct accept",
     "Score": "split guard seeds seed_list horizon margin strict",
     "Program": "to steps covariance jacobian unchecked",
-    "Compute": "preset seed jobs backend device port",
+    "Compute": "preset seed jobs device port",
     "Output": "out plots report html browser rerun write_mapping docs overwrite json",
     "Other": "debug",
 }

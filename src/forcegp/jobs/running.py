@@ -18,8 +18,7 @@ from forcegp import __version__
 from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, require_writable, write_json
 from forcegp.errors import BackendError, FileFormatError, FitError, ForceGPError, InvalidInput, OutdatedWarning
 from forcegp.jobs.job import Job, digests, machine
-from forcegp.parallel import Backend, Joblib
-from forcegp.parallel.backend import outcome_of
+from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
 
 FORMAT_VERSION = 1
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
@@ -138,10 +137,8 @@ Progress = Callable[[int, int, str], None]
 """Called as `progress(work done, work in total, note)`; work is an estimate in CPU seconds."""
 
 
-def run_jobs(
-    store: JobStore, jobs: Sequence[Job], backend: Backend | None = None, progress: Progress | None = None
-) -> int:
-    """Compute all jobs that the store lacks, on a backend (None: in one other process); returns how many.
+def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: Progress | None = None) -> int:
+    """Compute all jobs that the store lacks, so many at once, or in an executor; returns how many.
 
     Every finished job is kept at once, so a run that is killed at any moment goes on where it was. A job that fails
     stops only what depends on it. Results of other code or settings are computed anew, with a warning. Raises FitError
@@ -157,7 +154,7 @@ def run_jobs(
         if missing:
             require_writable(store.place("trial"))
             _warn_of_outdated(store, missing)
-            _Run(store, by_name, dict(missing), wanted, progress).on(backend or Joblib(1))
+            _Run(store, by_name, dict(missing), wanted, progress).on(at_once)
     return len(missing)
 
 
@@ -193,15 +190,16 @@ class _Run:
         self.failed: dict[str, str] = {}
         self.stopped = False
 
-    def on(self, backend: Backend) -> None:
+    def on(self, at_once: Jobs) -> None:
         """Compute all."""
-        at_work: dict[Future[None], Job] = {}
+        executor, at_work = executor_for(at_once), dict[Future[Any], Job]()
+        most = at_once if isinstance(at_once, int) else len(self.jobs)
         try:
             while True:
-                for job in self._ready(backend.jobs - len(at_work)):
+                for job in self._ready(most - len(at_work)):
                     bare = replace(job, arguments=())  # arguments go by themselves
                     known = {"digest": self.digests[job.name], "code": job.code_digest}
-                    at_work[backend.submit(compute, self.store, bare, known, *job.arguments)] = job
+                    at_work[submit(executor, compute, self.store, bare, known, *job.arguments)] = job
                 if not at_work:
                     break  # what still waits depends on jobs that failed
                 for future in wait(at_work, return_when=FIRST_COMPLETED).done:
@@ -209,8 +207,7 @@ class _Run:
         except BackendError as error:
             raise BackendError(f"{error}. {self._kept()}") from None
         finally:
-            if at_work:
-                backend.stop()
+            stop(executor, at_work)
             remove_leftovers(self.store.folder)
         if self.failed:
             name, cause = next(iter(self.failed.items()))
@@ -237,7 +234,7 @@ class _Run:
             (self._work_behind(other.name) for other in self.waiting.values() if name in other.inputs), default=0.0
         )
 
-    def _record(self, job: Job, future: Future[None]) -> None:
+    def _record(self, job: Job, future: Future[Any]) -> None:
         try:
             outcome_of(future)
             self.done.append(job.name)
