@@ -1,7 +1,7 @@
 """Work at once: in this process, in processes that are kept between calls, or in any `concurrent.futures.Executor`.
 
 Where a function takes `jobs`, 1 is this process, a number is so many processes of this machine, and an executor is
-used as it is: `ProcessPoolExecutor`, Dask's `client.get_executor()`, the pool of Ray or MPI. Equal tasks have equal outcomes.
+used as it is: `ProcessPoolExecutor`, Dask's `client.get_executor()`, the pool of Ray or MPI. Outcomes are the same.
 """
 
 import contextlib
