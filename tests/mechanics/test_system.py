@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.mechanics.systems import assert_close, model_with, normal, robot, states, surfaces
-from tests.robots.robot_models import CHAIN, FRAMES, TREE
+from tests.robots.robot_models import CHAIN, FRAMES, TREE, loaded
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, NumericalError, UnknownFrame
 from forcegp.forces import Actuation, Coulomb, RigidBodies, Rotor, Viscous
@@ -25,8 +25,7 @@ def complete() -> Model:
     """Every kind of part, a robot that is not as its file says."""
     built = Robot.from_urdf_text(TREE, gravity=(0.1, -0.2, -9.7), locked={"left_gripper": 0.013})
     built = built.with_armature({"torso": 0.25})
-    parameters = built.inertial_parameters("right_hand")["right_hand"]
-    built = built.with_inertials({"right_hand": parameters + 0.1 * normal(10)})
+    built = loaded(built, "right_hand")
     return Model(
         built,
         (

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import torch
 from tests.robots.pinocchio_oracle import Oracle
+from tests.robots.robot_models import loaded
 
 from forcegp.codegen.c_writer import write_program
 from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
-from forcegp.robots.dynamics_programs import INERTIA_ENTRIES, PURPOSE, Request, trace_dynamics
+from forcegp.robots.dynamics_programs import PURPOSE, Request, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
@@ -48,7 +49,6 @@ TEXT = """<robot name="small">
 </robot>
 """
 ARMATURE = {"swing": 0.2, "slide": 0.4}
-LINKS = ("arm", "cart", "tool")  # one body keeps a link of the URDF: hand
 METHODS = {
     "mass_matrix": 1,
     "bias_forces": 2,
@@ -78,13 +78,12 @@ def random(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def results(of, method, arguments, inertials):
+def results(of, method, arguments):
     """Values, and the gradients of a random combination of them with respect to everything that requires one."""
-    values = getattr(of, method)(*arguments, inertials)
+    values = getattr(of, method)(*arguments)
     values = values if isinstance(values, tuple) else (values,)
     total = sum((value * random(*value.shape, seed=9)).sum() for value in values)
-    leaves = [*arguments, *(inertials or {}).values()]
-    return [value.detach() for value in values], torch.autograd.grad(total, [x for x in leaves if x.requires_grad])
+    return [value.detach() for value in values], torch.autograd.grad(total, arguments)
 
 
 def assert_equal_results(ours, theirs):
@@ -94,20 +93,10 @@ def assert_equal_results(ours, theirs):
             torch.testing.assert_close(x, y, rtol=0, atol=1e-12 * scale)
 
 
-@pytest.mark.parametrize("inertials", [None, (), (1, 6)], ids=["as they are", "one set", "in batches"])
 @pytest.mark.parametrize("method", METHODS)
-def test_values_and_gradients_equal_those_of_the_robot(robot, compiled, method, inertials):
+def test_values_and_gradients_equal_those_of_the_robot(robot, compiled, method):
     arguments = [random(5, 6, 3, seed=k).requires_grad_() for k in range(METHODS[method])]
-    if inertials is not None:
-        names = enumerate(LINKS)
-        inertials = {name: (0.3 * random(*inertials, 10, seed=20 + k)).requires_grad_() for k, name in names}
-    assert_equal_results(*(results(of, method, arguments, inertials) for of in (compiled, robot)))
-
-
-def test_only_the_gradient_of_the_inertials(robot, compiled):
-    inertials = {name: (0.3 * random(10, seed=20 + k)).requires_grad_() for k, name in enumerate(LINKS)}
-    arguments = [random(6, 3, seed=k) for k in range(3)]
-    assert_equal_results(*(results(of, "forward_dynamics", arguments, inertials) for of in (compiled, robot)))
+    assert_equal_results(*(results(of, method, arguments) for of in (compiled, robot)))
 
 
 def test_pinocchio_agrees(robot, compiled):
@@ -118,13 +107,8 @@ def test_pinocchio_agrees(robot, compiled):
 
 
 def test_gradients_against_differences(compiled):
-    inertials = [(0.3 * random(10, seed=20 + k)).requires_grad_() for k in range(3)]
     states = [random(2, 3, seed=k).requires_grad_() for k in range(3)]
-
-    def accelerations(*x):
-        return compiled.forward_dynamics(*x[:3], dict(zip(LINKS, x[3:], strict=True)))
-
-    assert torch.autograd.gradcheck(accelerations, (*states, *inertials))
+    assert torch.autograd.gradcheck(compiled.forward_dynamics, states)
 
 
 def test_forward_dynamics_undoes_inverse_dynamics(compiled):
@@ -134,12 +118,10 @@ def test_forward_dynamics_undoes_inverse_dynamics(compiled):
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 8, 9])
 def test_every_number_of_states(robot, compiled, count):
-    """Some fill the vector registers, some do not; sums over states count each once."""
+    """Some fill the vector registers, some do not."""
     q, v, tau = (random(count, 3, seed=k).requires_grad_() for k in range(3))
-    inertials = {"cart": random(10).requires_grad_()}
     ours, theirs = (
-        torch.autograd.grad(of.forward_dynamics(q, v, tau, inertials).square().sum(), (q, *inertials.values()))
-        for of in (compiled, robot)
+        torch.autograd.grad(of.forward_dynamics(q, v, tau).square().sum(), (q, v)) for of in (compiled, robot)
     )
     torch.testing.assert_close(ours, theirs)
 
@@ -148,16 +130,13 @@ def test_every_number_of_states(robot, compiled, count):
 def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
     """What is written for other processors runs here, too, only slower; parts of any length do the same."""
     q, v, tau, weights = random(4, 13, 3)
-    inputs = [q, v, tau, robot.tree.inertias[..., 0][:, *zip(*INERTIA_ENTRIES, strict=True)].reshape(1, -1)]
+    inputs = [q, v, tau]
     for derivatives in (False, True):  # which take what the value has kept
-        request = Request("forward_dynamics", True, derivatives, derivatives, keeps=not derivatives)
+        request = Request("forward_dynamics", derivatives, keeps=not derivatives)
         source = write_program(trace_dynamics(UnrolledRobot(robot), request), lanes, statements)
         options, path = ("-std=gnu11", "-O1", "-fPIC", "-shared"), tmp_path / f"{derivatives}.so"
-        sizes = request.sizes(UnrolledRobot(robot))
-        outputs = [
-            torch.full((1 if name == "inertias" else 13, sizes[name]), torch.nan, dtype=torch.float64)
-            for name in request.outputs
-        ]
+        _, sizes = request.sizes(UnrolledRobot(robot))
+        outputs = [torch.full((13, size), torch.nan, dtype=torch.float64) for size in sizes.values()]
         library = compile_library(source, options, path, "evaluate", PURPOSE)
         given, made = ([x.shape[1] for x in vectors] for vectors in (inputs, outputs))
         assert RowFunction(library, given, made).rows(13, inputs, outputs) == 0
@@ -173,25 +152,17 @@ def test_batches_broadcast_as_those_of_the_robot(robot, compiled):
     assert ours.shape == (4, 2, 3)
     torch.testing.assert_close(ours, theirs)
     assert compiled.mass_matrix(q).shape == (3, 3)
-    inertials = {"cart": 0.3 * random(5, 10), "tool": 0.3 * random(10)}
-    for states in (random(3, 3), random(3, 1, 3), random(3, 0, 1, 3)):  # every state serves all sets of inertias
-        ours, theirs = (of.forward_dynamics(*states, inertials) for of in (compiled, robot))
-        torch.testing.assert_close(ours, theirs)
 
 
 def test_large_batches_by_several_threads(robot, compiled):
     q, v, tau = random(3, 5000, 3)
-    inertials = {"tool": (0.1 * random(10)).requires_grad_()}
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        values = compiled.forward_dynamics(q, v, tau, inertials)
-        (gradient,) = torch.autograd.grad(values.sum(), inertials.values())
+        values = compiled.forward_dynamics(q, v, tau)
     finally:
         torch.set_num_threads(threads)
-    expected = robot.forward_dynamics(q, v, tau, inertials)
-    torch.testing.assert_close(values, expected)
-    torch.testing.assert_close(gradient, torch.autograd.grad(expected.sum(), inertials.values())[0])
+    torch.testing.assert_close(values, robot.forward_dynamics(q, v, tau))
 
 
 def test_another_process_finds_the_code(robot, folder, compiled, repository):
@@ -214,7 +185,7 @@ print(compiled.forward_dynamics(q, v, tau).tolist())
 def test_other_robots_have_code_of_their_own(robot, compiled, folder):
     compiled.gravity_forces(random(3))
     before = len(list(folder.iterdir()))
-    heavier = robot.with_inertials({"tool": robot.inertial_parameters("tool")["tool"] + 0.1})
+    heavier = loaded(robot, "tool")
     q = random(2, 3)
     torch.testing.assert_close(heavier.compile(folder).gravity_forces(q), heavier.gravity_forces(q))
     assert len(list(folder.iterdir())) == before + 1
@@ -250,10 +221,8 @@ def test_the_page_on_compiled_dynamics_runs(repository, tmp_path):
 def test_inputs_are_checked_as_those_of_the_robot(compiled):
     with pytest.raises(InvalidInput, match=r"tau must be a tensor of real numbers; given: torch\.bool"):
         compiled.forward_dynamics(random(3), random(3), random(3) > 0)
-    with pytest.raises(InvalidInput, match=r"batch shapes do not broadcast: q \(2,\), inertials \(3,\)"):
-        compiled.mass_matrix(random(2, 3), {"arm": random(3, 10)})
-    with pytest.raises(InvalidInput, match="'base' of small is fixed in the world"):
-        compiled.mass_matrix(random(3), {"base": random(10)})
+    with pytest.raises(InvalidInput, match=r"batch shapes do not broadcast: q \(2,\), v \(3,\)"):
+        compiled.bias_forces(random(2, 3), random(3, 3))
 
 
 def test_states_that_are_not_finite(compiled):

@@ -36,5 +36,4 @@ def test_joints_and_the_other_links_are_the_originals():
     changed = Robot.from_urdf_text(urdf(joint_damping=0.5))
     assert changed.joints == original.joints
     kept = [f"lbr_iiwa_link_{number}" for number in range(1, 7)]
-    found, expected = changed.inertial_parameters(*kept), original.inertial_parameters(*kept)
-    assert all(torch.equal(found[name], expected[name]) for name in kept)
+    assert all(changed.link(name) == original.link(name) for name in kept)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,8 +10,8 @@ from torch import Tensor
 
 from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.arguments import Inertials, JointValues, Positions, broadcast_batch
-from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, MERGED, Request, compiled_program
+from forcegp.robots.arguments import JointValues, Positions, broadcast_batch
+from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, Request, compiled_program
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
@@ -25,9 +25,9 @@ class CompiledRobot:
     """The dynamics of a robot, compiled for it; made by ``robot.compile()``.
 
     The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, also where a base moves, and
-    backward passes give the derivatives with respect to all arguments and inertial parameters. Results agree to
-    rounding. Not supported, with an :class:`~forcegp.errors.InvalidInput` : second derivatives, transforms of
-    ``torch.func``, forward-mode differentiation, and other devices than the CPU. Use the robot itself there.
+    backward passes give the derivatives with respect to all arguments. Results agree to rounding. Not supported, with
+    an :class:`~forcegp.errors.InvalidInput`: second derivatives, transforms of ``torch.func``, forward-mode
+    differentiation, and other devices than the CPU. Use the robot itself there.
 
     A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
     ``folder`` (``~/.cache/forcegp/compiled`` by default) holds them already; :meth:`prepare` does so ahead. Code from
@@ -55,55 +55,48 @@ class CompiledRobot:
     def __repr__(self) -> str:
         return f"CompiledRobot({self.robot!r}, folder={str(self.folder)!r})"
 
-    def prepare(self, *functions: str, inertials: bool = False, derivatives: bool = False) -> "CompiledRobot":
-        """Compile functions now: those named, or all; returns the same object.
+    def prepare(self, *functions: str, derivatives: bool = False) -> "CompiledRobot":
+        """Compile functions now: those named, or all, with ``derivatives`` also those of a backward pass.
 
-        ``inertials``: for calls with ``inertials=``, which take the inertias as inputs; else for those without.
-        ``derivatives``: also those of a backward pass, with respect to the arguments, the inertias, or both.
+        Returns the same object. Raises InvalidInput for a name that no function has.
         """
         unknown = [name for name in functions if name not in ARGUMENTS]
         if unknown:
             raise InvalidInput(f"no function {unknown[0]!r} to compile; there are: {', '.join(ARGUMENTS)}")
-        kinds = [(False, False)]
-        if derivatives:
-            kinds += [(True, False), *([(False, True), (True, True)] if inertials else [])]
         for name in functions or ARGUMENTS:
-            for states, inertias in kinds:
-                self.program(Request(name, inertials, states, inertias))
-            if derivatives and name == KEEPING:
-                self.program(Request(name, inertials, keeps=True))
+            self.program(Request(name))
+            if derivatives:
+                self.program(Request(name, derivatives=True))
+                if name == KEEPING:
+                    self.program(Request(name, keeps=True))
         return self
 
-    def mass_matrix(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
         """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
-        return self._evaluate("mass_matrix", inertials, q=q)[0]
+        return self._evaluate("mass_matrix", q=q)[0]
 
-    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.bias_forces <forcegp.robots.Robot.bias_forces>`."""
-        return self._evaluate("bias_forces", inertials, q=q, v=v)[0]
+        return self._evaluate("bias_forces", q=q, v=v)[0]
 
     def mass_matrix_and_bias(
-        self, q: Positions, v: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """As :meth:`Robot.mass_matrix_and_bias <forcegp.robots.Robot.mass_matrix_and_bias>`."""
-        mass, bias = self._evaluate("mass_matrix_and_bias", inertials, q=q, v=v)
+        mass, bias = self._evaluate("mass_matrix_and_bias", q=q, v=v)
         return mass, bias
 
-    def gravity_forces(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.gravity_forces <forcegp.robots.Robot.gravity_forces>`."""
-        return self._evaluate("gravity_forces", inertials, q=q)[0]
+        return self._evaluate("gravity_forces", q=q)[0]
 
-    def inverse_dynamics(
-        self, q: Positions, v: JointValues, a: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.inverse_dynamics <forcegp.robots.Robot.inverse_dynamics>`."""
-        return self._evaluate("inverse_dynamics", inertials, q=q, v=v, a=a)[0]
+        return self._evaluate("inverse_dynamics", q=q, v=v, a=a)[0]
 
-    def forward_dynamics(
-        self, q: Positions, v: JointValues, tau: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
         """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
-        return self._evaluate("forward_dynamics", inertials, q=q, v=v, tau=tau)[0]
+        return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)[0]
 
     def program(self, request: Request) -> RowFunction:
         """The machine code of a request."""
@@ -112,34 +105,27 @@ class CompiledRobot:
             found = self._programs[request] = compiled_program(self._unrolled, request, self.folder)
         return found
 
-    def _evaluate(self, function: str, inertials: Inertials | None, **arguments: Tensor) -> tuple[Tensor, ...]:
+    def _evaluate(self, function: str, **arguments: Tensor) -> tuple[Tensor, ...]:
         nv, given = self._nv, list(arguments.values())
-        parameters = [*self.robot.checked_inertials(inertials).values()] if inertials else []
         plain = self._are_possible(arguments) if self._space.groups else are_plain(given, nv)
         if not plain:
             given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
-        require_plain((*given, *parameters), "compiled dynamics", INSTEAD_OF_TRANSFORMS)
-        batch, own = given[0].shape[:-1], torch.Size()
-        if plain and not parameters and not batch:
+        require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
+        batch = given[0].shape[:-1]
+        if plain and not batch:
             bits, found = self.program(Request(function)).single(*given)
             if bits & NOT_POSITIVE:
                 raise NumericalError(NOT_POSITIVE_DEFINITE)
             return _shaped(found, (), function, nv)
-        simple = plain and all(x.dim() == 1 for x in parameters)
-        if not simple:
-            named = zip(inertials or (), parameters, strict=True)
-            own = broadcast_batch({f"inertials[{name!r}]": values.shape[:-1] for name, values in named})
-            parameters = [values.expand(*own, 10) for values in parameters]
-            shapes = {name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)}
-            batch = broadcast_batch(shapes | ({"inertials": own} if parameters else {}))
+        if not plain:
+            batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)})
             given = [value.expand(*batch, value.shape[-1]) for value in given]
-        if not simple or len(batch) != 1:
+        if not plain or len(batch) != 1:
             given = [value.reshape(batch.numel(), value.shape[-1]).contiguous() for value in given]
-        call, tensors = _Call(function, tuple(inertials or ()), batch, own), (*given, *parameters)
-        if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
-            results = _Value.apply(self, call, *tensors)
+        if torch.is_grad_enabled() and any(value.requires_grad for value in given):
+            results = _Value.apply(self, function, *given)
         else:
-            results, _ = values_of(self, call, tensors)
+            results = run(self, Request(function), given)
         return _shaped(results, batch, function, nv)  # type: ignore[arg-type]  # torch does not type `apply`
 
     def _are_possible(self, arguments: Mapping[str, Tensor]) -> bool:
@@ -159,103 +145,39 @@ def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: 
     )
 
 
-class _Call(NamedTuple):
-    """A function at (batch) states with parameters (own, 10) of links, whose batch broadcasts to that of the states."""
-
-    function: str
-    links: tuple[str, ...]
-    batch: torch.Size
-    own: torch.Size
-
-    def joined(self, parameters: Sequence[Tensor]) -> Tensor:
-        """The parameters of all links, a row for each set."""
-        return torch.cat(list(parameters), dim=-1).view(self.own.numel(), -1)
-
-
-def values_of(
-    owner: CompiledRobot, call: _Call, tensors: Sequence[Tensor], keeps: bool = False
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Results (count, size), and what derivatives take beside states and cotangents: the inertias and what was kept."""
-    states, parameters = (list(part) for part in _split(call, tensors))
-    if parameters:
-        rows = call.joined(parameters)
-        (inertias,) = run(owner, Request(MERGED, links=call.links), len(rows), [rows])
-        if call.own:
-            size = inertias.shape[1]
-            inertias = inertias.view(*call.own, size).expand(*call.batch, size).reshape(-1, size)
-        states.append(inertias)
-    request = Request(call.function, bool(parameters), keeps=keeps and call.function == KEEPING)
-    made = run(owner, request, call.batch.numel(), states)
-    results = len(request.results)
-    return made[:results], [*states[len(ARGUMENTS[call.function]) :], *made[results:]]
-
-
-def derivatives_of(
-    owner: CompiledRobot, call: _Call, request: Request, held: Sequence[Tensor], tensors: Sequence[Tensor]
-) -> list[Tensor | None]:
-    """Derivatives in the states and the parameters of links, None for those not asked for; `tensors` as in `_Value`."""
-    states, (*parameters,) = _split(call, tensors[: len(ARGUMENTS[call.function]) + len(call.links)])
-    cotangents = tensors[len(states) + len(parameters) :]
-    found: list[Tensor | None] = [*run(owner, request, call.batch.numel(), [*states, *held, *cotangents])]
-    if not request.states:
-        found = [*[None] * len(states), *found]
-    if not request.inertias:
-        return [*found, *[None] * len(parameters)]
-    inertias, rows = found.pop(), call.joined(parameters)
-    assert inertias is not None  # the last that was asked for
-    if call.own:
-        size = inertias.shape[1]
-        inertias = inertias.view(*call.batch, size).sum_to_size(*call.own, size).reshape(-1, size)
-    merging = Request(MERGED, states=True, links=call.links)
-    (gradient,) = run(owner, merging, len(rows), [rows, inertias])
-    return [*found, *gradient.view(*call.own, len(parameters), 10).unbind(-2)]
-
-
-def _split(call: _Call, each: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
-    count = len(ARGUMENTS[call.function])
-    return each[:count], each[count:]
-
-
-def run(owner: CompiledRobot, request: Request, count: int, tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Results of a request, (count, size) each, from its inputs in order."""
-    program = owner.program(request)
+def run(owner: CompiledRobot, request: Request, tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Results of a request, (count, size) each, from its inputs (count, size) in order."""
+    program, count = owner.program(request), len(tensors[0])
     outputs = [torch.empty(count, size, dtype=torch.float64) for size in program.outputs]
-    if request.inertias:  # the last; one set of inertias receives the sum over all states
-        outputs[-1] = torch.empty_like(tensors[len(request.arguments) - 1])
     if program.rows(count, tensors, outputs) & NOT_POSITIVE:
         raise NumericalError(NOT_POSITIVE_DEFINITE)
     return outputs
 
 
 class _Value(torch.autograd.Function):
-    """A function of the robot, of states and parameters of links; its backward pass is the program of derivatives."""
+    """A function of the robot at (count) states; its backward pass is the program of derivatives."""
 
     @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, call: _Call, *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.owner, ctx.call = owner, call
-        results, ctx.held = values_of(owner, call, tensors, keeps=True)
-        ctx.save_for_backward(*tensors)
-        return tuple(results)
+    def forward(ctx: Any, owner: CompiledRobot, function: str, *states: Tensor) -> tuple[Tensor, ...]:
+        request = Request(function, keeps=function == KEEPING)
+        made = run(owner, request, states)
+        results = len(request.results)
+        ctx.owner, ctx.function, ctx.kept = owner, function, made[results:]
+        ctx.save_for_backward(*states)
+        return tuple(made[:results])
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        states, inertias = (any(part) for part in _split(ctx.call, ctx.needs_input_grad[2:]))
-        request = Request(ctx.call.function, bool(ctx.call.links), states, inertias)
-        tensors = *ctx.saved_tensors, *(cotangent.contiguous() for cotangent in cotangents)
-        given = ctx.owner, ctx.call, request, ctx.held
-        if torch.is_grad_enabled():
-            return None, None, *_Derivative.apply(*given, *tensors)
-        return None, None, *derivatives_of(*given, tensors)
+        given = *ctx.saved_tensors, *ctx.kept, *(cotangent.contiguous() for cotangent in cotangents)
+        return None, None, *_Derivative.apply(ctx.owner, ctx.function, *given)
 
 
 class _Derivative(torch.autograd.Function):
-    """Derivatives of a function of the robot, which have none themselves."""
+    """Derivatives of a function of the robot in its states, which have none themselves."""
 
     @staticmethod
-    def forward(
-        ctx: Any, owner: CompiledRobot, call: _Call, request: Request, held: Sequence[Tensor], *tensors: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        return tuple(derivatives_of(owner, call, request, held, tensors))
+    def forward(ctx: Any, owner: CompiledRobot, function: str, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(run(owner, Request(function, derivatives=True), tensors))
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:

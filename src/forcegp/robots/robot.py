@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, RobotFileWarning, UnstatedBase, usable_arguments
+from forcegp.errors import RobotFileWarning, UnstatedBase, usable_arguments
 from forcegp.robots.arguments import (
-    Inertials,
     JointValues,
     Positions,
     Vector,
@@ -26,7 +25,7 @@ from forcegp.robots.arguments import (
 )
 from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.inertia import SINGULAR, physical_from_parameters
+from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import lay_out
 from forcegp.robots.mjcf import is_mjcf, translate
@@ -61,8 +60,7 @@ class Robot(RobotStructure):
     leading batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth
     first, branches in file order. On a base that moves, q has other entries than v (:mod:`forcegp.robots.manifold`):
     `nq` of them, called :attr:`position_names`; :meth:`integrate` and :meth:`difference` add and subtract. Batch
-    dimensions of all arguments broadcast. ``inertials`` maps names of moving links to log-Cholesky parameters (..., 10)
-    (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the URDF.
+    dimensions of all arguments broadcast.
 
     Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
     :class:`~forcegp.errors.UnknownName`.
@@ -276,19 +274,16 @@ class Robot(RobotStructure):
         values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
-    def with_inertials(self, inertials: Inertials) -> "Robot":
-        """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
-        text = self.urdf_text
-        for name, parameters in inertials.items():
-            self.layout.require_moving(name, self.name)
-            parameters = self.checked_parameters(name, parameters)
-            if parameters.dim() != 1:
-                raise InvalidInput(
-                    f"inertials[{name!r}] has shape {tuple(parameters.shape)}; a robot holds one set, give shape (10,)."
-                )
-            mass, center, inertia = (value.detach().cpu().numpy() for value in physical_from_parameters(parameters))
-            text = replace_inertial(text, name, float(mass), center, inertia, source=self.source)
-        return self.with_text(text)
+    def with_link(self, name: str, mass: float, center_of_mass: Vector, inertia: Any) -> "Robot":
+        """A robot whose URDF gives a moving link this mass (kg), centre (3,) of mass (m) and inertia (3, 3).
+
+        The inertia is about the centre of mass, in the axes of the link frame, in kg m^2. Raises UnknownLink,
+        InvalidInput for a link that is fixed in the world, and NonPhysicalInertia for what no body has.
+        """
+        self.layout.require_moving(name, self.name)
+        center = finite_vector("center_of_mass", center_of_mass, 3)
+        moments = finite_vector("inertia", np.ravel(inertia), 9, ", shape (3, 3)").reshape(3, 3)
+        return self.with_text(replace_inertial(self.urdf_text, name, float(mass), center, moments, source=self.source))
 
     def with_armature(self, armature: Vector | Mapping[str, float | int]) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
@@ -397,38 +392,34 @@ class Robot(RobotStructure):
             q[:, group.places][:, group.motion.turn] = turn
         return self.space.normalized(q).to(self.device)
 
-    def mass_matrix(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
-        return self.kinematics(q).mass_matrix(inertials)
+        return self.kinematics(q).mass_matrix()
 
-    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
-        return self.kinematics(q, v).bias_forces(inertials)
+        return self.kinematics(q, v).bias_forces()
 
     def mass_matrix_and_bias(
-        self, q: Positions, v: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """:meth:`mass_matrix` and :meth:`bias_forces` from one kinematics pass."""
-        return self.kinematics(q, v).mass_matrix_and_bias(inertials)
+        return self.kinematics(q, v).mass_matrix_and_bias()
 
-    def gravity_forces(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
-        return self.kinematics(q).gravity_forces(inertials)
+        return self.kinematics(q).gravity_forces()
 
-    def inverse_dynamics(
-        self, q: Positions, v: JointValues, a: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
         """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
-        return self.kinematics(q, v).inverse_dynamics(a, inertials)
+        return self.kinematics(q, v).inverse_dynamics(a)
 
-    def forward_dynamics(
-        self, q: Positions, v: JointValues, tau: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``, by Cholesky.
 
         Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
         """
-        return self.kinematics(q, v).forward_dynamics(tau, inertials)
+        return self.kinematics(q, v).forward_dynamics(tau)
 
     def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""

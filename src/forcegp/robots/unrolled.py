@@ -138,8 +138,8 @@ class UnrolledKinematics:
     """The rigid-body algorithms at given states; one scalar per joint; ``v`` only if they are needed.
 
     A scalar is a float, which is a constant, or an :class:`~forcegp.codegen.graph.Expression`. All results are arrays
-    of scalars, in the units of :class:`~forcegp.robots.Robot`. ``inertias`` is one symmetric 4x4 pseudo-inertia
-    (kg m^2, kg m, kg) per body in body axes, in place of the robot's. An entry that is structurally zero is 0.0.
+    of scalars, in the units of :class:`~forcegp.robots.Robot`. An entry that is structurally
+    zero is 0.0.
     """
 
     def __init__(self, unrolled: UnrolledRobot, q: Sequence[Any], v: Sequence[Any] | None = None) -> None:
@@ -166,10 +166,10 @@ class UnrolledKinematics:
                 self.rotations.append(joint.rotation)
                 self.origins.append(joint.origin + joint.rotation[:, 2] * position)
 
-    def mass_matrix(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def mass_matrix(self) -> Scalars:
         """Mass matrix (nv, nv), armature on the diagonal; 0.0 between joints of different branches."""
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
-        composite = list(self.unrolled.inertias if inertias is None else inertias)
+        composite = list(self.unrolled.inertias)
         for i in reversed(range(n)):
             if joints[i].parent != WORLD and i == joints[i].rows[-1]:
                 composite[joints[i].parent] = composite[joints[i].parent] + self._inertia_in_parent(i, composite[i])
@@ -189,17 +189,17 @@ class UnrolledKinematics:
         M[np.diag_indices(len(M))] = M.diagonal() + self.unrolled.armature
         return M
 
-    def bias_forces(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def bias_forces(self) -> Scalars:
         """Coriolis, centrifugal and gravity forces (nv,): the tau that gives zero acceleration."""
-        return self._joint_forces(self.v, None, inertias)
+        return self._joint_forces(self.v, None)
 
-    def inverse_dynamics(self, a: Scalars, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def inverse_dynamics(self, a: Scalars) -> Scalars:
         """Joint forces (nv,) that give the accelerations ``a``: ``M a + bias``."""
-        return self._joint_forces(self.v, self._of_bodies(a), inertias) + self.unrolled.armature * a
+        return self._joint_forces(self.v, self._of_bodies(a)) + self.unrolled.armature * a
 
-    def gravity_forces(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def gravity_forces(self) -> Scalars:
         """Joint forces (nv,) that hold the robot still."""
-        return self._joint_forces([0.0] * len(self.unrolled.joints), None, inertias)
+        return self._joint_forces([0.0] * len(self.unrolled.joints), None)
 
     def _of_bodies(self, values: _Values) -> Any:
         """Velocities or accelerations of the joints of all bodies."""
@@ -241,7 +241,7 @@ class UnrolledKinematics:
             A.append(np.column_stack([_turning(w[i], dw[i]), acceleration]))
         return A
 
-    def _joint_forces(self, v: _Values | None, a: _Values | None, inertias: Sequence[Scalars] | None) -> Scalars:
+    def _joint_forces(self, v: _Values | None, a: _Values | None) -> Scalars:
         assert v is not None, "forces that depend on velocities need some"
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
         forces, moments = ([scalars([0.0] * 3) for _ in range(n)] for _ in range(2))
@@ -250,7 +250,7 @@ class UnrolledKinematics:
         for i in reversed(range(n)):
             if i != joints[i].rows[-1]:
                 continue
-            F = accelerations[i] @ (self.unrolled.inertias if inertias is None else inertias)[i]
+            F = accelerations[i] @ self.unrolled.inertias[i]
             force = forces[i] + F[:, 3]
             moment = moments[i] + scalars([F[x, y] - F[y, x] for x, y in ((2, 1), (0, 2), (1, 0))])
             for k in joints[i].rows:
