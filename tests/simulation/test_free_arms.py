@@ -85,7 +85,7 @@ def test_seeds_and_noise_have_streams_of_their_own():
     ("options", "message"),
     [
         ({"arm": "ur10"}, "arm"),
-        ({"arm": "ur5-free", "seconds": 0.0}, "seconds is 0.0; it must be finite and > 0"),
+        ({"arm": "ur5-free", "seconds": 0.0}, "seconds is 0.0; it must be one number, from 0.1 to 1e5 s"),
         ({"arm": "ur5-free", "noise": float("nan")}, "noise is nan"),
         ({"arm": "ur5-free", "episodes": 0}, "episodes is 0; it must be an integer from 1"),
         ({"arm": "ur5-free", "seed": -1}, "seed is -1"),

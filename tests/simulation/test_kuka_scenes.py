@@ -159,10 +159,6 @@ def test_equal_seeds_give_equal_data(scenes, name):
         ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),
         ({"contact": "bullet", "patch_factor": 2.0}, "ideal contact"),
         ({"surface": "none", "patch_factor": 2.0}, "needs a surface"),
-        ({"lift_share": 0.1}, "cannot be left"),
-        ({"surface": "sphere", "waypoint_x": (-5.0, 5.0)}, "sphere_radius"),
-        ({"tilt_axis": (0.0, 0.0)}, "horizontal direction"),
-        ({"press": -1.0}, ">= 0"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(changes, message):
