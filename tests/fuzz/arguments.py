@@ -301,14 +301,14 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         _robot_from,
         lambda: {
             **{"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None},
-            **{"inertias": "strict", "base": None, "root": None, "strict": False},
+            **{"inertias": "strict", "base": None, "root": None},
         },
     ),
     "Robot.from_mjcf_text": (
         lambda **k: repr(forcegp.Robot.from_mjcf_text(**k)),
         lambda: {
             **{"text": FOUR_BAR, "gravity": None, "armature": None, "locked": None, "inertias": "strict"},
-            **{"base": None, "strict": False},
+            "base": None,
         },
     ),
     "Model.from_file": (

@@ -23,7 +23,6 @@ from forcegp.report import (
     recorded_scene,
     serve,
     write_page,
-    write_rerun,
 )
 
 
@@ -127,22 +126,6 @@ def test_controls_show_the_row_of_the_time(swinging, friction):
         assert controls.time.value == 0.0  # it begins again
         controls.nodes.show_group(0, False, controls.row)
         assert not controls.nodes.arrows[0][0].visible
-
-
-def test_a_log_for_rerun_holds_the_motion(swinging, friction, tmp_path):
-    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed, or an old one that reads no file")
-    path, recorded = tmp_path / "motion.rrd", recorded_scene(swinging, friction, seconds=0.5)
-    write_rerun(path, recorded)
-    assert path.read_bytes().startswith(b"RRF")  # its mark
-    angles = []
-    for part in chunk.RrdReader(path).stream():
-        if part.entity_path == "/q/lower_hinge":
-            batch = part.to_record_batch()
-            seconds = batch["time"].cast("int64").to_numpy() / 1e9
-            angles += zip(seconds, batch["Scalars:scalars"].flatten().to_numpy(), strict=True)
-    np.testing.assert_allclose(sorted(angles), np.column_stack([recorded.time, recorded.q[:, 1]]), atol=1e-8)
-    with pytest.raises(InvalidInput, match="exists already"):
-        write_rerun(path, recorded)
 
 
 def test_a_dataset_alone_has_a_page(swinging):

@@ -132,8 +132,6 @@ def test_what_acts_in_mujoco_alone_is_named(what):
     with pytest.warns(RobotFileWarning) as caught:
         Robot.from_mjcf_text(text)
     assert f"left out: {what}" in str(caught[0].message)
-    with pytest.raises(RobotModelError, match="leave strict out"):
-        Robot.from_mjcf_text(text, strict=True)
 
 
 def test_a_joint_that_an_equality_holds_is_locked():

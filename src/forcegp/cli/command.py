@@ -102,7 +102,7 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
-OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html", "rerun")
+OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html")
 """Names of the fields with what a command writes: never an input, nor another output."""
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)

@@ -69,42 +69,16 @@ class Robot(RobotStructure):
     @classmethod
     @usable_arguments("Robot.from_urdf")
     def from_urdf(
-        cls,
-        path: str | Path,
-        *,
-        gravity: Vector = GRAVITY,
-        armature: Vector | Mapping[str, float | int] | None = None,
-        locked: Mapping[str, float | int] | None = None,
-        inertias: InertiaChoice = "strict",
-        base: BaseChoice | None = None,
-        root: str | None = None,
-        strict: bool = False,
+        cls, path: str | Path, *, armature: Vector | Mapping[str, float | int] | None = None, **options: Any
     ) -> "Robot":
         """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
-        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
-        joint or by joint name, by default what :meth:`to_urdf` wrote beside the file, or 0; ``locked`` maps joint names
-        to positions at which movable joints become fixed; ``inertias`` of "nearest" replaces one that no body has by
-        the nearest possible; ``base`` says how the root is held, "fixed", "floating", "planar" or "spherical", which
-        files of robots that do not look bolted to the world are asked; ``root`` names a link that the file does not
-        define, "world" for example, to be the root. A RobotFileWarning names what was ignored or repaired; with
-        ``strict`` what could be ignored is an error.
-
-        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, all links and joints
-        that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``). Raises
-        :class:`~forcegp.errors.MissingExtra` for a .xacro file without the package xacro.
+        ``armature`` and ``options`` are those of :meth:`from_urdf_text`; without, rotor inertias are what
+        :meth:`to_urdf` wrote beside the file. Raises what that raises, and :class:`~forcegp.errors.MissingExtra` for a
+        .xacro file without the package xacro.
         """
-        return cls.from_urdf_text(
-            read_robot_file(path),
-            source=str(path),
-            gravity=gravity,
-            armature=read_armature(path) if armature is None else armature,
-            locked=locked,
-            inertias=inertias,
-            base=base,
-            root=root,
-            strict=strict,
-        )
+        text, armature = read_robot_file(path), read_armature(path) if armature is None else armature
+        return cls.from_urdf_text(text, source=str(path), armature=armature, **options)
 
     @classmethod
     @usable_arguments("Robot.from_urdf_text")
@@ -119,16 +93,23 @@ class Robot(RobotStructure):
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
         root: str | None = None,
-        strict: bool | None = False,
     ) -> "Robot":
-        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it.
+        """Read URDF text; ``source`` is what error messages call it.
 
-        ``strict`` of None warns of nothing: for text that was warned of before.
+        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
+        joint or by joint name, by default 0; ``locked`` maps joint names to positions at which movable joints become
+        fixed; ``inertias`` of "nearest" replaces one that no body has by the nearest possible; ``base`` says how the
+        root is held, "fixed", "floating", "planar" or "spherical", which files of robots that do not look bolted to the
+        world are asked; ``root`` names a link that the file does not define, "world" for example, to be the root. A
+        RobotFileWarning names what was ignored or repaired.
+
+        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, all links and joints
+        that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``).
         """
         text = well_formed(text.lstrip())
         text = text if root is None else with_root(text, root)
         given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
-        return cls._made(text, Problems(source, given, strict=bool(strict)), gravity, armature, quiet=strict is None)
+        return cls._made(text, Problems(source, given), gravity, armature)
 
     @classmethod
     @usable_arguments("Robot.from_mjcf")
@@ -140,12 +121,12 @@ class Robot(RobotStructure):
         linear is a mimic joint. Meshes are needed only where a mass follows from them. q is MuJoCo's `qpos`, but
         quaternions are x, y, z, w, and the linear velocity of a free body has the axes of the body.
 
-        Parameters are those of :meth:`from_urdf`, without ``root``: ``gravity`` (default: the file's), ``armature``
-        (default: the file's), ``locked``, ``inertias``, ``base`` (default: as in the file) and ``strict``. A
+        Parameters are those of :meth:`from_urdf_text`, without ``root``: ``gravity`` (default: the file's),
+        ``armature`` (default: the file's), ``locked``, ``inertias`` and ``base`` (default: as in the file). A
         RobotFileWarning names what acts in MuJoCo and not here: springs, tendons, gains of actuators, closed loops
         (which :meth:`Model.from_mjcf <forcegp.Model.from_mjcf>` has) and others.
 
-        Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
+        Raises what :meth:`from_urdf_text` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
         :class:`~forcegp.errors.MissingExtra` without the package mujoco.
         """
         return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
@@ -174,12 +155,11 @@ class Robot(RobotStructure):
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
-        strict: bool = False,
         for_system: bool = False,
     ) -> "tuple[Robot, Translation]":
         """The robot of MJCF text, and what a model takes from it, which is noted as left out unless ``for_system``."""
         given = {"locked": locked, "inertias": inertias, "base": base}
-        problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
+        problems = Problems(source, given, "Robot.from_mjcf")
         found = translate(text, path, inertias == "nearest", for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
@@ -205,7 +185,7 @@ class Robot(RobotStructure):
         numbers = finite_vector("gravity", gravity, 3), armature, beside or {}, locked, inertias
 
         def read(held: BaseChoice | None) -> tuple[Robot | None, Problems]:
-            problems = Problems(found.source, named, strict=found.strict, reader=found.reader)
+            problems = Problems(found.source, named, found.reader)
             problems.errors, problems.notes = [*found.errors], {what: [*where] for what, where in found.notes.items()}
             return cls._read(text, problems, held, *numbers), problems
 
@@ -257,8 +237,15 @@ class Robot(RobotStructure):
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
         """The robot that :meth:`to_stored` gave."""
-        given = {name: stored[name] for name in ("gravity", "armature", "locked", "base")}
-        return cls.from_urdf_text(stored["urdf"], source="stored URDF", strict=None, **given)
+        return cls._again(
+            stored["urdf"], "stored URDF", *(stored[x] for x in ("gravity", "armature", "locked", "base"))
+        )
+
+    @classmethod
+    def _again(cls, text: str, source: str, gravity: Any, armature: Any, locked: Any, base: BaseChoice) -> "Robot":
+        """Of a text that was warned of before."""
+        given = {"locked": locked, "inertias": "strict", "base": base, "root": None}
+        return cls._made(well_formed(text.lstrip()), Problems(source, given), gravity, armature, quiet=True)
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
@@ -303,9 +290,8 @@ class Robot(RobotStructure):
 
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
-        given: dict[str, Any] = {"gravity": self.gravity, "locked": self.locked, "base": self.base}
-        given["armature"] = self.armature if armature is None else armature
-        robot = Robot.from_urdf_text(text, source=self.source, strict=None, **given)
+        armature = self.armature if armature is None else armature
+        robot = Robot._again(text, self.source, self.gravity, armature, self.locked, self.base)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def with_note(self, note: str) -> "Robot":
