@@ -24,7 +24,7 @@ def written(robot):
 
 
 def followers(robot):
-    drives = zip(robot.layout.bodies, robot.layout.drives)
+    drives = zip(robot.layout.bodies, robot.layout.drives, strict=True)
     return {
         body.name: (robot.joint_names[drive.joint], drive.multiplier, drive.offset)
         for body, drive in drives
