@@ -34,7 +34,7 @@ from benchmarks.casadi_dynamics import QUANTITIES, CasadiLoops
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.dynamics_programs import Request, trace_dynamics
+from forcegp.robots.dynamics_programs import trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
@@ -136,7 +136,7 @@ def cold(robot: Robot, folder: Path) -> dict[str, float]:
 def inductor() -> None:
     """Print what torch.compile makes of the unrolled forward dynamics, and how long it takes to."""
     states = States(BATCH)
-    program = trace_dynamics(UnrolledRobot(states.robot), Request("forward_dynamics"))
+    program = trace_dynamics(UnrolledRobot(states.robot), "forward_dynamics")
     graph = program.graph
 
     @torch.compile(dynamic=True, fullgraph=True)
@@ -173,7 +173,7 @@ def chain(joints: int) -> None:
         for k in range(1, joints + 1)
     ]
     robot = Robot.from_urdf_text(f"""<robot name="chain"><link name="l0"/>{"".join(parts)}</robot>""")
-    operations = trace_dynamics(UnrolledRobot(robot), Request("forward_dynamics")).operations
+    operations = trace_dynamics(UnrolledRobot(robot), "forward_dynamics").operations
     with tempfile.TemporaryDirectory() as folder:
         start = sum(os.times()[:4])  # with those of the compiler
         robot.compile(folder).prepare("forward_dynamics")

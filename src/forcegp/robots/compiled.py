@@ -1,38 +1,33 @@
-"""`CompiledRobot`: the dynamics of one robot as machine code made for it, with first derivatives."""
+"""`CompiledRobot`: the dynamics of one robot as machine code made for it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.robots.arguments import JointValues, Positions, broadcast_batch
-from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, KEEPING, Request, compiled_program
+from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, compiled_program
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.unrolled import UnrolledRobot
 
-INSTEAD_OF_TRANSFORMS = (
-    "use batch dimensions and backward passes, or the robot itself (compiled.robot), whose results are the same"
-)
+INSTEAD = "use the robot itself (compiled.robot), whose results are the same"
 
 
 class CompiledRobot:
     """The dynamics of a robot, compiled for it; made by ``robot.compile()``.
 
-    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, also where a base moves, and
-    backward passes give the derivatives with respect to all arguments. Results agree to rounding. Not supported, with
-    an :class:`~forcegp.errors.InvalidInput`: second derivatives, transforms of ``torch.func``, forward-mode
-    differentiation, and other devices than the CPU. Use the robot itself there.
+    The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, also where a base moves.
+    Results agree to rounding. Not supported, with an :class:`~forcegp.errors.InvalidInput`: derivatives, transforms of
+    ``torch.func``, and other devices than the CPU. Use the robot itself there.
 
-    A function is compiled when it is first called, and its derivatives when they are first asked for, unless a file in
-    ``folder`` (``~/.cache/forcegp/compiled`` by default) holds them already; :meth:`prepare` does so ahead. Code from
-    that folder runs with the rights of the process. Several states are computed at once, and large batches by as many
-    threads as torch has.
+    A function is compiled when it is first called, unless a file in ``folder`` (``~/.cache/forcegp/compiled`` by
+    default) holds it already; :meth:`prepare` does so ahead. Code from that folder runs with the rights of the process.
+    Several states are computed at once, and large batches by as many threads as torch has.
 
     Raises :class:`~forcegp.errors.CompilerError` where something must be compiled and no C compiler is there.
     """
@@ -47,7 +42,7 @@ class CompiledRobot:
         self.folder = default_folder() if folder is None else Path(folder).expanduser()
         self._unrolled = UnrolledRobot(robot)
         self._nv, self._space = robot.nv, robot.space
-        self._programs: dict[Request, RowFunction] = {}
+        self._programs: dict[str, RowFunction] = {}
 
     def __reduce__(self) -> "tuple[type[CompiledRobot], tuple[RobotStructure, Path]]":
         return CompiledRobot, (self.robot, self.folder)
@@ -55,20 +50,11 @@ class CompiledRobot:
     def __repr__(self) -> str:
         return f"CompiledRobot({self.robot!r}, folder={str(self.folder)!r})"
 
-    def prepare(self, *functions: str, derivatives: bool = False) -> "CompiledRobot":
-        """Compile functions now: those named, or all, with ``derivatives`` also those of a backward pass.
-
-        Returns the same object. Raises InvalidInput for a name that no function has.
-        """
-        unknown = [name for name in functions if name not in ARGUMENTS]
-        if unknown:
-            raise InvalidInput(f"no function {unknown[0]!r} to compile; there are: {', '.join(ARGUMENTS)}")
+    def prepare(self, *functions: str) -> "CompiledRobot":
+        """Compile functions now: those named, or all; returns the same object. Raises InvalidInput for other names."""
         for name in functions or ARGUMENTS:
-            self.program(Request(name))
-            if derivatives:
-                self.program(Request(name, derivatives=True))
-                if name == KEEPING:
-                    self.program(Request(name, keeps=True))
+            require_known("function", name, "a compiled robot", ARGUMENTS)
+            self.program(name)
         return self
 
     def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
@@ -98,11 +84,11 @@ class CompiledRobot:
         """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
         return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)[0]
 
-    def program(self, request: Request) -> RowFunction:
-        """The machine code of a request."""
-        found = self._programs.get(request)
+    def program(self, function: str) -> RowFunction:
+        """The machine code of a function."""
+        found = self._programs.get(function)
         if found is None:
-            found = self._programs[request] = compiled_program(self._unrolled, request, self.folder)
+            found = self._programs[function] = compiled_program(self._unrolled, function, self.folder)
         return found
 
     def _evaluate(self, function: str, **arguments: Tensor) -> tuple[Tensor, ...]:
@@ -110,23 +96,26 @@ class CompiledRobot:
         plain = self._are_possible(arguments) if self._space.groups else are_plain(given, nv)
         if not plain:
             given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
-        require_plain(given, "compiled dynamics", INSTEAD_OF_TRANSFORMS)
-        batch = given[0].shape[:-1]
+            if torch.is_grad_enabled() and any(value.requires_grad for value in given):
+                raise InvalidInput(f"compiled dynamics has no derivatives; {INSTEAD}.")
+        require_plain(given, "compiled dynamics", INSTEAD)
+        batch, program = given[0].shape[:-1], self.program(function)
         if plain and not batch:
-            bits, found = self.program(Request(function)).single(*given)
-            if bits & NOT_POSITIVE:
-                raise NumericalError(NOT_POSITIVE_DEFINITE)
-            return _shaped(found, (), function, nv)
-        if not plain:
-            batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)})
-            given = [value.expand(*batch, value.shape[-1]) for value in given]
-        if not plain or len(batch) != 1:
-            given = [value.reshape(batch.numel(), value.shape[-1]).contiguous() for value in given]
-        if torch.is_grad_enabled() and any(value.requires_grad for value in given):
-            results = _Value.apply(self, function, *given)
+            bits, results = program.single(*given)
         else:
-            results = run(self, Request(function), given)
-        return _shaped(results, batch, function, nv)  # type: ignore[arg-type]  # torch does not type `apply`
+            if not plain:
+                batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)})
+                given = [value.expand(*batch, value.shape[-1]) for value in given]
+            if not plain or len(batch) != 1:
+                given = [value.reshape(batch.numel(), value.shape[-1]).contiguous() for value in given]
+            results = [torch.empty(batch.numel(), size, dtype=torch.float64) for size in program.outputs]
+            bits = program.rows(batch.numel(), given, results)
+        if bits & NOT_POSITIVE:
+            raise NumericalError(NOT_POSITIVE_DEFINITE)
+        dimensions = DIMENSIONS.get(function, (1,))
+        return tuple(
+            x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True)
+        )
 
     def _are_possible(self, arguments: Mapping[str, Tensor]) -> bool:
         """`are_plain` where q has more entries than v and a length to check."""
@@ -136,52 +125,3 @@ class CompiledRobot:
             self._space.check(q)
             return True
         return False
-
-
-def _shaped(results: Sequence[Tensor], batch: Sequence[int], function: str, nv: int) -> tuple[Tensor, ...]:
-    dimensions = DIMENSIONS.get(function, (1,))
-    return tuple(
-        x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True)
-    )
-
-
-def run(owner: CompiledRobot, request: Request, tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Results of a request, (count, size) each, from its inputs (count, size) in order."""
-    program, count = owner.program(request), len(tensors[0])
-    outputs = [torch.empty(count, size, dtype=torch.float64) for size in program.outputs]
-    if program.rows(count, tensors, outputs) & NOT_POSITIVE:
-        raise NumericalError(NOT_POSITIVE_DEFINITE)
-    return outputs
-
-
-class _Value(torch.autograd.Function):
-    """A function of the robot at (count) states; its backward pass is the program of derivatives."""
-
-    @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, function: str, *states: Tensor) -> tuple[Tensor, ...]:
-        request = Request(function, keeps=function == KEEPING)
-        made = run(owner, request, states)
-        results = len(request.results)
-        ctx.owner, ctx.function, ctx.kept = owner, function, made[results:]
-        ctx.save_for_backward(*states)
-        return tuple(made[:results])
-
-    @staticmethod
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        given = *ctx.saved_tensors, *ctx.kept, *(cotangent.contiguous() for cotangent in cotangents)
-        return None, None, *_Derivative.apply(ctx.owner, ctx.function, *given)
-
-
-class _Derivative(torch.autograd.Function):
-    """Derivatives of a function of the robot in its states, which have none themselves."""
-
-    @staticmethod
-    def forward(ctx: Any, owner: CompiledRobot, function: str, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(run(owner, Request(function, derivatives=True), tensors))
-
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
-        raise InvalidInput(
-            "compiled dynamics has first derivatives only; for second ones use the robot itself (compiled.robot), "
-            "whose results are the same."
-        )

@@ -19,7 +19,6 @@ ch. 5 and 6), carried to the joints above.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -101,20 +100,6 @@ class UnrolledRobot:
     def nv(self) -> int:
         """Number of coordinates."""
         return self.robot.nv
-
-    @cached_property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Each joint with each of those above it, where the mass matrix has entries below its diagonal.
-
-        All pairs where joints mimic others: what they couple fills in.
-        """
-        if self.coupled:
-            return [(k, i) for k in range(self.nv) for i in range(k)]
-        above: list[list[int]] = []
-        for k, joint in enumerate(self.joints):
-            parent = joint.parent if k == joint.rows[0] else k - 1  # that of a chain of single degrees of freedom
-            above.append([] if parent == WORLD else [*above[parent], parent])
-        return [(k, i) for k, found in enumerate(above) for i in found]
 
     def _scalars(self, values: torch.Tensor, scale: float = 1.0) -> Scalars:
         """The numbers, with 0.0 for what is rounding beside ``scale``."""
