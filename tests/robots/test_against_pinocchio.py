@@ -91,7 +91,7 @@ def test_every_frame(text):
     robot = Robot.from_urdf_text(text)
     oracle = Oracle(text, robot)
     q, v = np.random.default_rng(3).normal(size=(2, robot.nv))
-    for frame in robot.frame_names:
+    for frame in robot.link_names:
         pose, jacobian, acceleration = oracle.frame(q, v, oracle.with_point(frame, np.zeros(3)))
         args = torch.tensor(q), torch.tensor(v)
         np.testing.assert_allclose(robot.frame_pose(args[0], frame), pose, atol=1e-13)

@@ -88,7 +88,7 @@ def test_limits_names_and_losses():
     assert arm.gravity.tolist() == [0.0, 0.5, -9.7]
     assert (arm.joints[0].lower, arm.joints[0].upper) == pytest.approx((-np.pi / 2, np.radians(80.0)))
     assert arm.joint("roll").type == "continuous"
-    assert "elbow site" in arm.frame_names
+    assert "elbow site" in arm.link_names
     assert arm.base == "fixed"
     assert Robot.from_mjcf_text(CHAIN).base == "fixed"
     dog = Robot.from_mjcf_text(QUADRUPED)

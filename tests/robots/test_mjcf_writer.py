@@ -44,7 +44,7 @@ def test_mujoco_and_forcegp_read_the_same_robot(name, tmp_path):
     for joint, other in zip(robot.joints, again.joints, strict=True):
         numbers = [(x.lower, x.upper, x.effort_limit, x.damping, x.friction) for x in (joint, other)]
         assert numbers[0] == pytest.approx(numbers[1], rel=1e-12)
-    assert set(again.frame_names) >= {x for x in robot.frame_names if robot.link(x).mass}
+    assert set(again.link_names) >= {x for x in robot.link_names if robot.link(x).mass}
     torch.testing.assert_close(again.armature, robot.armature)
 
 

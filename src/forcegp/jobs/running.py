@@ -154,7 +154,7 @@ def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: 
         if missing:
             require_writable(store.place("trial"))
             _warn_of_outdated(store, missing)
-            _Run(store, by_name, dict(missing), wanted, progress).on(at_once)
+            _Run(store, by_name, dict(missing), wanted).on(at_once, progress)
     return len(missing)
 
 
@@ -172,28 +172,21 @@ def _warn_of_outdated(store: JobStore, missing: Mapping[str, Job]) -> None:
         )
 
 
-@dataclass
 class _Run:
-    """The jobs that wait, those that run, and those that are done."""
+    """The jobs that wait, and those that are done."""
 
-    store: JobStore
-    jobs: Mapping[str, Job]
-    waiting: dict[str, Job]
-    digests: Mapping[str, str]
-    progress: Progress | None
-
-    def __post_init__(self) -> None:
-        self.finished = self.jobs.keys() - self.waiting.keys()
-        self.total, self.count = sum(job.cost for job in self.waiting.values()), len(self.waiting)
-        self.done: list[str] = []
-        self.done_cost = 0.0
+    def __init__(self, store: JobStore, jobs: Mapping[str, Job], waiting: dict[str, Job], wanted: Mapping[str, str]):
+        self.store, self.waiting, self.digests = store, waiting, wanted
+        self.finished = jobs.keys() - waiting.keys()
+        self.total, self.count = sum(job.cost for job in waiting.values()), len(waiting)
+        self.done, self.done_cost = 0, 0.0
         self.failed: dict[str, str] = {}
         self.stopped = False
 
-    def on(self, at_once: Jobs) -> None:
+    def on(self, at_once: Jobs, progress: Progress | None) -> None:
         """Compute all."""
         executor, at_work = executor_for(at_once), dict[Future[Any], Job]()
-        most = at_once if isinstance(at_once, int) else len(self.jobs)
+        most = at_once if isinstance(at_once, int) else self.count
         try:
             while True:
                 for job in self._ready(most - len(at_work)):
@@ -203,7 +196,11 @@ class _Run:
                 if not at_work:
                     break  # what still waits depends on jobs that failed
                 for future in wait(at_work, return_when=FIRST_COMPLETED).done:
-                    self._record(at_work.pop(future), future)
+                    job = at_work.pop(future)
+                    self._record(job, future)
+                    if progress is not None:
+                        note = f"{self.done + len(self.failed)} of {self.count} jobs, last {job.name}"
+                        progress(int(self.done_cost * 10), max(1, int(self.total * 10)), note)
         except BackendError as error:
             raise BackendError(f"{error}. {self._kept()}") from None
         finally:
@@ -216,28 +213,21 @@ class _Run:
             raise FitError(f"{name}{others}{skipped} ({cause}); {self._kept()}")
 
     def _kept(self) -> str:
-        return f"{len(self.done)} of {self.count} jobs are kept, so the same command goes on from here"
+        return f"{self.done} of {self.count} jobs are kept, so the same command goes on from here"
 
     def _ready(self, free: int) -> list[Job]:
-        """The next jobs whose inputs are finished: those that others wait for longest come first."""
+        """The next jobs whose inputs are finished, and which no longer wait: the longest come first."""
         ready = [job for job in self.waiting.values() if not self.stopped and self.finished.issuperset(job.inputs)]
-        ready.sort(key=lambda job: -self._work_behind(job.name))
-        chosen = ready[:free]
+        chosen = sorted(ready, key=lambda job: -job.cost)[:free]
         for job in chosen:
             del self.waiting[job.name]
         return chosen
 
-    def _work_behind(self, name: str) -> float:
-        """Cost of this job and of the longest chain of jobs that wait for it."""
-        job = self.waiting[name]
-        return job.cost + max(
-            (self._work_behind(other.name) for other in self.waiting.values() if name in other.inputs), default=0.0
-        )
-
     def _record(self, job: Job, future: Future[Any]) -> None:
+        self.done_cost += job.cost
         try:
             outcome_of(future)
-            self.done.append(job.name)
+            self.done += 1
             self.finished.add(job.name)
         except BackendError:
             raise
@@ -247,10 +237,6 @@ class _Run:
             self.failed[job.name], self.stopped = str(error), True
         except Exception as error:  # also a defect in one job must not cost what other jobs have done
             self.failed[job.name] = f"{type(error).__name__}: {error}"
-        self.done_cost += job.cost
-        if self.progress is not None:
-            note = f"{len(self.done) + len(self.failed)} of {self.count} jobs, last {job.name}"
-            self.progress(int(self.done_cost * 10), max(1, int(self.total * 10)), note)
 
 
 def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: Any) -> None:

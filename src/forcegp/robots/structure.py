@@ -130,11 +130,6 @@ class RobotStructure(Summary):
         return tuple(self.description.links)
 
     @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of all frames: those of the links."""
-        return self.link_names
-
-    @property
     def gravity(self) -> Float[Tensor, "3"]:
         """Gravitational acceleration in m/s^2."""
         return self.tree.gravity.clone()
