@@ -82,12 +82,6 @@ def test_a_process_that_dies_is_reported_and_what_was_done_is_kept(results, tmp_
     assert not list((tmp_path / "out").glob("**/*.tmp"))
 
 
-def test_this_process_can_do_it_all(results):
-    assert run_jobs(results, [next_to(square(3)), square(3)]) == 2
-    assert results.result("next/3")["value"] == 10
-    assert results.result("square/3")["process"] == os.getpid()
-
-
 def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence(results):
     run_jobs(results, [square(3), next_to(square(3)), square(4)])
     kept = results.load("square/4")

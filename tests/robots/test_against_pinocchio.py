@@ -45,14 +45,6 @@ def test_bias_forces(case):
     assert relative_error(robot.bias_forces(torch.tensor(q), torch.tensor(v)), theirs) < 1e-12
 
 
-def test_mass_matrix_and_bias_in_one_pass(case):
-    robot, _, _, q, v, *_ = case
-    q, v = torch.tensor(q), torch.tensor(v)
-    mass, bias = robot.mass_matrix_and_bias(q, v)
-    torch.testing.assert_close(mass, robot.mass_matrix(q), rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(bias, robot.bias_forces(q, v), rtol=1e-13, atol=1e-12)
-
-
 def test_gravity_forces(case):
     robot, oracle, _, q, *_ = case
     assert relative_error(robot.gravity_forces(torch.tensor(q)), [oracle.gravity_forces(x) for x in q]) < 1e-12

@@ -16,7 +16,6 @@ the wrench of the composite body under A of one unit of joint j (Featherstone, "
 ch. 5 and 6), carried to the joints above.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -35,7 +34,8 @@ Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
 """Floats and expressions; the operators of NumPy are theirs, entry by entry."""
 _Values: TypeAlias = Sequence[Any] | Scalars
 
-# What is smaller in a rotation matrix or an inertia is rounding, as of the turn onto the joint axis: sin(pi) = 1e-16.
+# What is smaller in a rotation matrix, an origin in m or, beside its largest entry, an inertia, is rounding, as of the
+# turn onto the joint axis: sin(pi) = 1e-16.
 ROUNDING = 1e-15
 
 
@@ -63,15 +63,11 @@ class UnrolledJoint:
 
 
 class UnrolledRobot:
-    """The constants of a robot as floats, from which `UnrolledKinematics` unrolls its algorithms.
+    """The constants of a robot as floats, from which `UnrolledKinematics` unrolls its algorithms."""
 
-    Parameters: ``robot``; ``rounding``, below which entries of rotation matrices, of origins in m and of the merged
-    inertias (relative to the largest entry) count as zero. They are those of the robot on the CPU.
-    """
-
-    def __init__(self, robot: RobotStructure, *, rounding: float = ROUNDING) -> None:
+    def __init__(self, robot: RobotStructure) -> None:
         layout, tree = robot.layout, robot.tree
-        self.robot, self.rounding = robot, rounding
+        self.robot = robot
         places = range(robot.nv) if tree.positions is None else tree.positions.tolist()
         whole = {body: group for group in layout.groups for body in range(*group.bodies.indices(len(layout.bodies)))}
         joints = []
@@ -104,7 +100,7 @@ class UnrolledRobot:
     def _scalars(self, values: torch.Tensor, scale: float = 1.0) -> Scalars:
         """The numbers, with 0.0 for what is rounding beside ``scale``."""
         values = values.detach().cpu()
-        return scalars(torch.where(values.abs() <= self.rounding * scale, 0.0, values).tolist())
+        return scalars(torch.where(values.abs() <= ROUNDING * scale, 0.0, values).tolist())
 
 
 def scalars(values: list) -> Scalars:
@@ -143,8 +139,7 @@ class UnrolledKinematics:
             if unrolled.coupled:
                 position = position * joint.drive.multiplier + joint.drive.offset
             if joint.revolute:
-                known = isinstance(position, float)
-                c, s = (math.cos(position), math.sin(position)) if known else (position.cos(), position.sin())
+                c, s = position.cos(), position.sin()
                 self.rotations.append(joint.rotation @ scalars([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
                 self.origins.append(joint.origin)
             else:
