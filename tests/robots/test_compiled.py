@@ -18,7 +18,7 @@ from forcegp.codegen.c_writer import write_program
 from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
-from forcegp.robots.dynamics_programs import PURPOSE, trace_dynamics
+from forcegp.robots.compiled import PURPOSE, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them

@@ -1,21 +1,83 @@
 """`CompiledRobot`: the dynamics of one robot as machine code made for it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, require_plain
+from forcegp.codegen.c_writer import Program, write_program
+from forcegp.codegen.graph import Graph, node_of
+from forcegp.codegen.library import (
+    NOT_POSITIVE,
+    Purpose,
+    RowFunction,
+    VectorUnit,
+    are_plain,
+    default_folder,
+    load_library,
+    require_plain,
+)
 from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.robots.arguments import JointValues, Positions, broadcast_batch
-from forcegp.robots.dynamics_programs import ARGUMENTS, DIMENSIONS, compiled_program
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.structure import RobotStructure
-from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.unrolled import UnrolledKinematics, UnrolledRobot, factorize, scalars, solve_factorized
 
 INSTEAD = "use the robot itself (compiled.robot), whose results are the same"
+# Arguments of each function, and the shapes of its results in joints.
+ARGUMENTS = {
+    "mass_matrix": ("q",),
+    "bias_forces": ("q", "v"),
+    "mass_matrix_and_bias": ("q", "v"),
+    "gravity_forces": ("q",),
+    "inverse_dynamics": ("q", "v", "a"),
+    "forward_dynamics": ("q", "v", "tau"),
+}
+DIMENSIONS = {"mass_matrix": (2,), "mass_matrix_and_bias": (2, 1)}
+
+
+def trace_dynamics(unrolled: UnrolledRobot, function: str) -> Program:
+    """Write a function of the robot down."""
+    graph = Graph()
+    inputs = {name: unrolled.robot.nq if name == "q" else unrolled.nv for name in ARGUMENTS[function]}
+    given = {name: scalars(graph.more_inputs(size)) for name, size in inputs.items()}
+    at = UnrolledKinematics(unrolled, given["q"], given.get("v"))
+    positive = scalars([])
+    if function == "forward_dynamics":
+        L, positive = factorize(at.mass_matrix())
+        made = [solve_factorized(L, 1.0 / positive, given["tau"] - at.bias_forces())]
+    elif function == "inverse_dynamics":
+        made = [at.inverse_dynamics(given["a"])]
+    else:
+        names = ("mass_matrix", "bias_forces") if function == "mass_matrix_and_bias" else (function,)
+        made = [getattr(at, name)().ravel() for name in names]
+
+    def nodes(array: Iterable[Any]) -> list[int]:
+        return [node_of(graph, scalar) for scalar in array]
+
+    return Program(graph, inputs, {f"result {k}": nodes(result) for k, result in enumerate(made)}, nodes(positive))
+
+
+PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the robot itself")
+
+
+def compiled_program(unrolled: UnrolledRobot, function: str, folder: Path) -> RowFunction:
+    """From ``folder`` if it is there, else compiled into it. Raises CompilerError as `load_library`."""
+
+    def write(unit: VectorUnit) -> str:
+        return write_program(trace_dynamics(unrolled, function), unit.lanes)
+
+    constants: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in unrolled.joints]
+    constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
+    constants += [unrolled.gravity.tolist(), unrolled.armature.tolist(), [body.tolist() for body in unrolled.inertias]]
+    library, _ = load_library(
+        f"{unrolled.robot.name[:40]}-{function}", f"{constants!r}\0{function}", write, folder, PURPOSE
+    )
+    sizes = [unrolled.robot.nq if name == "q" else unrolled.nv for name in ARGUMENTS[function]]
+    return RowFunction(library, sizes, [unrolled.nv**d for d in DIMENSIONS.get(function, (1,))])
 
 
 class CompiledRobot:
