@@ -1,7 +1,7 @@
 """`fit`: the numbers and functions of a model, found from a log; the one entry for every kind of evidence."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,14 @@ from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.checks import check_forces, refuse_what_looks_alike, warn_of_contacts
 from forcegp.fit.independent import fit_independent
-from forcegp.fit.joint import CHANGE, MOST_ROUNDS, estimates_beside, numbers_beside
+from forcegp.fit.joint import (
+    CHANGE,
+    MOST_ROUNDS,
+    FreeNumbers,
+    estimates_beside,
+    numbers_beside,
+    with_free_numbers,
+)
 from forcegp.fit.motion_fit import refine_on_motions
 from forcegp.fit.objective import LOG_VARIANCE_SPREAD, FitObjective, Search, with_variance_priors
 from forcegp.fit.physical import fit_physical, typical_sizes, with_payloads_placed
@@ -77,7 +84,7 @@ def fit(
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
     Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
-    kernels and noise by marginal likelihood; where both are open, in turn. Then the functions are conditioned on the
+    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then the functions are conditioned on the
     rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
 
     Parameters
@@ -305,7 +312,7 @@ class _Functions:
         return start
 
     def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
-        """Searches for functions and for numbers of laws and bodies in turn, where these are open."""
+        """Searches for functions with numbers of laws and bodies free, where these are open."""
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
         given = rows.nodes if isinstance(rows, WindowedRows) else rows
@@ -313,37 +320,28 @@ class _Functions:
         typical = typical_sizes(self.model, [given])
         model = with_payloads_placed(self.model, [dataset], typical)
         space = ParameterSpace(model, typical)
-        x = self._first_numbers(space, dataset)
-        again, posterior, found, change = self, None, None, np.inf
-        for _ in range(MOST_ROUNDS):
+        x = space.start
+        again, found, change = self, None, np.inf
+        for number in range(MOST_ROUNDS):
             with warnings.catch_warnings():
-                if posterior is not None:
+                if number:
                     warnings.simplefilter("ignore", DataWarning)  # the first search gave it, of the same rows
-                here = replace(space.model_at(x), noise=self.model.noise)
-                posterior = replace(again, model=here)._search(rows, dataset, beside_numbers=True)
-            x, found, change = numbers_beside(posterior, space, x)
+                posterior = again._beside_numbers(rows, dataset, space, x)
             again = replace(self, search=replace(self.search, restarts=1, start=posterior.hyperparameters))
+            x, found, change = numbers_beside(posterior, space, x)
             if change < CHANGE:
                 break
         assert found is not None, "there was a round"
-        here = replace(space.model_at(x), noise=self.model.noise)
-        posterior = replace(again, model=here)._search(rows, dataset, beside_numbers=True)
+        posterior = again._beside_numbers(rows, dataset, space, x)
         estimates = replace(estimates_beside(space, found, len(rows)), settled=change < CHANGE)
         return replace(posterior, estimates=estimates)
 
-    def _first_numbers(self, space: ParameterSpace, dataset: Dataset) -> np.ndarray:
-        """Where numbers begin: what all rows show without unknown functions, or the numbers of the model."""
-        if not space.model.robot.space.is_vector_space:  # unknown forces look like mass there
-            return space.start
-        bare = replace(space.model, forces=space.model.laws, noise=None)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)
-                solution = fit_physical(bare, [dataset], Accelerations())
-        except InvalidInput:  # contacts that slide, which only functions beside it explain
-            return space.start
-        low, high = space.bounds
-        return np.clip(solution.x, low, high) if len(solution.x) == space.size else space.start
+    def _beside_numbers(
+        self, rows: Dataset | WindowedRows, dataset: Dataset, space: ParameterSpace, x: np.ndarray
+    ) -> StructuredPosterior:
+        """One search with the numbers about x free."""
+        here = replace(space.model_at(x), noise=self.model.noise)
+        return replace(self, model=here)._search(rows, dataset, lambda given: with_free_numbers(given, space, x))
 
     def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
         """One search, or more under the normal force that friction changes."""
@@ -359,9 +357,15 @@ class _Functions:
         return fit_with_refined_loads(first, again)
 
     def _search(
-        self, rows: Dataset | WindowedRows, dataset: Dataset, beside_numbers: bool = False
+        self,
+        rows: Dataset | WindowedRows,
+        dataset: Dataset,
+        beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None,
     ) -> StructuredPosterior:
-        """One search on these rows or windows of the log with the model as it is, and the exact posterior there."""
+        """One search on these rows or windows of the log with the model as it is, and the exact posterior there.
+
+        `beside` gives the likelihood in which numbers are free.
+        """
         noise = resolved_noise(self.model.noise, rows)
         model = replace(self.model, noise=noise)
         training = TrainingData.of(rows, model.robot.device)
@@ -375,9 +379,10 @@ class _Functions:
         described["forces"] = [described_force(force) for force in model.forces]
         learned_noise, fixed = likelihood.split_noise
         kernels = likelihood.kernels
-        if beside_numbers and self.search.hyperprior:
+        if beside is not None and self.search.hyperprior:
             kernels, described["log_variance_spread"] = with_variance_priors(kernels), LOG_VARIANCE_SPREAD
-        objective = FitObjective(likelihood, kernels, noise, fixed, self.search.hyperprior)
+        searched = likelihood if beside is None else beside(likelihood)
+        objective = FitObjective(searched, kernels, noise, fixed, self.search.hyperprior)
         starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
         result, of_search = self.search.best(objective, starts)
         found = result.parameters | fixed, result, {**described, **of_search}
