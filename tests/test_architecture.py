@@ -54,7 +54,6 @@ IMPORTED_WHERE_USED = {
     "casadi": (),
     "viser": (),
     "trimesh": (),
-    "rerun": (),
     "jinja2": ("forcegp.report.page",),
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),

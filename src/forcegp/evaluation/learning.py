@@ -154,7 +154,7 @@ def learn(
 
     Functions of one or two inputs learn from all rows, which count for less where their errors resemble each other;
     others from `points`, `POINTS` where that is None. Motions among the evidence are those of `recording`, which may
-    have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, backend.
+    have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, jobs.
     """
     motions = [each for each in evidence if isinstance(each, Motions)]
     others = [each for each in evidence if not isinstance(each, Motions)] or [usual_evidence(model)]

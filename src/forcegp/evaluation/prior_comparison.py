@@ -130,7 +130,7 @@ def compare_priors(
     points: rows to train on, far apart in (q, v, u); None takes all. All are conditioned on exactly.
     model: what is known; None takes that of the dataset.
     block_seconds: length of the stretches of time that are left out; None cuts the recording into 20.
-    search: restarts, seed, jobs, backend, hyperprior, options and progress as for `fit`, for each of them.
+    search: restarts, seed, jobs, hyperprior, options and progress as for `fit`, for each of them.
 
     Raises
     ------

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -50,7 +51,7 @@ from forcegp.forces import UnknownForces
 from forcegp.forces.registry import described_force
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
-from forcegp.parallel import backend_for
+from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
@@ -71,8 +72,7 @@ def fit(
     rows: int | None = None,
     restarts: int | None = None,
     seed: int = 0,
-    jobs: int | None = None,
-    backend: Any = None,
+    jobs: int | Executor = 1,
     hyperprior: bool = True,
     options: OptimizerOptions | None = None,
     start: Mapping[str, Tensor] | Posterior | None = None,
@@ -104,9 +104,8 @@ def fit(
         local optima cost most and searches cost little, and 1 beyond, which then begins where searches on 250 and
         500 of the rows ended.
     seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
-    jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
-    backend: where restarts run: `Serial()`, `Joblib(jobs)`, a `Backend` of your own, or a name, "serial", "joblib".
-        None is this process for one job and processes of this machine for several.
+    jobs: restarts at once, in as many processes of this machine, or an executor in which they run, such as Dask's
+        `client.get_executor()`. Results do not depend on it.
     hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
         maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
     options: the search itself; None is `fit.search.default_options`, which is content sooner beyond 400 points.
@@ -151,7 +150,7 @@ def fit(
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
-        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
+        search = Search(checked_jobs(jobs), restarts, seed, hyperprior, options, start, progress)
         posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points, rest)
     if refinement is None:
         return posterior
