@@ -8,7 +8,7 @@ from tests.fit.test_payload import ROBOT, TEXT, log
 
 from forcegp import Model, Rotor, Stribeck, Torques, Viscous, fit
 from forcegp.data import Preparation, estimate_delay
-from forcegp.data.held_out_cutoff import FACTORS, held_out_cutoff
+from forcegp.data.spectrum import FACTORS, held_out_cutoff
 from forcegp.errors import DatasetError
 from forcegp.evidence import motion_residuals
 from forcegp.forces import RigidBodies

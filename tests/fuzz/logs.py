@@ -110,8 +110,6 @@ MORE = st.lists(
                 "--headerless",
                 "--unit",
                 "--sign",
-                "--scale",
-                "--offset",
                 "--max-rows",
                 "--resample",
                 "--step",

@@ -21,7 +21,7 @@ from forcegp.cli.command import Command
 
 GROUPS: Mapping[str, str] = {
     "Input": "baseline task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
-    "Columns": "time q v u a step joints orientation axes ned unit sign scale offset episode unwrap",
+    "Columns": "time q v u a step joints orientation axes ned unit sign episode unwrap",
     "Timing": "start end gap resample rate",
     "Preparation": "cutoff differentiate delay lag stance every trim",
     "Robot": "robot shapes inertias base root identified "

@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.training_data import TrainingData, second_moments, shrunk
