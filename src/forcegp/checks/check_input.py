@@ -137,10 +137,11 @@ class CheckInput:
             dataset = replace(dataset, time_ordered=False)
         if dataset.time_ordered:
             found |= _mended(dataset)
-            mended, rows, jump = found["mended"], found["mended"], found["jumps"].any()
-            found["compared"] = None if jump else smoothed(_unwrapped(mended, found["wraps"]))
+            mended, jump = found["mended"], found["jumps"].any()
+            rows = mended if jump else smoothed(_unwrapped(mended, found["wraps"]))
+            found["compared"] = None if jump else rows
             if not jump:
-                rows, seen = found["compared"], white_noise(mended, running_width(mended))
+                seen = white_noise(mended, running_width(mended))
                 found["compared_noise"] = found["compared_noise"] if seen is None else np.nan_to_num(seen)
             with contextlib.suppress(InvalidInput):
                 found["even"] = _even(few_stretches(rows), found["jumps"])

@@ -105,16 +105,6 @@ class ArrayFile(Source):
         yield columns_of({name: self.array(name) for name in arrays}, {name: self._places[name] for name in names})
 
 
-def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
-    """Whether an array holds numbers; text is left out. Raises FileFormatError for Python objects, which are code."""
-    if dtype.hasobject:
-        raise FileFormatError(
-            f"{path}: {name!r} holds Python objects, which are never read because reading them runs code; "
-            "save it as an array of numbers."
-        )
-    return dtype.kind in "fiu"
-
-
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
     """So that demo_10 comes after demo_9."""
     parts = re.findall(r"\d+|\D", name)
@@ -129,8 +119,7 @@ class NumpyArchive(ArrayFile):
     """The arrays of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     @cached_property
-    def _arrays(self) -> dict[str, tuple[str, tuple[int, ...], bool, np.dtype]]:
-        """Name -> (member, shape, column-major, type)."""
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
         found = {}
         with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive:
             members = archive.infolist()
@@ -138,36 +127,30 @@ class NumpyArchive(ArrayFile):
             require_plausible_size(self.path, "the archive", declared, self.path.stat().st_size)
             for member in members:
                 require_plausible_size(self.path, repr(member.filename), member.file_size, member.compress_size)
-                if not member.filename.endswith(".npy"):
-                    continue
                 name = member.filename.removesuffix(".npy")
-                with archive.open(member) as stream:
-                    shape, column_major, dtype = _header(stream)
-                if not require_numbers(self.path, name, dtype):
+                if name == member.filename:
                     continue
+                with archive.open(member) as stream:
+                    read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
+                    shape, _, dtype = read(stream)
+                if dtype.hasobject:
+                    raise FileFormatError(
+                        f"{self.path}: {name!r} holds Python objects, which are never read because reading them runs "
+                        "code; save it as an array of numbers."
+                    )
                 if math.prod(shape) * dtype.itemsize > member.file_size:
                     raise FileFormatError(
                         f"{self.path}: {name!r} claims the shape {shape}, but the file does not hold that much."
                     )
-                if name in found:
-                    raise FileFormatError(f"{self.path}: {name!r} is in the archive twice; write it again.")
-                found[name] = (member.filename, shape, column_major, dtype)
+                if dtype.kind in "fiu":
+                    found[name] = shape
         return found
 
     @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        return {name: shape for name, (_, shape, _, _) in self._arrays.items()}
+        return self._shapes
 
     @override
     def array(self, name: str) -> np.ndarray:
-        member, shape, column_major, dtype = self._arrays[name]
-        with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive, archive.open(member) as stream:
-            _header(stream)
-            values = np.frombuffer(stream.read(), dtype)  # to the end, where the checksum is compared
-            return values.reshape(shape, order="F" if column_major else "C")
-
-
-def _header(stream) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = npy.read_magic(stream)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    return read(stream)
+        with reading(self.path, WHAT, *_ERRORS), np.load(self.path, allow_pickle=False) as archive:
+            return archive[name]

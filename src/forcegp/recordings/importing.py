@@ -137,7 +137,7 @@ def import_recordings(
             pieces.append(piece | {"episode": np.full(count, len(pieces))})
             told = {"recording": recording.label, "number": stretch.number, "row": int(rows[0]), "begin": stamp}
             done["episodes"].append(told | {"rows": count})
-    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
     return Dataset(**columns, joint_names=plan.joints, units=plan.units, model=model, metadata={"import": done})

@@ -157,5 +157,6 @@ def _element_names(feature: Any) -> list[str]:
     names = feature.get("names")
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
-    named = isinstance(names, list) and all(isinstance(name, str) and name for name in names)
-    return names if named and len(set(names)) == len(names) else []
+    if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
+        return []
+    return names if len(set(names)) == len(names) else []
