@@ -111,7 +111,6 @@ MORE = st.lists(
                 "--unit",
                 "--sign",
                 "--max-rows",
-                "--resample",
                 "--step",
                 "--episode",
                 "--episodes",

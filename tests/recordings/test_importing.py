@@ -122,7 +122,7 @@ def test_resampling_brings_uneven_rows_near_the_motion(tmp_path):
 
 def test_every_stamp_is_kept_if_told_so(tmp_path):
     data = uneven()
-    found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES, resample="no")
+    found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES, rate="log")
     np.testing.assert_array_equal(found.time, data["time"] - data["time"][0])
     np.testing.assert_array_equal(found.q, data["q"])
     np.testing.assert_array_equal(found.a, differentiate(data["v"], found.time))
@@ -141,7 +141,7 @@ def test_gaps_split_and_repeated_stamps_are_dropped(tmp_path):
     data["time"][100:] += 1.0
     data["time"][11] = data["time"][10]
     data["time"][197:] += 1.0  # three rows are no episode
-    found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES, resample="no")
+    found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES, rate="log")
     done = found.metadata["import"]["recordings"][0]
     assert (done["repeated_stamps_dropped"], done["rows_in_stretches_too_short"]) == (1, 3)
     assert len(done["gaps"]) == 2
@@ -151,7 +151,7 @@ def test_gaps_split_and_repeated_stamps_are_dropped(tmp_path):
     kept = np.r_[0:11, 12:197]
     np.testing.assert_array_equal(found.q, data["q"][kept])
     np.testing.assert_array_equal(found.episode, np.where(kept < 100, 0, 1))
-    joined = imported(tmp_path / "log.csv", NAMES, resample="no", gap=2.0)
+    joined = imported(tmp_path / "log.csv", NAMES, rate="log", gap=2.0)
     assert joined.episodes == (0,)
 
 

@@ -15,7 +15,7 @@ import forcegp.data
 import forcegp.evaluation
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, unless_given
+from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, facts, shown
@@ -85,10 +85,9 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
     """The files are one recording, with a signal in each; columns are called FILE:column."""
     gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
     """A longer pause starts a new episode."""
-    resample: Literal["auto", "no"] = "auto"
-    """auto: rows at uneven times are given even ones by a cubic spline. no: every stamp is kept."""
-    rate: Annotated[float | None, unless_given("HZ", "the median", float)] = None
-    """Rows per second of the even times."""
+    rate: Annotated[str, arg(metavar="HZ|auto|log")] = "auto"
+    """Rows per second. auto: rows at uneven times are given even ones at the median rate, by a cubic spline. log: every
+    stamp is kept."""
     start: Seconds = None
     """Leave out what comes earlier, in seconds from the first row of each episode."""
     end: Seconds = None
@@ -107,8 +106,11 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
         return replace(super()._preparation(), stance=self.stance)
 
     def _options(self) -> forcegp.ImportOptions:
-        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
-        given = {name: getattr(self, name) for name in same}
+        same = ("gap", "start", "end", "unwrap", "beyond_limits")
+        given: dict[str, Any] = {name: getattr(self, name) for name in same} | {"rate": self.rate}
+        if self.rate not in ("auto", "log"):
+            complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."
+            [given["rate"]] = numbers_of(self.rate, complaint, one=True)
         return forcegp.ImportOptions(most_rows=self.max_rows, stance="auto", **given)
 
     def _model(self) -> forcegp.Model | None:

@@ -40,8 +40,8 @@ class ImportOptions:
     ------
     gap: seconds without a row, or a message of one of several topics, that begin another episode; None for ten median
         steps.
-    resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
-    rate: of the even times in Hz, instead of the median of the recordings' median rates.
+    rate: "auto" gives uneven rows even times at the median of the recordings' median rates, a number (Hz) all rows at
+        that rate; "log" keeps every stamp.
     start, end: seconds from the first row of each episode that are kept.
     unwrap: continue positions of turning joints that jump by a turn; those that count turns stay.
     beyond_limits: accept positions beyond the limits of the URDF.
@@ -53,8 +53,7 @@ class ImportOptions:
     """
 
     gap: float | None = None
-    resample: Literal["auto", "no"] = "auto"
-    rate: float | None = None
+    rate: float | Literal["auto", "log"] = "auto"
     start: float | None = None
     end: float | None = None
     unwrap: bool = False
@@ -64,12 +63,9 @@ class ImportOptions:
 
     @usable_arguments("ImportOptions")
     def __post_init__(self) -> None:
-        for name in ("gap", "rate"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < float("inf"):
+        for name, value in (("gap", self.gap), ("rate", self.rate)):
+            if value is not None and value not in ("auto", "log") and not 0.0 < value < float("inf"):
                 raise InvalidInput(f"{name} is {value}; it must be positive and finite.")
-        if self.rate is not None and self.resample == "no":
-            raise InvalidInput("a rate asks for resampling; leave out `rate` or `resample` no.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
         if self.stance not in ("log", "auto"):
@@ -172,7 +168,7 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
 def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
     """The step of even times that all episodes get, or None if every stamp stays."""
     median = float(np.median([own.step for own in stamps]))
-    if options.rate is not None:
+    if not isinstance(options.rate, str):
         if options.rate < 0.9 / median:
             warnings.warn(
                 f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
@@ -182,7 +178,7 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
             )
         return 1.0 / options.rate
     alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in stamps)
-    if options.resample == "no" or (alike and all(own.even for own in stamps)):
+    if options.rate == "log" or (alike and all(own.even for own in stamps)):
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
