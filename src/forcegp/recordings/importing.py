@@ -21,7 +21,6 @@ from forcegp.recordings.reading import (
     RawRecording,
     read_recording,
     require_plausible_positions,
-    warn_of_implausible_forces,
 )
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import MOST_ROWS, Source
@@ -115,7 +114,6 @@ def import_recordings(
         found = read_recording(source, own, label, unwrap=options.unwrap, most_rows=options.most_rows)
         if not options.beyond_limits:
             require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
-        warn_of_implausible_forces(found, own, robot)
         recordings.append(found)
     stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
     step = _even_step(stamps, options)

@@ -109,12 +109,9 @@ class LeRobotFolder(Source):
     """A LeRobot dataset as one table: all rows of its data files in the order of their numbers.
 
     Columns are those of the Parquet files; where `info.json` names the elements of a list, they are
-    `observation.state.<name>`. `timestamp` is the time and `episode_index` the episode. Videos are not looked at.
+    `observation.state.<name>`. Videos are not looked at.
     Raises FileFormatError if the files do not hold what `info.json` states.
     """
-
-    suggested_time = "timestamp"
-    suggested_episode = "episode_index"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import forcegp.robots
-from forcegp.errors import DatasetError, DataWarning, FileFormatError, MistakenUnit
+from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.moving_base import Jumps, read_poses
 from forcegp.recordings.signal_plan import SignalPlan
 from forcegp.recordings.source import Columns, Source
@@ -201,9 +200,6 @@ BEYOND = 0.1
 TURNS = 4.0 * np.pi
 """rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees."""
 
-STRONGER = 3.0
-"""Times the limit of the URDF that a force may be before it is warned of."""
-
 
 def require_plausible_positions(
     recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None, believed: Collection[str]
@@ -232,18 +228,3 @@ def require_plausible_positions(
         if degrees and item.joint not in believed and not np.isfinite(upper - lower):
             hint = "Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
             raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", "deg")
-
-
-def warn_of_implausible_forces(recording: RawRecording, plan: SignalPlan, robot: forcegp.robots.Robot | None) -> None:
-    """Warn (DataWarning) of forces far beyond the limits of the URDF."""
-    limits = {} if robot is None else {joint.name: joint.effort_limit for joint in robot.joints}
-    for index, item in enumerate(plan.signals):
-        limit = limits.get(item.joint, np.inf)
-        most = float(np.abs(recording.ranges[index]).max())
-        if item.signal == "u" and 0.0 < limit < np.inf and most > STRONGER * limit:
-            warnings.warn(
-                f"{recording.label}: u of joint {item.joint!r} reaches {most:.4g} {item.unit.si}; the URDF allows "
-                f"{limit:.4g}. Is it in another unit (`unit` u=mNm), or on the motor's side of a gear (`u` 100*tau)?",
-                DataWarning,
-                stacklevel=2,
-            )

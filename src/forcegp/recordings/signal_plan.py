@@ -28,6 +28,8 @@ from forcegp.summary import listed
 LACKING = LinearExpression({}, 0.0)
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
+EPISODE = "episode_index"
+"""Numbers the episodes where nothing else is stated, as in datasets of LeRobot."""
 MOST_NAMES = 40
 """Of columns in a message."""
 
@@ -159,9 +161,7 @@ def signal_plan(
         for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
     )
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
-    episode = mapping.episode
-    if episode is None and source.suggested_episode in source.columns():
-        episode = source.suggested_episode
+    episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
     if episode is not None:
         require_known("column", episode, str(source.path), source.columns(), FileFormatError)
     # stamps of ROS are whole nanoseconds; everything else is taken for seconds

@@ -38,10 +38,6 @@ class Source(ABC):
 
     row_word: ClassVar[str] = "row"
     """What one row is called in messages."""
-    suggested_time: ClassVar[str | None] = None
-    """The column that holds the time wherever this format is used, if there is one."""
-    suggested_episode: ClassVar[str | None] = None
-    """The column that numbers the episodes wherever this format is used, if there is one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -83,7 +79,7 @@ class Source(ABC):
 
     def time_beside(self, names: Sequence[str]) -> str | None:
         """The column that is the time of these columns, if the format itself names it."""
-        return self.suggested_time
+        return None
 
     def files(self) -> tuple[Path, ...]:
         """The files that this log consists of."""
