@@ -165,7 +165,7 @@ def fitted(rig: Rig, source: Source, points: int, seed: int) -> Posterior:
         return fit(replace(model, noise=noise), _later(rig.train, 5 * seed), how, points=points, restarts=1)
     rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train).dataset
     noise = Noise(1.0, rig.force_noise, learn=True)
-    return fit(replace(model, noise=noise), farthest_rows(rows, points, seed=seed), restarts=1)
+    return fit(replace(model, noise=noise), farthest_rows(rows, points, start=seed), restarts=1)
 
 
 def _later(raw: Dataset, rows: int) -> Dataset:

@@ -529,7 +529,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ImportOptions": (
         forcegp.ImportOptions,
-        lambda: {"gap": None, "resample": "auto", "rate": None, "start": None, "end": None, "most_rows": 10},
+        lambda: {"gap": None, "rate": "auto", "start": None, "end": None, "most_rows": 10},
     ),
     "KukaSurfaceConfig": (
         forcegp.KukaSurfaceConfig,

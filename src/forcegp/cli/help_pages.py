@@ -21,8 +21,8 @@ from forcegp.cli.command import Command
 
 GROUPS: Mapping[str, str] = {
     "Input": "baseline task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
-    "Columns": "time q v u a step joints orientation axes ned unit sign scale offset episode unwrap",
-    "Timing": "start end gap resample rate",
+    "Columns": "time q v u a step joints orientation axes ned unit sign episode unwrap",
+    "Timing": "start end gap rate",
     "Preparation": "cutoff differentiate delay lag stance every trim",
     "Robot": "robot shapes inertias base root identified "
     "lock armature gravity beyond_limits link system contact feet wheels",

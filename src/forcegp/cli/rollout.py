@@ -129,12 +129,12 @@ class Rollout(Overwriting):
 
 
 def _write_arrays(path: Path, rollout: Any, recorded: forcegp.data.RecordedMotions, joint_names: Sequence[str]) -> None:
-    from forcegp.data.hdf5 import NewFile  # here, so that --help does not wait for it
+    from forcegp.data.hdf5 import new_file  # here, so that --help does not wait for it
 
     arrays = {name: getattr(rollout, name) for name in ("time", "q", "v", "a", "constraint", "diverged_at")}
     if rollout.samples is not None:
         arrays |= {f"samples/{name}": getattr(rollout.samples, name) for name in ("q", "v", "a", "constraint")}
-    with NewFile(path) as file:
+    with new_file(path) as file:
         for name, values in arrays.items():
             file[name] = values.cpu().numpy()
         for name in ("q", "v", "u"):

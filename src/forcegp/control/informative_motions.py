@@ -23,7 +23,7 @@ from typing_extensions import override
 from forcegp.atomic_files import atomic_file
 from forcegp.control.controller import per_joint
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.evidence.identifiability import base_parameters, torque_regressor

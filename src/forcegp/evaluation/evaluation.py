@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.data import Dataset, contact_doubts
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import require_type
 from forcegp.evaluation import metrics
 from forcegp.evaluation.doubts import doubts, overlap_warnings

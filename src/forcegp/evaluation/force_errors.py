@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Numbers

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from typing_extensions import override
 
 from forcegp.data import Dataset, farthest_rows, time_blocks
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.fit import fit
 from forcegp.forces import Force

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.data.memory import with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows

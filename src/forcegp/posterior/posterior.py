@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
 from forcegp.evidence.likelihood import MarginalLikelihood
