@@ -29,6 +29,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
+from forcegp.posterior.structured import Posterior
 
 from benchmarks.tracking import (
     CONFIG,
@@ -45,7 +46,6 @@ from benchmarks.tracking import (
 )
 from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, Model, PDGravity, fit
 from forcegp.data import farthest_rows
-from forcegp.posterior.structured import Posterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SECONDS, LOST = 600, 0.3
