@@ -38,7 +38,7 @@ PACKAGES |= {
     "evidence": MODEL | {"data", "inference"},
     "posterior": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence"},
     "fit": MODEL | {"parallel", "data", "inference", "integration", "evidence", "posterior"},
-    "checks": MODEL | {"data", "evidence", "posterior", "fit"},
+    "checks": MODEL | {"data", "evidence"},
     "control": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence", "posterior"},
     "simulation": {"errors", "robots", "mechanics", "forces", "model", "data"},
 }
@@ -53,7 +53,6 @@ IMPORTED_WHERE_USED = {
     "casadi": (),
     "viser": (),
     "trimesh": (),
-    "rerun": (),
     "jinja2": ("forcegp.report.page",),
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),
@@ -65,7 +64,7 @@ IMPORTED_WHERE_USED = {
     "rich": ("forcegp.cli",),
 }
 
-LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
+LONGEST_MODULE = 600  # lines; 100 to 300 are the rule, and what is one idea stays together, as `Posterior` does
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
 
 

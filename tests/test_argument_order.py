@@ -30,7 +30,7 @@ def posterior(data):
 
 
 CALLS = [
-    (lambda d, p: score(d, p), "log is a StructuredPosterior; give a Dataset"),
+    (lambda d, p: score(d, p), "log is a Posterior; give a Dataset"),
     (lambda d, p: score(d, d), "models is a Dataset; give a Posterior, a mapping from names, or names"),
     (
         lambda d, p: score({"a": 5}, d, split=split_named(d, "blocks:2:1", 0.0), points=3),

@@ -321,7 +321,7 @@ class DeepKernel(ForceExperiment):
         parts = [
             "`friction-map`: viscous friction whose coefficient depends on the place, analytical mean, "
             f"{len(self.seeds)} seeds. Leave-one-out: log density of a training row given all others, in nats per row, "
-            "from the same fit; the higher, the better. `compare_priors` chooses by that of stretches of time."
+            "from the same fit; the higher, the better. `forcegp score --split leave-out` takes stretches of time."
         ]
         columns = ("mae_noise_free", "nlpd", "coverage_95")
         for scenario in STRIP:

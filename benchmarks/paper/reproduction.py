@@ -17,7 +17,7 @@ from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, require_known
 from forcegp.jobs import JobStore, Progress, run_jobs
-from forcegp.parallel import Backend
+from forcegp.parallel import Jobs
 from forcegp.scores import save_figure
 from forcegp.scores.tables import alike, markdown_table
 
@@ -144,7 +144,7 @@ def reproduce(
     command: str,
     page: Page = PAPER_PAGE,
     docs: Path | None = None,
-    backend: Backend | None = None,
+    jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
@@ -164,8 +164,8 @@ def reproduce(
             require_writable(folder / "trial")
         except OSError as error:
             raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
-    jobs = {job.name: job for experiment in experiments for job in experiment.jobs()}
-    run_jobs(results, list(jobs.values()), backend, progress)
+    pieces = {job.name: job for experiment in experiments for job in experiment.jobs()}
+    run_jobs(results, list(pieces.values()), jobs, progress)
     documents, pictures = {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)

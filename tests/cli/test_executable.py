@@ -25,7 +25,6 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
     "robot": (("arm.urdf", "--out", "arm.png"), "arm.png"),
     "check": (("log.h5", "--plots", "look"), "look/check.png"),
-    "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
     "payload": (("log.h5", "--cutoff", "none", "--delay", 0, "--out", "held"), "held/payload.json"),
     "score": (

@@ -24,10 +24,10 @@ FILES = {
     "import": f"{IMPORT} --overwrite --out OUT",
     "mapping": f"{IMPORT} --overwrite --out x.h5 --write-mapping OUT",
     "excite": "excite run --overwrite --out OUT",
-    "prepare": "prepare arm.h5 --every 2 --overwrite --out OUT",
+    "prepare": "import arm.h5 --every 2 --overwrite --out OUT",
 }
 FOLDERS = {
-    "spectra": "prepare arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
+    "spectra": "import arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
     "fit": "fit arm.h5 --overwrite --out OUT",
     "payload": "payload arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
@@ -39,7 +39,7 @@ STORES = {
     "reproduce": "reproduce fig2b --out OUT",
     "docs": "reproduce fig2b --out runs --docs OUT",
 }
-KINDS = {"spectra": "forcegp prepare"}
+KINDS = {"spectra": "forcegp import"}
 COMMANDS = FILES | FOLDERS | STORES
 
 
@@ -177,7 +177,7 @@ OVER_INPUTS = [
     "import log.csv --mapping log.yaml --out x.h5 --write-mapping log.yaml",
     "import log.csv --out x.h5 --write-mapping log.yaml",
     "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
-    "prepare arm.h5 --every 2 --out arm.h5",
+    "import arm.h5 --every 2 --out arm.h5",
     "fit arm.h5 --robot arm.urdf --out arm.urdf",
     "fit arm.h5 --identified run --out run",
     "fit run/inner.h5 --out run",
@@ -209,8 +209,8 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     [
         f"{IMPORT} --out x.h5 --write-mapping x.h5",
         f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
-        "prepare arm.h5 --every 2 --out x.h5 --plots x.h5",
-        "prepare arm.h5 --every 2 --out new/x.h5 --plots new",
+        "import arm.h5 --every 2 --out x.h5 --plots x.h5",
+        "import arm.h5 --every 2 --out new/x.h5 --plots new",
         "reproduce fig2b --out x --docs x",
     ],
 )

@@ -41,7 +41,7 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     assert "margin of rear_left_foot to slipping" in scored.stdout
     assert "slips in 0.0 % of the rows" in " ".join(scored.stdout.split())
     assert (tmp_path / "plots" / "friction_margins.png").exists()
-    found = forcegp("prepare", "log.h5", "--stance", "auto", "--out", "found.h5", folder=tmp_path)
+    found = forcegp("import", "log.h5", "--stance", "auto", "--out", "found.h5", folder=tmp_path)
     assert found.returncode == 0, found.stderr
     assert "front_left_stands 100%" in found.stdout
     flags = Dataset.load(tmp_path / "found.h5").u[:, 12:]

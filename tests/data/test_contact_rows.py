@@ -35,11 +35,6 @@ def test_flags_decide_where_a_contact_has_a_switch():
     assert contact_rows(noisy).all()
 
 
-def test_truth_is_not_looked_at(hopping):
-    blind = dataclasses.replace(hopping, truth={})
-    np.testing.assert_array_equal(contact_rows(blind), contact_rows(hopping))
-
-
 @pytest.mark.parametrize("surface", ["plane", "tilted", "sphere"])
 def test_an_ideal_contact_keeps_its_rows(surface):
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=10.0, seed=6, surface=surface))

@@ -47,7 +47,7 @@ class Writing:
 COMMANDS = {
     "simulate": Writing("simulate kuka-surface --seconds 1 --out OUT", "file"),
     "import": Writing("import log.csv --time time --q q_a --u u_a --joints a --out OUT", "file"),
-    "prepare": Writing("prepare train.h5 --cutoff 20 --out OUT", "file"),
+    "prepare": Writing("import train.h5 --cutoff 20 --out OUT", "file"),
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
     "identification": Writing("fit air.h5 --forces bodies,viscous --no-checks --out OUT"),
     "check": Writing("check train.h5 --plots OUT"),

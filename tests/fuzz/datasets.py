@@ -179,11 +179,11 @@ def check_commands(case: DataFile, folder: Path) -> None:
     """The same files under the commands that read datasets."""
     write(case, folder / "data.h5")
     number = sum(map(ord, repr(case)))
-    lag = "prepare data.h5 --cutoff 20 --lag auto --out o.h5"
+    lag = "import data.h5 --cutoff 20 --lag auto --out o.h5"
     words = (
         "check data.h5",
         lag,
-        "prepare data.h5 --cutoff 20 --out o.h5",
+        "import data.h5 --cutoff 20 --out o.h5",
         f"score {INPUTS.folder / 'carried'} data.h5",
     )
     require_ended_well(words[number % 4].split(), folder)

@@ -35,13 +35,9 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory, swinging, friction):
-    from forcegp import score
-    from forcegp.report import model_page, scores_sentence, scores_table, write_page
+def report(tmp_path_factory, page):
+    from forcegp.report import write_page
 
-    scores = score(friction, swinging, horizons=())
-    best = scores_sentence(scores, "rad/s²")
-    page = model_page(friction, swinging, title="A pendulum", best=best, tables=[scores_table(scores)])
     path = tmp_path_factory.mktemp("browser") / "report.html"
     write_page(path, page)
     return path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import time
 from collections.abc import Mapping
@@ -30,7 +29,7 @@ from forcegp.cli.auto_answer import (
 )
 from forcegp.cli.command import CONFIG, URDF, Resuming, unless_given
 from forcegp.cli.fit import write_estimates
-from forcegp.cli.import_log import Import
+from forcegp.cli.import_log import LogOptions
 from forcegp.cli.input_options import CandidateOptions, forces_of
 from forcegp.cli.payload import payload_dict, with_payload
 from forcegp.cli.terminal import Terminal, facts, findings_table
@@ -42,7 +41,7 @@ SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Auto(CandidateOptions, Resuming, Import):
+class Auto(CandidateOptions, Resuming, LogOptions):
     """From logs and a robot to a validated model: import, check, prepare, identify, learn, score, report.
 
     Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
@@ -69,10 +68,10 @@ class Auto(CandidateOptions, Resuming, Import):
     """Where a payload may be."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
     """Delay of u in the log, in s. auto: estimated where u are the torques of all joints and nothing is touched, else
     0."""
-    lag: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    lag: Annotated[str, arg(metavar="S|auto")] = "auto"
     """Time constant in s with which actuators follow u. auto: estimated for thrusters, 0 for joints."""
     every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
@@ -93,29 +92,27 @@ class Auto(CandidateOptions, Resuming, Import):
         assert model is not None
         for note in forces_of(model):
             terminal.note(note)
-        path = self.out.parent / f".{self.out.name}.log.h5"
-        with contextlib.ExitStack() as cleanup:
-            cleanup.callback(path.unlink, missing_ok=True)  # where the log is refused
-            dataset, done, mapping, mistakes = self._imported(terminal, model, mapping, path)
-            corrected = self._command(mapping)
-            if mistakes and not self.correct:
-                terminal.show(findings_table(mistakes, terminal.worded), "Run:")
-                terminal.command(corrected)
-                raise DatasetError(
-                    f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
-                )
-            terminal.names_stages = True  # of minutes, most of which have nothing to count
-            with terminal.progress("checking"):
-                report = forcegp.check(dataset)
-            wrong = [finding for finding in report.findings if finding.severity == "wrong"]
-            if wrong and not self.accept:
-                terminal.show(findings_table(wrong, terminal.worded))
-                raise DatasetError(
-                    f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
-                    "add --accept to continue."
-                )
-            self.out.mkdir(parents=True, exist_ok=True)
-            path.replace(self.out / "log.h5")
+        dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
+        corrected = self._command(mapping)
+        if mistakes and not self.correct:
+            terminal.show(findings_table(mistakes, terminal.worded), "Run:")
+            terminal.command(corrected)
+            raise DatasetError(
+                f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
+            )
+        terminal.names_stages = True  # of minutes, most of which have nothing to count
+        with terminal.progress("checking"):
+            report = forcegp.check(dataset)
+        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
+        if wrong and not self.accept:
+            terminal.show(findings_table(wrong, terminal.worded))
+            raise DatasetError(
+                f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
+                "add --accept to continue."
+            )
+        self.out.mkdir(parents=True, exist_ok=True)
+        with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
+            dataset.save(temporary)
         with terminal.progress("preparing"):
             if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
                 timed = self.with_delay_that_shows(terminal, preparation, dataset)
@@ -161,16 +158,15 @@ class Auto(CandidateOptions, Resuming, Import):
         return content
 
     def _imported(
-        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping, path: Path
+        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
         mistakes: list[forcegp.checks.Finding] = []
         for _ in range(MOST_CORRECTIONS):
             try:
-                with terminal.progress("importing") as progress, atomic_file(path, overwrite=True) as temporary:
-                    done = forcegp.import_recordings(
-                        self.logs, temporary, mapping, model=model, options=self._options(), report=progress
-                    )
+                with terminal.progress("importing") as progress:
+                    how: dict[str, Any] = {"model": model, "options": self._options(), "report": progress}
+                    dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
                 mistakes.append(
@@ -184,11 +180,10 @@ class Auto(CandidateOptions, Resuming, Import):
                 )
                 mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
                 continue
-            dataset, undecided = forcegp.Dataset.load(path), None
+            done = dict(dataset.metadata["import"])
             if done["open_switches"]:
                 try:
                     dataset = forcegp.data.estimate_stance(dataset).filled(dataset)
-                    dataset.save(path)
                 except DatasetError as error:  # of a mistake, perhaps
                     undecided = error
             found = [finding for finding in forcegp.checks.quick_check(dataset) if finding.correction]
@@ -293,7 +288,7 @@ class Auto(CandidateOptions, Resuming, Import):
         """The folder of the model's C program; None where there is no compiler, or none of this model."""
         try:
             with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
-                forcegp.export_c(cast(forcegp.posterior.StructuredPosterior, posterior), folder)
+                forcegp.export_c(cast(forcegp.posterior.Posterior, posterior), folder)
         except (CompilerError, InvalidInput, NumericalError) as error:
             terminal.note(f"no C program: {error}")
             return None

@@ -108,7 +108,7 @@ class Demo(Command):
         self,
         terminal: Terminal,
         folder: Path,
-        posterior: forcegp.posterior.StructuredPosterior,
+        posterior: forcegp.posterior.Posterior,
         test: forcegp.Dataset,
         results: Mapping[str, Any],
     ) -> str:
@@ -144,7 +144,7 @@ class Demo(Command):
 
     def _fitted(
         self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: bool
-    ) -> tuple[forcegp.posterior.StructuredPosterior, dict[str, Any]]:
+    ) -> tuple[forcegp.posterior.Posterior, dict[str, Any]]:
         """The fitted model, and what the fit came to."""
         assert train.model is not None
         start = time.monotonic()

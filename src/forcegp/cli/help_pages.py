@@ -21,8 +21,8 @@ from forcegp.cli.command import Command
 
 GROUPS: Mapping[str, str] = {
     "Input": "baseline task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
-    "Columns": "time q v u a step joints orientation axes ned unit sign scale offset episode unwrap",
-    "Timing": "start end gap resample rate",
+    "Columns": "time q v u a step joints orientation axes ned unit sign episode unwrap",
+    "Timing": "start end gap rate",
     "Preparation": "cutoff differentiate delay lag stance every trim",
     "Robot": "robot shapes inertias base root identified "
     "lock armature gravity beyond_limits link system contact feet wheels",
@@ -34,8 +34,8 @@ GROUPS: Mapping[str, str] = {
     "Fit": "points learning_points rows engine restarts iterations hyperprior checks correct accept",
     "Score": "split guard seeds seed_list horizon margin strict",
     "Program": "to steps covariance jacobian unchecked",
-    "Compute": "preset seed jobs backend device port",
-    "Output": "out plots report html browser rerun write_mapping docs overwrite json",
+    "Compute": "preset seed jobs device port",
+    "Output": "out plots report html browser write_mapping docs overwrite json",
     "Other": "debug",
 }
 """Options of all commands by purpose, in the order of the pages: a name means the same everywhere."""

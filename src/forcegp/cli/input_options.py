@@ -259,10 +259,10 @@ class CutoffOptions(Command):
 class PreparationOptions(CutoffOptions):
     """What every command asks that makes rows to learn from out of a raw log."""
 
-    delay: Annotated[str, arg(metavar="S|auto|each")] = "0"
-    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together.
-    each: estimated per joint. Both need the robot."""
-    lag: Annotated[str, arg(metavar="S|auto|each")] = "0"
+    delay: Annotated[str, arg(metavar="S|auto")] = "0"
+    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together,
+    which needs the robot."""
+    lag: Annotated[str, arg(metavar="S|auto")] = "0"
     """Time constant in s with which actuators of first order follow u: as for --delay."""
     every: Annotated[int | None, unless_given("N", "1", int)] = None
     """Keep every N-th row, after the filter."""
@@ -274,8 +274,8 @@ class PreparationOptions(CutoffOptions):
         late: dict[str, Any] = {}
         for name in ("delay", "lag"):
             given = getattr(self, name)
-            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, auto or each.".format
-            if given not in ("auto", "each"):
+            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, or auto.".format
+            if given != "auto":
                 each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in given.split(","))
                 given = each[0] if len(each) == 1 else each
             late[name] = given

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,13 +113,11 @@ class Monitor(Overwriting):
         else:
             beside = self.mapping or forcegp.recordings.beside(path)
             mapping = forcegp.ColumnMapping() if beside is None else forcegp.recordings.read_mapping(beside)
-            with tempfile.TemporaryDirectory() as folder, terminal.progress(f"reading {path}") as report:
-                out = Path(folder) / "log.h5"
+            with terminal.progress(f"reading {path}") as report:
                 try:
-                    forcegp.import_recordings([path], out, mapping, model=posterior.model, report=report)
+                    dataset = forcegp.import_recordings([path], mapping, model=posterior.model, report=report)
                 except InvalidInput as error:
                     raise InvalidInput(f"{error} Or write a dataset of {path} by `forcegp import`.") from None
-                dataset = forcegp.Dataset.load(out)
         require_same_joints(posterior, dataset, path)
         return dataset
 

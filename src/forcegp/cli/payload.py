@@ -48,7 +48,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
     """What is estimated beside it, as for forcegp fit."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter of a raw log. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
     """Delay of u in the log, in s."""
     out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
     """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""

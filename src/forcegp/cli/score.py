@@ -17,7 +17,7 @@ import forcegp.posterior
 import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import file_digest
-from forcegp.cli.command import NUMBERS, URDF, BackendOptions, InputPath, Overwriting, Resuming, listed, unless_given
+from forcegp.cli.command import NUMBERS, URDF, InputPath, Overwriting, Resuming, listed, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import (
     CandidateOptions,
@@ -41,7 +41,7 @@ NORMAL_FORCES_SEEN = "this prior leaves no force along the contact normal free, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, RobotOptions, Overwriting):
+class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwriting):
     """Score models on rows of a log that they have not seen: errors, densities, coverage, motions; and compare them.
 
     Folders of forcegp fit are scored on the whole log. With --forces, or without folders, models are fitted to one side
@@ -93,6 +93,8 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
     """A RUN predicts under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
     friction_coefficient: Annotated[float | None, unless_given("F", "no margins", float)] = None
     """Also show how far feet are from slipping on ground of this friction coefficient."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """So many pieces of work at once, each on one core."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
     """The folder of results: page, figures, numbers, models. An unfinished run resumes."""
     report: Annotated[Path | None, unless_given("FILE.html", "no report")] = None
@@ -115,7 +117,7 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
             )
         if (self.report is not None or self.friction_coefficient is not None) and len(runs) != 1:
             raise InvalidInput(f"{len(runs)} runs were given; a report and margins to slipping are of one RUN.")
-        backend, start = self._backend(), time.monotonic()
+        start = time.monotonic()
         raw = forcegp.Dataset.load(data)
         models: dict[str, Any] = {}
         for path in runs:
@@ -138,7 +140,7 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
                 recording=recording,
                 seeds=self.seeds,
                 margin=self.margin,
-                backend=backend,
+                jobs=self.jobs,
                 source=source,
                 overwrite=self.overwrite,
                 progress=report,
@@ -217,7 +219,7 @@ class Score(CandidateOptions, Resuming, BackendOptions, PreparationOptions, Robo
         where = ", carried to another robot or contacts" if trained != here else ""
         title = f"{scores.models[name]['summary']}{where}; {len(rows)} rows of {self.paths[-1]}"
         title += f"; errors in {unit_of_a(rows)}"
-        known = isinstance(posterior, forcegp.posterior.StructuredPosterior) and not posterior.latent_names
+        known = not posterior.latent_names
         rests = forcegp.scores.normal_force_rests_on_prior(posterior)
         why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests else NORMAL_FORCES_SEEN
         posterior, rows = forcegp.posterior.observing(posterior, rows)

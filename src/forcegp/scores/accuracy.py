@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset, time_blocks
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.prediction import Gaussian
 from forcegp.scores import metrics
@@ -175,7 +174,7 @@ def _components(posterior: Posterior, test: Dataset) -> Table:
 
     Not without an analytical mean, where the processes hold the known forces, too.
     """
-    if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
+    if posterior.is_black_box or posterior.carries_known_forces:
         return {}
     named = true_names([name for name, *_ in posterior.trained.unknown.named(posterior.model.robot)], test)
     if not named:

@@ -13,7 +13,6 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, TRUE_ACCELERATION, Table
 from forcegp.scores.predicted_rows import stated_noise_level
@@ -151,7 +150,7 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
     curves that each have an input of their own, and constants (a payload), are no such processes: one state does not
     separate them, but all together do.
     """
-    if not isinstance(posterior, StructuredPosterior) or not posterior.trained.contacts:
+    if not posterior.trained.contacts:
         return False
     training = posterior.training
     q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
@@ -249,8 +248,6 @@ def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
 
 def _errors_here_and_there(posterior: Posterior, dataset: Dataset, model: Model) -> tuple[float, float] | None:
     """Errors of the mean on some rows as it is and carried over to that model; None where it cannot be."""
-    if not isinstance(posterior, StructuredPosterior):
-        return None
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
     try:
         with warnings.catch_warnings(), torch.no_grad():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.model import Model

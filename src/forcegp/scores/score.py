@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,13 +13,13 @@ import numpy as np
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.jobs.job import machine
 from forcegp.model import Model
-from forcegp.parallel import Backend, backend_for
+from forcegp.parallel import checked_jobs
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.candidates import (
     Candidate,
@@ -61,8 +62,7 @@ def score(
     restarts: int | None = None,
     iterations: int | None = None,
     margin: float = MARGIN,
-    jobs: int | None = None,
-    backend: Backend | str | None = None,
+    jobs: int | Executor = 1,
     source: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -91,7 +91,7 @@ def score(
         accelerations into forces.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
     margin: ratios of errors within it of 1 count as no difference.
-    jobs, backend: how many pieces at once, and where.
+    jobs: pieces at once, in as many processes of this machine, or an executor in which they run.
     source: where the data come from, for the page: "title", and "data", a list of lines.
     overwrite: compute everything anew, also where the folder holds results.
 
@@ -133,12 +133,12 @@ def score(
     settings: Any = (points, horizons, starts, integrator, identification, restarts, iterations)
     experiment = Experiment(log, recording or log, robot, splits, *settings)
     chosen = candidates(default_models(robot) if given is None else given, robot, experiment.identifies)
-    workers = backend_for(backend, jobs)
+    checked_jobs(jobs)
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere, "scores") if folder is None else Path(folder)
         store = JobStore.open(place, KIND, experiment.configuration(), overwrite=overwrite)
         identifications, fits = jobs_of(experiment, chosen, seeds)
-        run_jobs(store, [*identifications, *fits], workers, progress)
+        run_jobs(store, [*identifications, *fits], jobs, progress)
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
             runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]

@@ -140,10 +140,10 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
         label = label if space.is_vector_space else "position; of a base its way from the first row"
         style.draw_line(axes, shown.time, values[:, joint], style.TRUTH, 1.0, label)
         return style.joint_units(shown, "q")[joint]
-    rows = log.correction.applied(shown)
+    rows = log.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
     measured, fitted = rows.u[:, joint], log.fit.at(log.robot, tau, rows)[:, joint]
-    mended = log.correction.torque_from[joint] != joint or log.correction.torque_factor[joint] != 1.0
+    mended = not np.array_equal(rows.u[:, joint], shown.u[:, joint])
     if mended:
         style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")
     style.draw_line(axes, rows.time, measured, style.MEASUREMENT, 2.2, "measured, filtered")

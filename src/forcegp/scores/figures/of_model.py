@@ -32,7 +32,7 @@ def model_figures(
     caption = "Every half second a prediction begins at the recorded state and follows the recorded u. The line is its "
     caption += "error, the band its 95 % interval."
     found["motions_ahead"] = caption, lambda: motion_bands_figure(posterior, dataset)
-    if posterior.model.contacts and posterior.predicts_forces:
+    if posterior.model.contacts:
         caption = "The forces of contacts, which no sensor measured."
         found["normal_force"] = caption, lambda: normal_force_figure(posterior, dataset)
     caption = "Accelerations over time, and their errors on the right."

@@ -73,7 +73,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     The force is |s_p| lambda in N, positive where the surface pushes along its gradient; where a point is held, the
     part along each axis of the world. Raises InvalidInput without contacts, and for models without forces.
     """
-    if not posterior.model.contacts or not posterior.predicts_forces:
+    if not posterior.model.contacts:
         raise InvalidInput(
             f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
             "forces."

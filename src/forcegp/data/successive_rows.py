@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from forcegp.data import Dataset
+from forcegp.data.dataset import Dataset
 from forcegp.data.row_selection import consecutive
 
 JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
@@ -100,8 +100,8 @@ def _means(values: np.ndarray, first: np.ndarray, width: int) -> np.ndarray:
     return (sums[first + width] - sums[first]) / width
 
 
-def white_noise(log: Dataset, width: int = 1) -> Float[np.ndarray, " nv"] | None:
-    """Standard deviation of noise on `a`, or on its means over `width` rows, from differences of successive ones.
+def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.ndarray, " nv"] | None:
+    """Standard deviation of noise on a signal, or on its means over `width` rows, from differences of successive ones.
 
     The k-th difference of white noise has the variance binomial(2k, k), that of a smooth motion falls with k: NaN where
     it is motion that is seen. Medians, since impacts are no noise. None for rows out of order and fewer than 30.
@@ -114,7 +114,7 @@ def white_noise(log: Dataset, width: int = 1) -> Float[np.ndarray, " nv"] | None
         if len(first) < FEWEST_DIFFERENCES:
             return None
         first = first[:: max(1, len(first) // MOST_DIFFERENCES)]
-        means = np.stack([_means(log.a, first + k * width, width) for k in range(order + 1)])
+        means = np.stack([_means(getattr(log, signal), first + k * width, width) for k in range(order + 1)])
         differences = np.diff(means, order, axis=0)[0]
         noise.append(1.4826 * np.median(np.abs(differences), axis=0) / np.sqrt(variance))
     with np.errstate(invalid="ignore", divide="ignore"):
