@@ -17,6 +17,7 @@ import forcegp.checks
 import forcegp.data
 import forcegp.evaluation
 import forcegp.evidence
+import forcegp.parallel
 import forcegp.posterior
 import forcegp.robots
 from forcegp.atomic_files import file_digest, write_json, write_text

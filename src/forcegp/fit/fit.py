@@ -84,8 +84,8 @@ def fit(
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
     Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
-    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then the functions are conditioned on the
-    rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
+    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then the functions
+    are conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
 
     Parameters
     ----------
