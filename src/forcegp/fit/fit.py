@@ -85,7 +85,8 @@ def fit(
 
     Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
     kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then the functions
-    are conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
+    are conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`,
+    `posterior.predict(q, v, u)`.
 
     Parameters
     ----------
