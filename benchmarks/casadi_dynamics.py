@@ -1,10 +1,8 @@
 """The dynamics of a robot by CasADi: scalar C that it generates, compiled with `gcc -O3 -march=native`, a loop in C.
 
 Recursive Newton-Euler, composite rigid bodies and LDL' in CasADi's scalar expressions (SX) and operations, with
-`casadi.cse`. (What forcegp traces for its own code, as CasADi expressions, takes as long: 0.9 to 1.03 times.) The
-gradient of sum(w * a) with respect to the ten standard parameters of every body comes with the accelerations from one
-function, and takes the implicit derivative, ``-d <l, ID(q, v, a)>`` with ``l = M^-1 w`` and a held, which is cheaper
-than CasADi's through the factorisation. Serial chains of revolute joints only.
+`casadi.cse`. (What forcegp traces for its own code, as CasADi expressions, takes as long: 0.9 to 1.03 times.) Serial
+chains of revolute joints only.
 """
 
 from __future__ import annotations
@@ -21,44 +19,39 @@ import numpy as np
 from forcegp.robots import Robot
 from forcegp.robots.unrolled import UnrolledRobot
 
-QUANTITIES = ("mass_bias", "fd", "inertial_gradient")
+QUANTITIES = ("mass_bias", "fd")
 LOOP = """
 void loop(long n, const double *const *a, double *const *o) {
-  static double w[1 + SZ_W], sum[1024];
+  static double w[1 + SZ_W];
   const double *arg[1 + SZ_ARG];
   double *res[1 + SZ_RES];
   casadi_int iw[1 + SZ_IW];
-  if (SUMMED) for (int j = 0; j < SUMMED; j++) o[1][j] = 0.0;
   for (long i = 0; i < n; i++) {
     ROWS
     f(arg, res, iw, w, 0);
-    if (SUMMED) for (int j = 0; j < SUMMED; j++) o[1][j] += sum[j];
   }
 }
 """
 
 
 class CasadiLoops:
-    """Loops over given states (count, nv); a call returns the results, the gradient (nv, 10) summed over the states."""
+    """Loops over given states (count, nv); a call returns the results."""
 
-    def __init__(
-        self, robot: Robot, folder: Path, q: np.ndarray, v: np.ndarray, tau: np.ndarray, w: np.ndarray
-    ) -> None:
+    def __init__(self, robot: Robot, folder: Path, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
         self.unrolled, self.folder, self.nv = UnrolledRobot(robot), folder, robot.nv
         self.standard = standard_parameters(self.unrolled)
-        given = {"mass_bias": (q, v), "fd": (q, v, tau), "inertial_gradient": (q, v, tau, w, self.standard)}
-        self.mass_bias, self.fd, self.inertial_gradient = (self._loop(name, *given[name]) for name in QUANTITIES)
+        given = {"mass_bias": (q, v), "fd": (q, v, tau)}
+        self.mass_bias, self.fd = (self._loop(name, *given[name]) for name in QUANTITIES)
 
     def _loop(self, quantity: str, *given: np.ndarray) -> Callable[[], list[np.ndarray]]:
         inputs, outputs = self._expressions(quantity)
-        summed = outputs[1].numel() if quantity == "inertial_gradient" else 0
         function = ca.Function("f", inputs, ca.cse(outputs))
         code = ca.CodeGenerator(f"{quantity}.c")
         code.add(function)
         code.generate(f"{self.folder}/")
         rows = [f"arg[{k}] = a[{k}] + i * {x.numel() if x.is_vector() else 0};" for k, x in enumerate(inputs)]
-        rows += [f"res[{k}] = {'sum' if summed and k else f'o[{k}] + i * {x.numel()}'};" for k, x in enumerate(outputs)]
-        text = LOOP.replace("ROWS", "\n    ".join(rows)).replace("SUMMED", str(summed))
+        rows += [f"res[{k}] = o[{k}] + i * {x.numel()};" for k, x in enumerate(outputs)]
+        text = LOOP.replace("ROWS", "\n    ".join(rows))
         for size in ("sz_w", "sz_arg", "sz_res", "sz_iw"):
             text = text.replace(f"+ {size.upper()}]", f"+ {getattr(function, size)()}]")
         source = self.folder / f"{quantity}.c"
@@ -69,8 +62,6 @@ class CasadiLoops:
         loop, count = ctypes.CDLL(str(library)).loop, len(given[0])
         held = [np.ascontiguousarray(x) for x in given]
         results = [np.zeros((count, x.numel())) for x in outputs]
-        if summed:
-            results[1] = np.zeros((self.nv, 10))
         a, o = ((ctypes.c_void_p * len(x))(*(y.ctypes.data for y in x)) for x in (held, results))
 
         def call(held: list[np.ndarray] = held) -> list[np.ndarray]:  # which keeps the inputs alive
@@ -80,22 +71,13 @@ class CasadiLoops:
         return call
 
     def _expressions(self, quantity: str) -> tuple[list, list]:
-        q, v, tau, w = (ca.SX.sym(name, self.nv) for name in ("q", "v", "tau", "w"))
-        standard = ca.SX.sym("standard", 10, self.nv)
-        known = ca.SX(ca.sparsify(ca.DM(self.standard.T)))
-        parameters = standard if quantity == "inertial_gradient" else known
-        M, bias = self._mass_matrix(q, parameters), self._inverse_dynamics(q, v, None, parameters)
+        q, v, tau = (ca.SX.sym(name, self.nv) for name in ("q", "v", "tau"))
+        parameters = ca.SX(ca.sparsify(ca.DM(self.standard.T)))
+        M, bias = self._mass_matrix(q, parameters), self._bias(q, v, parameters)
         if quantity == "mass_bias":
             return [q, v], [ca.densify(ca.vec(M)), bias]
         D, LT, permutation = ca.ldl(M)
-        a = ca.ldl_solve(tau - bias, D, LT, permutation)
-        if quantity == "fd":
-            return [q, v, tau], [a]
-        held = ca.SX.sym("held", 2 * self.nv)
-        power = ca.dot(held[: self.nv], self._inverse_dynamics(q, v, held[self.nv :], parameters))
-        multiplier = ca.ldl_solve(w, D, LT, permutation)
-        slope = ca.substitute(-ca.gradient(power, standard), held, ca.vertcat(multiplier, a))
-        return [q, v, tau, w, standard], [a, ca.vec(slope)]
+        return [q, v, tau], [ca.ldl_solve(tau - bias, D, LT, permutation)]
 
     def _poses(self, q: Any) -> list[tuple[Any, Any]]:
         """Body axes to the parent's, and the body's origin there."""
@@ -107,14 +89,14 @@ class CasadiLoops:
             poses.append((fixed @ turn, ca.SX(ca.DM(joint.origin.astype(float)))))
         return poses
 
-    def _inverse_dynamics(self, q: Any, v: Any, a: Any, parameters: Any) -> Any:
+    def _bias(self, q: Any, v: Any, parameters: Any) -> Any:
         poses, axis, n = self._poses(q), ca.SX(ca.DM([0, 0, 1])), self.nv
         w, dw, linear = ca.SX.zeros(3), ca.SX.zeros(3), -ca.SX(ca.DM(self.unrolled.gravity.astype(float)))
         wrenches = []
         for k, (R, p) in enumerate(poses):  # a chain: the parent of each is the one before
             linear = R.T @ (linear + ca.cross(dw, p) + ca.cross(w, ca.cross(w, p)))
             w, dw = R.T @ w, R.T @ dw
-            dw = dw + ca.cross(w, axis * v[k]) + (0 if a is None else axis * a[k])
+            dw = dw + ca.cross(w, axis * v[k])
             w = w + axis * v[k]
             mass, first, inertia = _body(parameters[:, k])
             force = mass * linear + ca.cross(dw, first) + ca.cross(w, ca.cross(w, first))
@@ -123,7 +105,7 @@ class CasadiLoops:
         force, moment = ca.SX.zeros(3), ca.SX.zeros(3)
         for k in reversed(range(n)):
             force, moment = force + wrenches[k][0], moment + wrenches[k][1]
-            out[k] = moment[2] + (0 if a is None else float(self.unrolled.armature[k]) * a[k])
+            out[k] = moment[2]
             R, p = poses[k]
             force = R @ force
             moment = R @ moment + ca.cross(p, force)

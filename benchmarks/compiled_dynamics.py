@@ -2,17 +2,7 @@
 
 One process, one thread, all sides in turn, CPU seconds, medians; the robot is the KUKA iiwa, 1,000 and 10,000 random
 states. All sides are first checked to agree. CasADi's is in `benchmarks.casadi_dynamics`, and the stronger of the two.
-The Pinocchio side is a C++ loop over the states (see `benchmarks.rigid_body`),
-and for the gradient of ``sum(w * a)``, a the accelerations under given forces, with respect to the ten inertial
-parameters of each of the seven moving links, the faster of two loops that a user of Pinocchio could write. Both compute
-``a = aba(q, v, tau)`` and ``l = M^-1 w`` (`crba` and its sparse Cholesky factor); the gradient of a state is ``-Y' l``
-with Y the torque regressor at (q, v, a):
-
-* "regressor": Y from `computeJointTorqueRegressor`;
-* "bodies": without Y, from `bodyRegressor` of each body after `rnea`, times the body's twist under the joint velocities
-  l (`forwardKinematics`), which is faster.
-
-Our side goes further, to the log-Cholesky parameters, and takes the time of a forward and a backward pass of torch.
+The Pinocchio side is a C++ loop over the states (see `benchmarks.rigid_body`).
 `pin.abaInParallel` is in the table as well, with one thread and with two (wall-clock time there).
 
 "Cold" is the time to compile into an empty folder, "warm" the time in a new process from ``robot.compile(folder)`` to
@@ -42,99 +32,40 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.casadi_dynamics import QUANTITIES, CasadiLoops
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
-from forcegp.robots import Robot, physical_from_parameters
-from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.dynamics_programs import Request, trace_dynamics
+from forcegp.robots import Robot
+from forcegp.robots.compiled import CompiledRobot, trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 
-GRADIENT_SOURCE = """
-#include <pinocchio/algorithm/cholesky.hpp>
-#include <pinocchio/algorithm/kinematics.hpp>
-#include <pinocchio/algorithm/regressor.hpp>
-
-// gradient (10 bodies) of sum_i w_i . aba(q_i, v_i, tau_i) with respect to the inertial parameters of all bodies
-extern "C" void inertial_gradient(PyObject* m, PyObject* d, PyObject* o, int count, int whole, const double* q,
-                                  const double* v, const double* tau, const double* w, double* gradient) {
-  Model& model = of<Model>(m);
-  Data &data = of<Data>(d), &other = of<Data>(o);
-  const int n = model.nv;
-  Out sum(gradient, 10 * n);
-  sum.setZero();
-  for (int i = 0; i < count; i++) {
-    const Row qi = row(q, i, n), vi = row(v, i, n), ti = row(tau, i, n);
-    const Vector a = aba(model, data, In(qi), In(vi), In(ti));
-    crba(model, data, In(qi), Convention::WORLD);
-    cholesky::decompose(model, data);
-    Vector l = row(w, i, n);
-    cholesky::solve(model, data, l);
-    if (whole) {
-      sum.noalias() -= computeJointTorqueRegressor(model, data, In(qi), In(vi), In(a)).transpose() * l;
-    } else {
-      rnea(model, data, In(qi), In(vi), In(a));
-      forwardKinematics(model, other, In(qi), In(l));
-      for (int k = 1; k <= n; k++)
-        sum.segment<10>(10 * (k - 1)).noalias() -=
-            bodyRegressor(data.v[k], data.a_gf[k]).transpose() * other.v[k].toVector();
-    }
-  }
-}
-"""
-
 
 class Loops:
-    """The C++ loops over given states; results in ``M``, ``bias``, ``a`` and ``gradient``."""
+    """The C++ loops over given states; results in ``M``, ``bias`` and ``a``."""
 
-    def __init__(self, states: States, weights: np.ndarray, folder: Path) -> None:
-        library = compiled(folder, SOURCE + GRADIENT_SOURCE)
+    def __init__(self, states: States, folder: Path) -> None:
+        library = compiled(folder, SOURCE)
         count, n = states.q.shape
-        self.other = states.model.createData()
         self.M, self.bias, self.a = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
-        self.gradient = np.zeros((n, 10))
         handles = ctypes.py_object(states.model), ctypes.py_object(states.data)
-        given = states.q, states.v, states.tau, weights, self.M, self.bias, self.a, self.gradient
-        q, v, tau, w, M, bias, a, gradient = (x.ctypes.data_as(ctypes.c_void_p) for x in given)
+        given = states.q, states.v, states.tau, self.M, self.bias, self.a
+        q, v, tau, M, bias, a = (x.ctypes.data_as(ctypes.c_void_p) for x in given)
         self.mass_and_bias: list[Callable[[], object]] = [
             lambda world=world: library.mass_and_bias(*handles, count, world, q, v, M, bias) for world in (0, 1)
         ]
         self.forward: Callable[[], object] = lambda: library.forward_dynamics(*handles, count, q, v, tau, a)
-        other = ctypes.py_object(self.other)
-        self.inertial_gradient: list[Callable[[], object]] = [
-            lambda whole=whole: library.inertial_gradient(*handles, other, count, whole, q, v, tau, w, gradient)
-            for whole in (1, 0)
-        ]
 
 
 class Ours:
     """The same questions to a robot, compiled or not."""
 
-    def __init__(self, states: States, weights: np.ndarray, of: Robot | CompiledRobot) -> None:
-        self.of, self.states, self.weights = of, states, torch.tensor(weights)
-        links = states.robot.link_names[1:]
-        self.inertials = {k: p.requires_grad_() for k, p in states.robot.inertial_parameters(*links).items()}
+    def __init__(self, states: States, of: Robot | CompiledRobot) -> None:
+        self.of, self.states = of, states
 
     def mass_and_bias(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self.of.mass_matrix_and_bias(*self.states.tensors[:2])
 
     def forward(self) -> torch.Tensor:
         return self.of.forward_dynamics(*self.states.tensors)
-
-    def inertial_gradient(self) -> tuple[torch.Tensor, ...]:
-        a = self.of.forward_dynamics(*self.states.tensors, self.inertials)
-        return torch.autograd.grad(a, list(self.inertials.values()), self.weights)
-
-
-def chained(gradient: np.ndarray, inertials: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Pinocchio's gradient per body [m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz] (about the joint) to log-Cholesky ones."""
-    mass, center, inertia = physical_from_parameters(torch.stack(list(inertials.values())))
-    first = mass[:, None] * center
-    square = (first * center).sum(-1)[:, None, None] * torch.eye(3, dtype=torch.float64)
-    about_joint = inertia + square - first[:, :, None] * center[:, None]
-    rows, columns = [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]
-    physical = torch.cat([mass[:, None], first, about_joint[:, rows, columns]], dim=1)
-    total = (physical * torch.tensor(gradient)).sum()
-    return torch.stack(torch.autograd.grad(total, list(inertials.values())))
 
 
 def largest_error(ours: torch.Tensor, theirs: np.ndarray | torch.Tensor) -> float:
@@ -143,19 +74,16 @@ def largest_error(ours: torch.Tensor, theirs: np.ndarray | torch.Tensor) -> floa
     return float((ours - expected).abs().max() / expected.abs().max())
 
 
-def against_casadi(states: States, weights: np.ndarray, mine: Ours, folder: Path) -> dict[str, float]:
+def against_casadi(states: States, mine: Ours, folder: Path) -> dict[str, float]:
     """Our time over that of CasADi's C for each quantity, after a check that both agree."""
     folder.mkdir()
-    loops, count = CasadiLoops(states.robot, folder, states.q, states.v, states.tau, weights), len(weights)
+    loops, count = CasadiLoops(states.robot, folder, states.q, states.v, states.tau), len(states.q)
     mass, bias = mine.mass_and_bias()
     M, h = loops.mass_bias()
     errors = [largest_error(mass.flatten(1), M), largest_error(bias, h), largest_error(mine.forward(), loops.fd()[0])]
-    a, gradient = loops.inertial_gradient()
-    errors += [largest_error(mine.forward(), a)]
-    errors += [largest_error(torch.stack(mine.inertial_gradient()), chained(gradient, mine.inertials))]
     assert max(errors) < 1e-9, errors
     found = {}
-    pairs = zip((mine.mass_and_bias, mine.forward, mine.inertial_gradient), QUANTITIES, strict=True)
+    pairs = zip((mine.mass_and_bias, mine.forward), QUANTITIES, strict=True)
     for ours, quantity in pairs:
         own, theirs = in_turn(
             ours, getattr(loops, quantity), repetitions=20 * REPETITIONS if count < BATCH else REPETITIONS
@@ -177,7 +105,7 @@ def aba_in_parallel(states: States) -> list[float]:
 
 
 def agreement(mine: Ours, loops: Loops) -> float:
-    """Largest error of all three results."""
+    """Largest error of all results."""
     mass, bias = mine.mass_and_bias()
     errors = []
     for loop in loops.mass_and_bias:
@@ -185,10 +113,6 @@ def agreement(mine: Ours, loops: Loops) -> float:
         errors += [largest_error(mass.tril(), np.tril(loops.M)), largest_error(bias, loops.bias)]
     loops.forward()
     errors.append(largest_error(mine.forward(), loops.a))
-    gradient = torch.stack(mine.inertial_gradient())
-    for loop in loops.inertial_gradient:
-        loop()
-        errors.append(largest_error(gradient, chained(loops.gradient, mine.inertials)))
     assert max(errors) < 1e-9, errors
     return max(errors)
 
@@ -202,20 +126,16 @@ def seconds(function: Callable[[], object]) -> float:
 def cold(robot: Robot, folder: Path) -> dict[str, float]:
     """Wall-clock seconds to compile each of what is measured here, into an empty folder."""
     compiled_robot, (q, v, tau) = robot.compile(folder), torch.zeros(3, 2, robot.nv, dtype=torch.float64)
-    inertials = {k: p.requires_grad_() for k, p in robot.inertial_parameters(*robot.link_names[1:]).items()}
     return {
         "mass matrix + bias": seconds(lambda: compiled_robot.mass_matrix_and_bias(q, v)),
         "forward dynamics": seconds(lambda: compiled_robot.forward_dynamics(q, v, tau)),
-        "forward dynamics with gradient to the inertials": seconds(
-            lambda: compiled_robot.forward_dynamics(q, v, tau, inertials).sum().backward()
-        ),
     }
 
 
 def inductor() -> None:
     """Print what torch.compile makes of the unrolled forward dynamics, and how long it takes to."""
     states = States(BATCH)
-    program = trace_dynamics(UnrolledRobot(states.robot), Request("forward_dynamics"))
+    program = trace_dynamics(UnrolledRobot(states.robot), "forward_dynamics")
     graph = program.graph
 
     @torch.compile(dynamic=True, fullgraph=True)
@@ -252,7 +172,7 @@ def chain(joints: int) -> None:
         for k in range(1, joints + 1)
     ]
     robot = Robot.from_urdf_text(f"""<robot name="chain"><link name="l0"/>{"".join(parts)}</robot>""")
-    operations = trace_dynamics(UnrolledRobot(robot), Request("forward_dynamics", free_inertias=False)).operations
+    operations = trace_dynamics(UnrolledRobot(robot), "forward_dynamics").operations
     with tempfile.TemporaryDirectory() as folder:
         start = sum(os.times()[:4])  # with those of the compiler
         robot.compile(folder).prepare("forward_dynamics")
@@ -264,7 +184,6 @@ def run() -> dict[str, float]:
     """Measure and print; nothing where there is no C++ loop to compare with."""
     torch.empty(30 * 2**20, dtype=torch.uint8)  # freed at once: see benchmarks.rigid_body
     states = States(BATCH)
-    weights = np.random.default_rng(1).normal(size=states.q.shape)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         taken = cold(states.robot, folder / "dynamics")
@@ -274,28 +193,20 @@ def run() -> dict[str, float]:
         print(f"first forward dynamics of another process: {1e3 * float(fresh.stdout):.1f} ms")
         results = {
             "compiled_cold_seconds_fd": taken["forward dynamics"],
-            "compiled_cold_seconds_inertial_gradient": taken["forward dynamics with gradient to the inertials"],
             "compiled_warm_seconds_fd": float(fresh.stdout),
         }
         try:
-            loops = Loops(states, weights, folder)
+            loops = Loops(states, folder)
         except (OSError, subprocess.CalledProcessError) as error:
             why = getattr(error, "stderr", None)
             print(f"no C++ loop to compare with ({error}); {why.decode()[-500:] if why else ''}")
             return results
-        mine, eager = (Ours(states, weights, of) for of in (states.robot.compile(folder / "dynamics"), states.robot))
+        mine, eager = (Ours(states, of) for of in (states.robot.compile(folder / "dynamics"), states.robot))
         results["compiled_error_vs_pinocchio"] = agreement(mine, loops)
         rows = []
         for key, label, ours, uncompiled, theirs in (
             ("mass_bias", "mass matrix + bias", mine.mass_and_bias, eager.mass_and_bias, loops.mass_and_bias),
             ("fd", "forward dynamics", mine.forward, eager.forward, [loops.forward]),
-            (
-                "inertial_gradient",
-                f"the same with the gradient to all {10 * len(mine.inertials)} inertials",
-                mine.inertial_gradient,
-                eager.inertial_gradient,
-                loops.inertial_gradient,
-            ),
         ):
             own, *others = in_turn(ours, *theirs, repetitions=REPETITIONS)
             (slow,) = in_turn(uncompiled, repetitions=EAGER_REPETITIONS)
@@ -310,8 +221,8 @@ def run() -> dict[str, float]:
         results["compiled_fd_single_us"] = 1e6 * single
         for count in (1000, BATCH):
             fewer = States(count)
-            own = Ours(fewer, weights[:count], mine.of)
-            results |= against_casadi(fewer, weights[:count], own, folder / str(count))
+            own = Ours(fewer, mine.of)
+            results |= against_casadi(fewer, own, folder / str(count))
         parallel = aba_in_parallel(states)
     print(f"\n{f'CPU ms, medians, {BATCH} states':56s}{'compiled':>10s}{'eager':>10s}{'C++ loops':>18s}{'ratio':>8s}")
     for label, own, slow, others in rows:

@@ -14,7 +14,7 @@ import torch
 from forcegp import Dataset, KukaSurfaceConfig, Model, Robot, fit, simulate_kuka_surface
 from forcegp.forces import Unknown
 from forcegp.mechanics import surface_axes
-from forcegp.robots import parameters_from_physical
+from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 
 NOISE = 0.1
 """rad/s^2"""
@@ -61,7 +61,7 @@ def slow_motions(mass: float, place: torch.Tensor) -> Dataset:
     """
     known = recording(1).model
     assert known is not None
-    carrying = known.robot.with_inertials({TOOL: _with_body(known.robot, mass, place)})
+    carrying = _with_body(known.robot, mass, place)
     rng = np.random.default_rng(3)
     q = np.deg2rad((85, 50, -10, -100, -170, -25, -100)) + rng.uniform(-0.8, 0.8, (300, 7))
     v, a = 0.1 * rng.standard_normal((2, 300, 7))
@@ -121,19 +121,12 @@ def _dataset(
     )
 
 
-def _with_body(robot: Robot, mass: float, place: torch.Tensor) -> torch.Tensor:
-    """Inertial parameters of link 7 with a point mass fixed to it."""
+def _with_body(robot: Robot, mass: float, place: torch.Tensor) -> Robot:
+    """The robot with a point mass fixed to link 7."""
     link = robot.link(TOOL)
-    own, center, inertia = (torch.tensor(x, dtype=F64) for x in (link.mass, link.center_of_mass, link.inertia))
-    together = own + mass
-    middle = (own * center + mass * place) / together
-
-    def shifted(m: torch.Tensor | float, d: torch.Tensor) -> torch.Tensor:
-        return m * (d.square().sum() * torch.eye(3, dtype=F64) - torch.outer(d, d))
-
-    return parameters_from_physical(
-        together, middle, inertia + shifted(own, center - middle) + shifted(mass, place - middle)
-    )
+    together = pseudo_inertia(link.mass, np.array(link.center_of_mass), np.array(link.inertia))
+    together = together + pseudo_inertia(mass, place.numpy(), np.zeros((3, 3)))
+    return robot.with_link(TOOL, *physical_of_pseudo_inertia(together))
 
 
 TURNTABLE = """<robot name="turntable"><link name="base"/><joint name="turn" type="continuous"><parent link="base"/>

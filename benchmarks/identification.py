@@ -13,13 +13,13 @@ import argparse
 import time
 import warnings
 
+import numpy as np
 import torch
 
 from forcegp import KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.errors import NumericalWarning
 from forcegp.forces import Body, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
-from forcegp.robots import parameters_from_physical
 from forcegp.simulation.kuka_motion import TOOL_LINK
 
 F64 = torch.float64
@@ -45,11 +45,9 @@ def main() -> None:
         data = simulate_kuka_surface(KukaSurfaceConfig(seconds=100, seed=seed))
         assert data.model is not None
         link = data.model.robot.link(TOOL_LINK)
-        mass, center, inertia = (torch.tensor(x, dtype=F64) for x in (link.mass, link.center_of_mass, link.inertia))
         off = float(given.start == "wrong")
-        center_off = off * torch.tensor(TOO_FAR, dtype=F64)
-        wrong = parameters_from_physical(mass + off * TOO_HEAVY, center + center_off, inertia)
-        robot = data.model.robot.with_inertials({TOOL_LINK: wrong})
+        center = np.array(link.center_of_mass) + off * np.array(TOO_FAR)
+        robot = data.model.robot.with_link(TOOL_LINK, link.mass + off * TOO_HEAVY, center, link.inertia)
         begin = time.process_time()
         body = RigidBodies({TOOL_LINK: Body(0.01, ("mass", "center_of_mass"))})
         model = data.model.with_robot(robot).with_forces(JointForces(), body)
@@ -65,7 +63,9 @@ def main() -> None:
         assert found is not None
         standard = torch.tensor(list(found.standard_errors.values()), dtype=F64)
         known = time.process_time()
-        error = torch.tensor(list(found.values.values()), dtype=F64) - torch.cat([mass[None], center])
+        error = torch.tensor(list(found.values.values()), dtype=F64) - torch.tensor(
+            [link.mass, *link.center_of_mass], dtype=F64
+        )
         known_at_all = torch.isfinite(standard)
         covered = covered + (known_at_all & ((error / standard).abs() <= 1.96))
         count = count + known_at_all

@@ -23,7 +23,7 @@ from forcegp.data import Dataset
 from forcegp.evaluation import evaluate
 from forcegp.forces import parse_forces
 from forcegp.inference.pathwise import draw_functions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.simulation import simulate_kuka_surface
 
 SECONDS = 60.0
@@ -35,7 +35,7 @@ def recording(seed: int) -> Dataset:
     return simulate_kuka_surface(KukaSurfaceConfig(seconds=SECONDS, seed=seed))
 
 
-def drawn_below(posterior: StructuredPosterior) -> float:
+def drawn_below(posterior: Posterior) -> float:
     """Share of the functions drawn from the posterior as fitted of which less than 90 % lie in its 95 % intervals."""
     training = posterior.training
     with torch.no_grad():

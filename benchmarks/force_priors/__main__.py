@@ -9,7 +9,6 @@ from pathlib import Path
 from benchmarks.force_priors.presets import PAGE, PRESETS
 from benchmarks.paper.reproduction import ALL, experiments_of, reproduce
 from forcegp.errors import ForceGPError
-from forcegp.parallel import Joblib
 
 
 def main(words: list[str]) -> int:
@@ -30,9 +29,7 @@ def main(words: list[str]) -> int:
         kept = {"--preset": () if given.preset == "forces" else (given.preset,), "--points": given.points}
         options = (str(part) for name, values in kept.items() if values for part in (name, *values))
         command = " ".join([PAGE.program, *([] if given.experiment == ALL else [given.experiment]), *options])
-        reproduce(
-            experiments, given.preset, out, command=command, page=PAGE, docs=given.docs, backend=Joblib(given.jobs)
-        )
+        reproduce(experiments, given.preset, out, command=command, page=PAGE, docs=given.docs, jobs=given.jobs)
     except ForceGPError as error:
         print(f"{PAGE.program}: {error}", file=sys.stderr)
         return 2

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
 from benchmarks.paper.data import scored_rows, training_rows
 from forcegp.evaluation import evaluate
@@ -15,7 +15,6 @@ from forcegp.forces import Body, JointForces, RigidBodies, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.model import Model
-from forcegp.robots import parameters_from_physical, physical_from_parameters
 from forcegp.simulation.kuka_motion import TOOL_LINK
 
 MODELS = {"s-gp": "S-GP + analytical mean", "s-gp-tool": "the same, tool friction"}
@@ -50,9 +49,6 @@ def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
 
 def wrong_model(model: Model) -> Model:
     """The same with a tool that is too heavy and has its centre of mass elsewhere; its inertia stays."""
-    robot = model.robot
-    mass, center, inertia = physical_from_parameters(robot.inertial_parameters(TOOL_LINK)[TOOL_LINK])
-    moved = center + torch.tensor(CENTER_OFFSET, dtype=center.dtype)
-    return model.with_robot(
-        robot.with_inertials({TOOL_LINK: parameters_from_physical(mass + MASS_OFFSET, moved, inertia)})
-    )
+    link = model.robot.link(TOOL_LINK)
+    moved = np.array(link.center_of_mass) + np.array(CENTER_OFFSET)
+    return model.with_robot(model.robot.with_link(TOOL_LINK, link.mass + MASS_OFFSET, moved, link.inertia))

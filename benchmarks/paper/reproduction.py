@@ -20,7 +20,7 @@ from forcegp.evaluation import save_figure
 from forcegp.evaluation.metrics import markdown_table
 from forcegp.evaluation.pages import alike
 from forcegp.jobs import JobStore, Progress, run_jobs
-from forcegp.parallel import Backend
+from forcegp.parallel import Jobs
 
 PAPER_DATA = DataSettings(train_seconds=200.0, rows=10_000, test_seconds=100.0, every=12)
 SMOKE_DATA = DataSettings(train_seconds=10.0, rows=400, test_seconds=12.0, every=12)
@@ -145,7 +145,7 @@ def reproduce(
     command: str,
     page: Page = PAPER_PAGE,
     docs: Path | None = None,
-    backend: Backend | None = None,
+    jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
@@ -165,8 +165,8 @@ def reproduce(
             require_writable(folder / "trial")
         except OSError as error:
             raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
-    jobs = {job.name: job for experiment in experiments for job in experiment.jobs()}
-    run_jobs(results, list(jobs.values()), backend, progress)
+    pieces = {job.name: job for experiment in experiments for job in experiment.jobs()}
+    run_jobs(results, list(pieces.values()), jobs, progress)
     documents, pictures = {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)

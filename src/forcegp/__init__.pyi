@@ -78,8 +78,6 @@ from .control import Excitation as Excitation
 # how and where it is computed
 from .inference import Exact as Exact
 from .inference import Inducing as Inducing
-from .parallel import Serial as Serial
-from .parallel import Joblib as Joblib
 
 # how good it is
 from .evaluation import evaluate as evaluate

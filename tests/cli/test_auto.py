@@ -89,6 +89,7 @@ def test_the_answer_holds_what_was_simulated(answered):
     assert 8 <= len(content["answer"]) <= 11
 
 
+@pytest.mark.nightly
 def test_a_second_run_takes_what_is_finished(folder, answered, forcegp):
     command, content = answered
     jobs = folder / "answer" / "validation" / "jobs"

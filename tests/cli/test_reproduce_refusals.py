@@ -14,7 +14,7 @@ REFUSALS = [
     ("fig9", "no figure 'fig9'"),
     ("fig2b --preset huge", "no preset 'huge'"),
     ("fig2b --jobs -1", "jobs is -1; give the number of tasks at once, at least 1"),
-    ("fig2b --backend dask", "no backend 'dask'; choose serial, joblib"),
+    ("fig2b --jobs 0", "jobs is 0; give the number of tasks at once"),
     ("fig2b --preset smoke --points 500", "its data have 400 rows, so give 2 to 400"),
     ("fig2b --preset smoke --points 1", "asked for 1 training points"),
     ("fig2b --seed-list -3", "--seed-list"),
@@ -28,6 +28,7 @@ def test_it_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capfd, words, 
     assert_refused(f"reproduce {words} --out new", message, tmp_path, capfd)
 
 
+@pytest.mark.nightly
 def test_a_package_without_its_repository_names_what_to_clone_and_takes_that_of_the_current_folder(
     tmp_path, repository
 ):

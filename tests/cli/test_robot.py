@@ -63,14 +63,6 @@ def test_one_error_and_its_options_take_the_file(forcegp, file):
     assert repaired in taken.stderr.replace("\n", " ")
 
 
-def test_strict_refuses_what_is_ignored_otherwise(forcegp, file):
-    file.write_text(CHAIN.replace('velocity="4"', 'velocity="-4"'))
-    assert "warning: " in forcegp("robot", file).stderr
-    refused = forcegp("robot", file, "--strict")
-    assert refused.returncode == 2
-    assert "joint 'skew' has <limit> velocity=-4" in refused.stderr
-
-
 def test_the_picture_is_a_png_that_is_not_overwritten(forcegp, file):
     pytest.importorskip("trimesh")
     out = file.with_suffix(".png")

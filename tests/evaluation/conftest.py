@@ -7,7 +7,7 @@ from forcegp.data import Dataset
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 
 @pytest.fixture(scope="session")
@@ -21,12 +21,12 @@ def test_data() -> Dataset:
 
 
 @pytest.fixture(scope="session")
-def posterior(train) -> StructuredPosterior:
+def posterior(train) -> Posterior:
     return fit(arm_model().with_forces(JointForces()), train, restarts=1, options=OptimizerOptions(iterations=30))
 
 
 @pytest.fixture(scope="session")
-def without_mean(train) -> StructuredPosterior:
+def without_mean(train) -> Posterior:
     return fit(
         arm_model().with_forces(JointForces()).without_mean(),
         train,
@@ -36,6 +36,6 @@ def without_mean(train) -> StructuredPosterior:
 
 
 @pytest.fixture(scope="session")
-def without_contact(train) -> StructuredPosterior:
+def without_contact(train) -> Posterior:
     model = arm_model(contacts=0).with_forces(JointForces())
     return fit(model, train, restarts=1, options=OptimizerOptions(iterations=3))

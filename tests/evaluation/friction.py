@@ -12,7 +12,7 @@ from forcegp.forces import Unknown
 from forcegp.forces.tool_forces import ToolPoint
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 VISCOUS = 2.0
 """N/(m/s) at the tool."""
@@ -51,7 +51,7 @@ def friction_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     return dataclasses.replace(data, a=a + noise, truth=truth)
 
 
-def fitted(*forces: Unknown, points: int = 40, iterations: int = 60, mean: bool = True) -> StructuredPosterior:
+def fitted(*forces: Unknown, points: int = 40, iterations: int = 60, mean: bool = True) -> Posterior:
     """A model of that arm with these forces, with known forces as their mean or without."""
     data, model = friction_data(points, seed=0), arm_model().with_forces(*forces)
     options = OptimizerOptions(iterations=iterations)

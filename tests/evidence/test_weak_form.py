@@ -26,7 +26,7 @@ from forcegp.data import Dataset
 from forcegp.errors import FileFormatError, InvalidInput, NotEnoughMemory
 from forcegp.evidence import MarginalLikelihood, TrainingData
 from forcegp.inference import FunctionalPosterior, OptimizerOptions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.robots import Robot
 
 HOW = Windows(0.1, nodes=8)
@@ -38,7 +38,7 @@ def with_true_accelerations(dataset: Dataset) -> Dataset:
 
 
 @cache
-def fitted() -> StructuredPosterior:
+def fitted() -> Posterior:
     data = motion()
     return fit(data.model.with_forces(JointFriction()), data, HOW, **FIT)
 

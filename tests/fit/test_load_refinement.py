@@ -17,7 +17,6 @@ from forcegp.fit.refinement import SETTLED, fit_with_refined_loads
 from forcegp.forces import ContactFriction, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
-from forcegp.parallel import Serial
 from forcegp.posterior import load_posterior, save_posterior
 
 COULOMB, SLOWLY = 0.35, 0.1  # coefficient, and the speed (m/s) below which it falls to zero
@@ -64,7 +63,7 @@ def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
 
 def first_fit(model: Model, data: Dataset):
     """The fit under the nominal normal force, which `fit` does not stop at."""
-    search = Search(Serial(), restarts=1, seed=0, hyperprior=True, options=OPTIONS, start=None, progress=None)
+    search = Search(1, restarts=1, seed=0, hyperprior=True, options=OPTIONS, start=None, progress=None)
     return _Functions(model, search, "exact", None)._search(data, data)
 
 

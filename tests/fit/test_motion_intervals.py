@@ -87,9 +87,6 @@ def test_recordings_that_cannot_teach_it_are_refused(log):
         with_intervals(plain, log, (9.0,))
     with pytest.raises(InvalidInput, match="horizons are"):
         with_intervals(plain, log, (0.0,))
-    black_box = fit(slide(3.0, 4.0).black_box(), log, points=20, restarts=1)
-    with pytest.raises(InvalidInput, match="take a "):
-        with_intervals(black_box, log)
     swapped = replace(log.rows(np.arange(len(log))[::-1]), model=log.model)
     with pytest.raises(InvalidInput, match="not in the order of time"):
         with_intervals(plain, swapped, HORIZONS)
@@ -102,6 +99,7 @@ def floating():
     return fit(log.model, log, points=40, restarts=1), log
 
 
+@pytest.mark.nightly
 def test_where_the_base_moves_they_hold_as_steps(floating):
     fitted, log = floating
     calibrated = with_intervals(fitted, log, HORIZONS)

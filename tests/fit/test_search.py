@@ -1,4 +1,4 @@
-"""Several starts of one search: when they end, which are dropped, and that this is the same on every backend."""
+"""Several starts of one search: when they end, which are dropped; the same in any number of processes."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,6 @@ from forcegp.fit.search import AT_ONCE, best_value, run_restarts
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions, minimize_objective
 from forcegp.model import Model
-from forcegp.parallel import Joblib, Serial
 
 UNTIL_CONVERGED = OptimizerOptions(memory=20)
 """The search as it was: few steps remembered, and all starts to the end."""
@@ -46,7 +45,7 @@ def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
 
 def test_starts_behind_those_before_are_dropped_and_say_so():
     options = OptimizerOptions(patience=5)
-    found = run_restarts(lambda index, **how: from_place(index, **how, options=options), 5, 5, Serial(), None)
+    found = run_restarts(lambda index, **how: from_place(index, **how, options=options), 5, 5, 1, None)
     assert [each.status.startswith("dropped: 5 iterations") for each in found] == [False, False, True, False, True]
     alone = from_place(2, options=options)
     assert alone.converged
@@ -68,17 +67,18 @@ def test_a_fit_reports_the_end_of_every_start(train):
     assert all(value > posterior.result.value for value, drop in zip(values, dropped, strict=True) if drop)
 
 
-def test_who_is_compared_with_whom_does_not_depend_on_the_backend_or_the_number_of_starts():
+def test_who_is_compared_with_whom_does_not_depend_on_the_processes_or_the_number_of_starts():
     def seen(index, before, progress):
         return index, list(before)
 
-    serial = run_restarts(seen, 5, 100, Serial(), None)
+    serial = run_restarts(seen, 5, 100, 1, None)
     assert [len(before) for _, before in serial] == [0, 0, 2, 2, 4]
-    assert serial == run_restarts(seen, 5, 100, Joblib(2), None)
-    assert serial[:3] == run_restarts(seen, 3, 100, Serial(), None)
-    assert all(before == [] for _, before in run_restarts(seen, 5, 0, Serial(), None))
+    assert serial == run_restarts(seen, 5, 100, 2, None)
+    assert serial[:3] == run_restarts(seen, 3, 100, 1, None)
+    assert all(before == [] for _, before in run_restarts(seen, 5, 0, 1, None))
 
 
+@pytest.mark.nightly
 def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
     how = {"points": 15, "restarts": 4, "seed": 3, "options": OptimizerOptions(iterations=25, patience=2)}
     one, two = (fit(train.model.with_forces(JointForces()), train, jobs=jobs, **how) for jobs in (1, 2))

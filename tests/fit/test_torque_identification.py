@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
+from tests.robots.robot_models import loaded
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, InvalidInput, RobotFileWarning
@@ -64,9 +65,7 @@ def recorded(rows: int, seed: int, noise: float = 0.0, torque_noise: float = 0.0
 def given() -> Model:
     """A URDF that is wrong about every mass and knows no friction."""
     model = arm_model(0)
-    parameters = model.robot.inertial_parameters("upper", "fore", "hand")
-    wrong = {name: value + 0.1 * torch.sin(torch.arange(10.0).double()) for name, value in parameters.items()}
-    return model.with_robot(model.robot.with_inertials(wrong))
+    return model.with_robot(loaded(model.robot, "upper", "fore", "hand", mass=0.05))
 
 
 @pytest.mark.parametrize("evidence", [Torques(), Torques("both"), Accelerations()], ids=str)

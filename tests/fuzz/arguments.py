@@ -301,14 +301,14 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         _robot_from,
         lambda: {
             **{"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None},
-            **{"inertias": "strict", "base": None, "root": None, "strict": False},
+            **{"inertias": "strict", "base": None, "root": None},
         },
     ),
     "Robot.from_mjcf_text": (
         lambda **k: repr(forcegp.Robot.from_mjcf_text(**k)),
         lambda: {
             **{"text": FOUR_BAR, "gravity": None, "armature": None, "locked": None, "inertias": "strict"},
-            **{"base": None, "strict": False},
+            "base": None,
         },
     ),
     "Model.from_file": (
@@ -466,7 +466,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ComputedTorque": (
         functools.partial(_control, forcegp.ComputedTorque, lambda: arm_model(0)),
-        lambda: {**TRACKING, "forces_at": "desired", "gain_factor": None, "on_failure": "raise"},
+        lambda: {**TRACKING, "forces_at": "desired", "on_failure": "raise"},
     ),
     "PDGravity": (functools.partial(_control, forcegp.PDGravity, _robot), lambda: {**TRACKING, "on_failure": "hold"}),
     "ContactMonitor": (
@@ -539,10 +539,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "noise": 0.1,
             "surface": "plane",
             "friction": None,
-            "tool_point": (0.0, 0.0, 0.1),
-            "patch_x": (0.0, 0.25),
-            "press": None,
-            "null_space_joints": (2,),
+            "patch_factor": 1.0,
         },
     ),
     "Windows": (forcegp.Windows, lambda: {"seconds": 0.1, "nodes": 6, "signal": "q", "order": 2}),

@@ -213,7 +213,7 @@ WRONG = {
     "ColumnMapping ": {"unit": 5},
     "ImportOptions": {"gap": "x"},
     "ImportOptions ": {"most_rows": None},
-    "KukaSurfaceConfig": {"null_space_joints": None},
+    "KukaSurfaceConfig": {"patch_factor": None},
     "Windows": {"signal": np.ones(3)},
     "JointFriction": {"joints": torch.tensor(5.0)},
 }

@@ -47,17 +47,15 @@ def test_a_tumbling_body_in_free_fall_keeps_energy_and_momentum():
     torch.testing.assert_close(torch.linalg.vector_norm(turn, dim=-1), torch.ones(1).double())
 
 
-@pytest.mark.parametrize(("name", "order"), [("symplectic-euler", 1), ("implicit-midpoint", 2), ("rk4", 4)])
 @pytest.mark.parametrize("base", ["floating", "planar", "spherical"])
-def test_steps_have_their_order_on_the_manifold(name, order, base):
+def test_steps_have_their_order_on_the_manifold(base):
     robot = Robot.from_urdf_text(LIMBS, base=base)
-    seconds, coarse = 0.16, 0.02
-    reference = moved(robot, "rk4", coarse / 32, seconds, 0.5)
-    errors = []
-    for dt in (coarse, coarse / 2):
-        end = moved(robot, name, dt, seconds, 0.5)
-        errors.append(float(robot.difference(reference.q[-1], end.q[-1]).norm()))
-    assert errors[1] < errors[0] / 2 ** (order - 0.4)
+    seconds, coarse = 0.08, 0.02
+    reference = moved(robot, "rk4", coarse / 16, seconds, 0.5)
+    for name, order in (("symplectic-euler", 1), ("implicit-midpoint", 2), ("rk4", 4)):
+        ends = [moved(robot, name, dt, seconds, 0.5).q[-1] for dt in (coarse, coarse / 2)]
+        errors = [float(robot.difference(reference.q[-1], end).norm()) for end in ends]
+        assert errors[1] < errors[0] / 2 ** (order - 0.4), name
 
 
 def test_a_motion_that_is_lost_has_no_distance_from_its_contacts_and_no_error():

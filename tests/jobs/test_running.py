@@ -11,7 +11,6 @@ import pytest
 
 from forcegp.errors import BackendError, FitError, OutdatedWarning
 from forcegp.jobs import Job, JobStore, digests, run_jobs
-from forcegp.parallel import Joblib, Serial
 
 TOY = "tests.jobs.toy_tasks"
 
@@ -32,7 +31,7 @@ def results(tmp_path):
 def test_all_jobs_are_computed_once_and_in_order(results):
     jobs = [next_to(square(3)), square(3), square(4)]
     told = []
-    assert run_jobs(results, jobs, backend=Joblib(2), progress=lambda *given: told.append(given)) == 3
+    assert run_jobs(results, jobs, at_once=2, progress=lambda *given: told.append(given)) == 3
     assert results.result("next/3")["value"] == 10
     assert results.result("square/4")["value"] == 16
     assert (results.place("square/4") / "note.txt").read_text() == "beside the result"
@@ -56,37 +55,31 @@ def test_a_failure_stops_only_what_needs_it(results):
 @pytest.mark.parametrize(("task", "cause"), [("break_down", "ZeroDivisionError"), ("not_a_number", "ValueError")])
 def test_a_defect_in_one_job_does_not_cost_the_others(results, task, cause):
     with pytest.raises(FitError, match=rf"bad failed \({cause}: .*1 of 2 jobs are kept"):
-        run_jobs(results, [Job("bad", f"{TOY}:{task}", {}), square(2)], backend=Joblib(2))
+        run_jobs(results, [Job("bad", f"{TOY}:{task}", {}), square(2)], 2)
     assert results.result("square/2")["value"] == 4
     assert not results.place("bad").exists()
 
 
 def test_on_a_full_disk_nothing_more_is_begun(results):
     with pytest.raises(FitError, match=r"full failed, 2 .* left out \(.*No space left on device\); 0 of 3 jobs"):
-        run_jobs(results, [Job("full", f"{TOY}:fill_the_disk", {}), square(2), square(3)], Serial())
-    assert run_jobs(results, [square(2), square(3)], Serial()) == 2
+        run_jobs(results, [Job("full", f"{TOY}:fill_the_disk", {}), square(2), square(3)])
+    assert run_jobs(results, [square(2), square(3)]) == 2
 
 
 def test_a_disk_that_is_full_is_noticed_before_the_first_job(results, limited_file_size):
     with limited_file_size(1000), pytest.raises(OSError, match="File too large"):
-        run_jobs(results, [square(2)], Serial())
+        run_jobs(results, [square(2)])
     assert not list(results.folder.rglob(".*.tmp"))
 
 
 def test_a_process_that_dies_is_reported_and_what_was_done_is_kept(results, tmp_path):
     dead = Job("dead", f"{TOY}:die_once", {"marker": str(tmp_path / "marker")}, ("square/2",))
     with pytest.raises(BackendError, match=r"processes broke off.*1 of 2 jobs are kept, so the same command goes on"):
-        run_jobs(results, [square(2), dead])
+        run_jobs(results, [square(2), dead], 2)
     assert results.result("square/2")["value"] == 4
     assert run_jobs(results, [square(2), dead]) == 1
     assert results.result("dead") == {"survived": True}
     assert not list((tmp_path / "out").glob("**/*.tmp"))
-
-
-def test_this_process_can_do_it_all(results):
-    assert run_jobs(results, [next_to(square(3)), square(3)], Serial()) == 2
-    assert results.result("next/3")["value"] == 10
-    assert results.result("square/3")["process"] == os.getpid()
 
 
 def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence(results):
@@ -111,10 +104,10 @@ def test_other_code_is_seen_and_computed_anew_with_one_sentence(results, monkeyp
 
 def test_arguments_reach_the_task_wherever_it_runs(results):
     shared = {"factor": 3}
-    for number, backend in enumerate((Serial(), Joblib(2))):
+    for number, at_once in enumerate((1, 2)):
         job = Job(f"times/{number}", f"{TOY}:times", {"number": 5}, arguments=(shared, 2))
         after = Job(f"after/{number}", f"{TOY}:square", {"before": job.name}, (job.name,))
-        assert run_jobs(results, [after, job], backend) == 2
+        assert run_jobs(results, [after, job], at_once) == 2
         assert results.result(job.name)["value"] == 5 * 3 * 2
         assert results.result(after.name)["value"] == 31
 
@@ -132,7 +125,7 @@ def test_kill_9_loses_only_the_job_at_work_and_leaves_no_process(tmp_path):
         "from tests.jobs.test_running import *\n"
         "if __name__ == '__main__':\n"
         f"    slow = Job('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
-        f"    run_jobs(JobStore.open(Path({str(tmp_path / 'out')!r}), 'a test', {{}}), [square(2), slow])\n"
+        f"    run_jobs(JobStore.open(Path({str(tmp_path / 'out')!r}), 'a test', {{}}), [square(2), slow], 2)\n"
     )
     (tmp_path / "script.py").write_text(script)
     paths = [str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]

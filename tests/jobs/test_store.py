@@ -42,11 +42,6 @@ def test_a_job_that_fails_leaves_nothing(results):
     assert [entry.name for entry in (results.folder / "jobs" / "fits").iterdir()] == []
 
 
-def test_a_job_of_another_digest_is_not_the_same(results):
-    store(results, "a", "10", {})
-    assert not results.has("a", "11")
-
-
 @pytest.mark.parametrize("content", ["", '{"spec": {}', '{"spec": {}}', "[1]"])
 def test_a_half_written_job_is_named_and_kept(results, content):
     store(results, "a", "1", {})

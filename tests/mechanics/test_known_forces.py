@@ -2,8 +2,6 @@
 
 import json
 import math
-from dataclasses import FrozenInstanceError, dataclass, fields
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -28,7 +26,6 @@ from forcegp.forces import (
     Viscous,
 )
 from forcegp.forces.force import JointLaw
-from forcegp.forces.parameters import Coefficient
 from forcegp.forces.registry import FORCES, force_class, force_from_dict, force_to_dict
 from forcegp.mechanics import State
 from forcegp.model import Model
@@ -85,14 +82,6 @@ def test_each_against_its_formula(make_and_formula):
     assert_close(make().bound_to(chain()).force(State.of(chain(), q, v, u)), expected, 1e-10)
 
 
-def test_none_can_be_changed():
-    numbers = [(force, field.name) for force in (make() for make, _ in FORMULAS.values()) for field in fields(force)]
-    assert len({type(force) for force, _ in numbers}) == len(FORMULAS)
-    for force, name in numbers:
-        with pytest.raises(FrozenInstanceError):
-            setattr(force, name, 0.0)
-
-
 def test_the_sum_is_what_is_listed_and_nothing_else():
     q, v, u = states(4, 6)
     parts = [make() for make, _ in FORMULAS.values()]
@@ -116,24 +105,6 @@ def test_the_numbers_of_the_urdf(model):
     assert_close(Model(built, forces=laws).dynamics(q, v, u).Q_K, expected, 1e-14)
 
 
-def test_friction_never_drives():
-    q, v, u = states(4, 50)
-    for force in (Viscous(NUMBERS), Coulomb(NUMBERS)):
-        assert float((known(force).dynamics(q, v, u).Q_K * v).max()) <= 0.0
-
-
-def test_friction_by_load_alone_is_none_without_load():
-    q, v, u = states(4, 5)
-    friction = known(LoadFriction(0.0, NUMBERS))  # w = 0.01, if nothing else is said
-    assert_close(friction.dynamics(q, v, u).Q_K, -TENSOR * u.abs() * (v / 0.01).tanh(), 1e-12)
-
-
-def test_dry_friction_saturates_at_its_coefficient():
-    q, v, u = states(4, 50)
-    friction = known(Coulomb(NUMBERS, 1e-9)).dynamics(q, v, u).Q_K
-    assert_close(friction, -TENSOR * v.sign(), 1e-12)
-
-
 # ---------------------------------------------------------------- armature
 
 
@@ -148,14 +119,6 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
     assert_close(dynamics.acceleration(nothing), torch.linalg.solve(plain.M + added, plain.Q_K), 1e-10)
 
 
-def test_armature_as_a_known_force_equals_armature_of_the_robot():
-    q, v, u = states(4, 5)
-    nothing = torch.zeros_like(u)
-    one = Model(chain().with_armature(NUMBERS), forces=(Actuation(), RigidBodies())).dynamics(q, v, u)
-    other = known(Actuation(), RigidBodies(), Rotor(NUMBERS)).dynamics(q, v, u)
-    assert_close(one.acceleration(nothing), other.acceleration(nothing), 1e-10)
-
-
 def test_rotors_that_a_moving_link_carries():
     """The kinetic energy of two rotors: the first sits in the base, the second turns with the first link, too."""
     ratio, rotor = 6.0, [1e-3, 2e-3, 0.0, 0.0]
@@ -168,14 +131,6 @@ def test_rotors_that_a_moving_link_carries():
     assert_close(added, Model(chain()).dynamics(q, v, u).M + M, 1e-13)
     one_each = CoupledRotors(NUMBERS).bound_to(chain()).added_inertia(chain())
     assert_close(one_each, Rotor(NUMBERS).bound_to(chain()).added_inertia(chain()), 1e-14)
-
-
-def test_dry_friction_falls_from_breakaway_to_its_level():
-    slow, fast = torch.full((1, 4), 1e-4, dtype=torch.float64), torch.full((1, 4), 5.0, dtype=torch.float64)
-    nothing = torch.zeros_like(slow)
-    friction = known(Stribeck(1.0, 2.0, 0.1, 1e-6))
-    assert_close(friction.dynamics(nothing, slow, nothing).Q_K, torch.full((1, 4), -3.0).double(), 1e-4)
-    assert_close(friction.dynamics(nothing, fast, nothing).Q_K, torch.full((1, 4), -1.0).double(), 1e-12)
 
 
 # ---------------------------------------------------------------- one number per joint
@@ -288,28 +243,6 @@ def test_damaged_forces_are_refused(stored):
 
 
 # ---------------------------------------------------------------- a law of the user
-
-
-@dataclass(frozen=True, eq=False)
-class Sinking(JointLaw):
-    """As the documentation promises: one subclass with features and an amplitude."""
-
-    stiffness: float | list[float] | None = None
-    coefficients: ClassVar[dict[str, Coefficient]] = {"stiffness": Coefficient("force/position")}
-
-    def features(self, state: State) -> tuple[torch.Tensor, ...]:
-        return (state.positions,)
-
-    def amplitude(self, features, parameters) -> torch.Tensor:
-        return -parameters["stiffness"] * features[0] ** 3
-
-
-def test_a_law_of_the_user():
-    q, v, u = states(4, 3)
-    assert_close(known(Sinking(2.0)).dynamics(q, v, u).Q_K, -2.0 * q**3, 1e-14)
-    assert_close(known(Sinking(NUMBERS)).dynamics(q, v, u).Q_K, -TENSOR * q**3, 1e-14)
-    with pytest.raises(InvalidInput, match="a Sinking cannot be stored: register it first"):
-        known(Sinking(2.0)).to_json()
 
 
 def test_numbers_are_copied():

@@ -1,4 +1,4 @@
-"""Tasks that tell where and how they ran, or end their own process, for tests of the backends."""
+"""Tasks that tell where and how they ran, wait, or end their own process."""
 
 import os
 import signal
@@ -15,8 +15,23 @@ def seeded_sum(seed):
 
 def slow_first(index):
     """The first argument ends last."""
-    time.sleep(0.5 if index == 0 else 0.0)
+    time.sleep(0.2 if index == 0 else 0.0)
     return index
+
+
+def wait_for_the_gate(gate, index):
+    for _ in range(12_000):
+        if index == 0 or gate.exists():
+            return index
+        time.sleep(0.05)
+    return "the gate stayed shut"
+
+
+def sleep_long(file):
+    """An hour; the file names the process."""
+    if file is not None:
+        Path(file).write_text(str(os.getpid()))
+        time.sleep(3600)
 
 
 def process(_):

@@ -3,8 +3,9 @@
 import pytest
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import JointForces, JointFriction, Viscous, fit
+from forcegp import JointForces, JointFriction, Viscous, evaluate, fit
 from forcegp.inference import OptimizerOptions
+from forcegp.report import evaluation_sentence, evaluation_table, model_page
 from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
@@ -26,3 +27,11 @@ def friction(swinging):
 @pytest.fixture(scope="session")
 def on_plane():
     return fit(arm_model().with_forces(JointForces()), arm_data(20, seed=0), restarts=1, options=QUICK)
+
+
+@pytest.fixture(scope="session")
+def page(swinging, friction):
+    """A page about the pendulum."""
+    evaluation = evaluate(friction, swinging)
+    best = evaluation_sentence(evaluation, "rad/s²")
+    return model_page(friction, swinging, title="pendulum", best=best, tables=[evaluation_table(evaluation)])

@@ -35,13 +35,9 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory, swinging, friction):
-    from forcegp import evaluate
-    from forcegp.report import evaluation_sentence, evaluation_table, model_page, write_page
+def report(tmp_path_factory, page):
+    from forcegp.report import write_page
 
-    evaluation = evaluate(friction, swinging)
-    best = evaluation_sentence(evaluation, "rad/s²")
-    page = model_page(friction, swinging, title="A pendulum", best=best, tables=[evaluation_table(evaluation)])
     path = tmp_path_factory.mktemp("browser") / "report.html"
     write_page(path, page)
     return path

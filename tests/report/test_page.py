@@ -17,24 +17,15 @@ from forcegp.report import (
     Page,
     Table,
     evaluation_sentence,
-    evaluation_table,
     is_page,
     model_page,
     recorded_scene,
     serve,
     write_page,
-    write_rerun,
 )
 
 
-@pytest.fixture(scope="module")
-def page(swinging, friction):
-    evaluation = evaluate(friction, swinging)
-    best = evaluation_sentence(evaluation, "rad/s²")
-    return model_page(friction, swinging, title="pendulum", best=best, tables=[evaluation_table(evaluation)])
-
-
-def test_a_page_needs_no_network_and_is_small(page, tmp_path):
+def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
     write_page(tmp_path / "report.html", page)
     text = (tmp_path / "report.html").read_text()
     assert len(text.encode()) < 5e6
@@ -42,11 +33,6 @@ def test_a_page_needs_no_network_and_is_small(page, tmp_path):
     assert not re.findall(r'(?:src|href)="(?!data:)[^"]*"', own.split("srcdoc")[0] + own.split("</iframe>")[1])
     assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', player)
     assert page.best in text
-
-
-def test_a_page_shows_every_picture_and_number(page, tmp_path):
-    write_page(tmp_path / "report.html", page)
-    text = (tmp_path / "report.html").read_text()
     pictures = re.findall(r'<img src="data:image/png;base64,([^"]+)"', text)
     assert len(pictures) == len(page.pictures) == 3  # friction curves, motions ahead, accelerations
     for picture in pictures:
@@ -127,22 +113,6 @@ def test_controls_show_the_row_of_the_time(swinging, friction):
         assert controls.time.value == 0.0  # it begins again
         controls.nodes.show_group(0, False, controls.row)
         assert not controls.nodes.arrows[0][0].visible
-
-
-def test_a_log_for_rerun_holds_the_motion(swinging, friction, tmp_path):
-    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed, or an old one that reads no file")
-    path, recorded = tmp_path / "motion.rrd", recorded_scene(swinging, friction, seconds=0.5)
-    write_rerun(path, recorded)
-    assert path.read_bytes().startswith(b"RRF")  # its mark
-    angles = []
-    for part in chunk.RrdReader(path).stream():
-        if part.entity_path == "/q/lower_hinge":
-            batch = part.to_record_batch()
-            seconds = batch["time"].cast("int64").to_numpy() / 1e9
-            angles += zip(seconds, batch["Scalars:scalars"].flatten().to_numpy(), strict=True)
-    np.testing.assert_allclose(sorted(angles), np.column_stack([recorded.time, recorded.q[:, 1]]), atol=1e-8)
-    with pytest.raises(InvalidInput, match="exists already"):
-        write_rerun(path, recorded)
 
 
 def test_a_dataset_alone_has_a_page(swinging):

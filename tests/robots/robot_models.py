@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from forcegp.robots import Robot
+from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 
 # Branches at two depths, joints scattered over the file, names not in alphabetical order, links fixed to moving links
 # with inertias at turned origins, massless frames, a base that is offset from the root link.
@@ -151,3 +155,14 @@ def iiwa() -> str:
 
 MODELS = {"iiwa": iiwa, "tree": lambda: TREE, "chain": lambda: CHAIN}
 FRAMES = {"iiwa": "lbr_iiwa_link_7", "tree": "right_hand", "chain": "tool"}  # a frame at the end of each
+
+
+def loaded(robot: Robot, *links: str, mass: float = 0.3) -> Robot:
+    """The robot with other masses, centres and inertias of these links: each carries two more points."""
+    for k, name in enumerate(links):
+        link = robot.link(name)
+        total = pseudo_inertia(link.mass, np.array(link.center_of_mass), np.array(link.inertia))
+        for point in ((0.1, 0.05 + 0.01 * k, -0.02), (-0.04, 0.1, 0.07), (0.02, -0.03, 0.1)):
+            total = total + pseudo_inertia(mass, np.array(point), np.diag([0.002, 0.003, 0.004]) * mass)
+        robot = robot.with_link(name, *physical_of_pseudo_inertia(total))
+    return robot

@@ -45,14 +45,6 @@ def test_bias_forces(case):
     assert relative_error(robot.bias_forces(torch.tensor(q), torch.tensor(v)), theirs) < 1e-12
 
 
-def test_mass_matrix_and_bias_in_one_pass(case):
-    robot, _, _, q, v, *_ = case
-    q, v = torch.tensor(q), torch.tensor(v)
-    mass, bias = robot.mass_matrix_and_bias(q, v)
-    torch.testing.assert_close(mass, robot.mass_matrix(q), rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(bias, robot.bias_forces(q, v), rtol=1e-13, atol=1e-12)
-
-
 def test_gravity_forces(case):
     robot, oracle, _, q, *_ = case
     assert relative_error(robot.gravity_forces(torch.tensor(q)), [oracle.gravity_forces(x) for x in q]) < 1e-12
@@ -91,7 +83,7 @@ def test_every_frame(text):
     robot = Robot.from_urdf_text(text)
     oracle = Oracle(text, robot)
     q, v = np.random.default_rng(3).normal(size=(2, robot.nv))
-    for frame in robot.frame_names:
+    for frame in robot.link_names:
         pose, jacobian, acceleration = oracle.frame(q, v, oracle.with_point(frame, np.zeros(3)))
         args = torch.tensor(q), torch.tensor(v)
         np.testing.assert_allclose(robot.frame_pose(args[0], frame), pose, atol=1e-13)

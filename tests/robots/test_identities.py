@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
 from hypothesis import strategies as st
-from tests.robots.pinocchio_oracle import Oracle
-from tests.robots.robot_models import FRAMES, MODELS, TREE
+from tests.robots.robot_models import FRAMES, MODELS
 from torch.func import grad, jvp
 
 from forcegp.robots import Robot
@@ -17,24 +15,6 @@ def case(request):
     robot = Robot.from_urdf_text(MODELS[request.param]())
     states = torch.tensor(np.random.default_rng(2).normal(size=(3, 20, robot.nv)))
     return robot, FRAMES[request.param], *states
-
-
-def test_forward_dynamics_undoes_inverse_dynamics(case):
-    robot, _, q, v, a = case
-    torch.testing.assert_close(robot.forward_dynamics(q, v, robot.inverse_dynamics(q, v, a)), a, rtol=1e-9, atol=1e-9)
-
-
-def test_inverse_dynamics_is_mass_matrix_and_bias(case):
-    robot, _, q, v, a = case
-    robot = robot.with_armature(torch.linspace(0.1, 1.0, robot.nv).tolist())
-    mass, bias = robot.mass_matrix_and_bias(q, v)
-    expected = (mass @ a[..., None]).squeeze(-1) + bias
-    torch.testing.assert_close(robot.inverse_dynamics(q, v, a), expected, rtol=1e-11, atol=1e-11)
-
-
-def test_bias_at_rest_is_gravity(case):
-    robot, _, q, *_ = case
-    torch.testing.assert_close(robot.bias_forces(q, torch.zeros_like(q)), robot.gravity_forces(q))
 
 
 def test_gravity_is_the_gradient_of_potential_energy(case):
@@ -84,27 +64,4 @@ def test_jacobian_is_the_rate_of_the_pose(case):
     torch.testing.assert_close(vee, angular, rtol=1e-11, atol=1e-11)
 
 
-def test_kinetic_energy(case):
-    robot, _, q, v, _ = case
-    oracle = Oracle(robot.urdf_text, robot)
-    ours = 0.5 * torch.einsum("bi,bij,bj->b", v, robot.mass_matrix(q), v)
-    theirs = [oracle.kinetic_energy(*x) for x in zip(q.numpy(), v.numpy(), strict=True)]
-    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
-
-
 angles = st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6)
-
-
-@given(angles)
-def test_mass_matrix_is_symmetric_positive_definite(q):
-    mass = Robot.from_urdf_text(TREE).mass_matrix(torch.tensor(q, dtype=torch.float64))
-    assert torch.equal(mass, mass.mT)
-    assert torch.linalg.eigvalsh(mass).min() > 0
-
-
-def test_branches_do_not_couple_beyond_their_common_joint():
-    robot = Robot.from_urdf_text(TREE)
-    mass = robot.mass_matrix(torch.linspace(-1, 1, 6).double())
-    right, left = robot.joint_names.index("right_wrist"), robot.joint_names.index("left_gripper")
-    assert mass[right, left] == 0
-    assert robot.frame_jacobian(torch.zeros(6).double(), "left_finger")[:, right].abs().max() == 0

@@ -116,21 +116,6 @@ def test_frames_move_with_the_coordinates(case):
     close(at.frame_bias_acceleration(frame), bias)
 
 
-def test_gradients_of_compiled_dynamics_are_those_of_the_robot(tmp_path):
-    robot = Robot.from_urdf_text(with_mimics(TREE, TREE_MIMICS))
-    links = ("left_finger", "body")
-    found = []
-    for of in (robot, robot.compile(tmp_path)):
-        states = torch.tensor(np.random.default_rng(5).normal(size=(3, COUNT, robot.nv)))
-        inputs = [x.clone().requires_grad_() for x in states]
-        inertials = {name: x.requires_grad_() for name, x in robot.inertial_parameters(*links).items()}
-        a = of.forward_dynamics(*inputs, inertials=inertials)
-        (a * torch.arange(1.0, a.numel() + 1.0).view_as(a)).sum().backward()
-        found.append([x.grad for x in (*inputs, *inertials.values())])
-    for ours, theirs in zip(*found, strict=True):
-        close(ours, theirs)
-
-
 def test_the_regressor_times_the_parameters_is_inverse_dynamics():
     robot = Robot.from_urdf_text(with_mimics(TREE, TREE_MIMICS))
     q, v, a = torch.tensor(np.random.default_rng(6).normal(size=(3, COUNT, robot.nv)))

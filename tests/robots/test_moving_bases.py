@@ -195,29 +195,6 @@ def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
         close(found, pair.data.ddq_dq[order], 100.0)
 
 
-def test_compiled_derivatives_on_the_manifold(pair, compiled):
-    """Of forward and inverse dynamics against Pinocchio, and in the inertias against torch."""
-    order, n, links = np.ix_(pair.to_v, pair.to_v), pair.robot.nv, pair.robot.layout.moving[:2]
-    for k, q, v, a, tau in pair.states():
-        for function, given in (("forward_dynamics", tau), ("inverse_dynamics", a)):
-            steps = torch.zeros(n, n, dtype=torch.float64, requires_grad=True)  # one row for each result
-            force = torch.as_tensor(given[pair.to_v])
-            found = getattr(compiled, function)(pair.robot.integrate(pair.q[k], steps), pair.v[k], force)
-            (slopes,) = torch.autograd.grad(found.diagonal().sum(), steps)
-            if function == "forward_dynamics":
-                pin.computeABADerivatives(pair.model, pair.data, q, v, tau)
-                close(slopes, pair.data.ddq_dq[order], 100.0)
-            else:
-                close(slopes, pin.computeRNEADerivatives(pair.model, pair.data, q, v, a)[0][order], 100.0)
-    inertials = {name: x.requires_grad_() for name, x in pair.robot.inertial_parameters(*links).items()}
-    ours, theirs = (
-        torch.autograd.grad(of.forward_dynamics(pair.q, pair.v, pair.tau, inertials).sum(), [*inertials.values()])
-        for of in (compiled, pair.robot)
-    )
-    for mine, expected in zip(ours, theirs, strict=True):
-        close(mine, expected.numpy(), 10.0)
-
-
 def test_a_compiled_robot_refuses_turns_of_other_length(pair, compiled):
     if pair.robot.space.is_vector_space:
         return

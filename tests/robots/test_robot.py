@@ -5,10 +5,10 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from tests.robots.robot_models import CHAIN, TREE
+from tests.robots.robot_models import CHAIN, TREE, loaded
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError, UnknownFrame, UnknownJoint, UnknownLink
-from forcegp.robots import Robot, physical_from_parameters
+from forcegp.robots import Robot
 
 
 @pytest.fixture(scope="module")
@@ -72,46 +72,18 @@ def test_links_show_who_moves_them_and_their_inertia(tree):
     np.testing.assert_allclose(camera.inertia, turn @ inertia @ turn.T, atol=1e-18)
     assert tree.link("base").joint is None
     assert tree.link("lens").mass == 0.0
-    assert set(tree.link_names) == set(tree.frame_names)
 
 
-def test_repr_names_robot_and_joints(chain):
-    assert repr(chain).startswith(
-        "Robot(\n  name: 'chain'\n  nv: 4\n  links: 7\n  joints: slide (prismatic), spin (continuous)"
-    )
-
-
-def test_merged_link_stays_a_parameter(chain):
-    # a bracket twice as heavy, by its name, although it is fixed to the hub
-    parameters = chain.inertial_parameters("bracket")["bracket"]
-    heavier = parameters + torch.tensor([0.5 * np.log(2.0), *np.zeros(9)])
-    text = CHAIN.replace('<mass value="0.7"/>', '<mass value="1.4"/>')
-    for old, new in [("0.002", "0.004"), ("0.0002", "0.0004"), ("0.003", "0.006"), ("0.0001", "0.0002")]:
-        head, tail = text.split('<link name="bracket">')
-        text = head + '<link name="bracket">' + tail.replace(f'="{old}"', f'="{new}"', 1)
-    text = text.replace('izz="0.0025"', 'izz="0.005"')
+def test_massless_frame_can_be_given_inertia_and_frames_stay(chain):
+    given = loaded(chain, "tool")
+    assert given.link("tool").mass == pytest.approx(0.9, rel=1e-14)
     q = torch.linspace(-1, 1, 4, dtype=torch.float64)
-    expected = Robot.from_urdf_text(text).mass_matrix(q)
-    torch.testing.assert_close(chain.mass_matrix(q, {"bracket": heavier}), expected, rtol=1e-12, atol=1e-14)
-
-
-def test_massless_frame_can_be_given_inertia(chain):
-    payload = torch.tensor([0.1, -2.0, -2.1, -2.2, 0.01, 0.0, 0.02, 0.05, 0.0, 0.1], dtype=torch.float64)
-    q, v = torch.ones(2, 4, dtype=torch.float64)
-    loaded = chain.with_inertials({"tool": payload})
-    mass, center, _ = physical_from_parameters(payload)
-    assert loaded.link("tool").mass == pytest.approx(mass.item(), rel=1e-15)
-    np.testing.assert_array_equal(loaded.link("tool").center_of_mass, center)
-    expected = chain.mass_matrix_and_bias(q, v, {"tool": payload})
-    torch.testing.assert_close(loaded.mass_matrix_and_bias(q, v), expected, rtol=1e-12, atol=1e-14)
-
-
-def test_moving_a_center_of_mass_never_moves_a_frame(chain):
-    q = torch.linspace(-1, 1, 4, dtype=torch.float64)
-    wrist = chain.inertial_parameters("wrist")["wrist"]
-    other = chain.with_inertials({"wrist": wrist + torch.tensor([0.0] * 7 + [0.3, 0.2, 0.1], dtype=torch.float64)})
-    for frame in chain.frame_names:
-        assert torch.equal(other.frame_pose(q, frame), chain.frame_pose(q, frame))
+    more = given.gravity_forces(q) - chain.gravity_forces(q)
+    places = torch.tensor([given.link("tool").center_of_mass], dtype=torch.float64)
+    lift = chain.frame_jacobian(q, "tool", places[0])[2]
+    torch.testing.assert_close(more, 9.81 * 0.9 * lift, rtol=1e-12, atol=1e-12)
+    for frame in chain.link_names:
+        assert torch.equal(given.frame_pose(q, frame), chain.frame_pose(q, frame))
 
 
 def test_locked_joint_is_fixed_where_it_is_locked(tree):
@@ -121,10 +93,10 @@ def test_locked_joint_is_fixed_where_it_is_locked(tree):
     full = dict.fromkeys(tree.joint_names, 0.2) | locked.locked
     q = torch.tensor([full[name] for name in tree.joint_names], dtype=torch.float64)
     free = [tree.joint_names.index(name) for name in locked.joint_names]
-    for frame in tree.frame_names:
+    for frame in tree.link_names:
         torch.testing.assert_close(locked.frame_pose(q[free], frame), tree.frame_pose(q, frame), rtol=0, atol=1e-15)
     torch.testing.assert_close(locked.mass_matrix(q[free]), tree.mass_matrix(q)[free][:, free], rtol=1e-13, atol=1e-15)
-    kept = locked.with_armature({"left_shoulder": 0.5}).with_inertials(locked.inertial_parameters("left_arm"))
+    kept = loaded(locked.with_armature({"left_shoulder": 0.5}), "left_arm")
     assert kept.locked == locked.locked
     assert kept.armature.tolist() == [0.0, 0.5, 0.0, 0.0]
 
@@ -145,9 +117,7 @@ def test_robot_is_immutable_and_survives_pickling(chain):
     chain.gravity.zero_()
     assert chain.gravity.tolist() == [0.0, 0.0, -9.81]
     q = torch.ones(4, dtype=torch.float64)
-    # nothing of a transform that ran before stays in the robot
-    wrist = chain.inertial_parameters("wrist")["wrist"]
-    torch.func.hessian(lambda p: chain.mass_matrix(q, {"wrist": p}).sum())(wrist)
+    torch.func.hessian(lambda q: chain.mass_matrix(q).sum())(q)  # nothing of a transform stays in the robot
     assert torch.equal(pickle.loads(pickle.dumps(chain)).mass_matrix(q), chain.mass_matrix(q))
 
 
@@ -158,23 +128,21 @@ def test_robot_is_immutable_and_survives_pickling(chain):
 def test_any_batch_shape(tree, batch):
     q, v, a = torch.randn(3, *batch, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     n = tree.nv
-    inertials = {name: p.expand(*batch, 10) for name, p in tree.inertial_parameters("camera", "left_arm").items()}
-    for given in (None, inertials):
-        shapes = {
-            (*batch, n, n): [tree.mass_matrix(q, given)],
-            (*batch, n): [
-                tree.bias_forces(q, v, given),
-                tree.gravity_forces(q, given),
-                tree.inverse_dynamics(q, v, a, given),
-                tree.forward_dynamics(q, v, a, given),
-            ],
-            (*batch, 4, 4): [tree.frame_pose(q, "lens"), tree.frame_pose(q, "base")],
-            (*batch, 6, n): [tree.frame_jacobian(q, "lens", (1.0, 0.0, 0.0)), tree.frame_jacobian(q, "base")],
-            (*batch, 6): [tree.frame_bias_acceleration(q, v, "lens"), tree.frame_bias_acceleration(q, v, "base")],
-        }
-        for shape, values in shapes.items():
-            for value in values:
-                assert value.shape == shape
+    shapes = {
+        (*batch, n, n): [tree.mass_matrix(q)],
+        (*batch, n): [
+            tree.bias_forces(q, v),
+            tree.gravity_forces(q),
+            tree.inverse_dynamics(q, v, a),
+            tree.forward_dynamics(q, v, a),
+        ],
+        (*batch, 4, 4): [tree.frame_pose(q, "lens"), tree.frame_pose(q, "base")],
+        (*batch, 6, n): [tree.frame_jacobian(q, "lens", (1.0, 0.0, 0.0)), tree.frame_jacobian(q, "base")],
+        (*batch, 6): [tree.frame_bias_acceleration(q, v, "lens"), tree.frame_bias_acceleration(q, v, "base")],
+    }
+    for shape, values in shapes.items():
+        for value in values:
+            assert value.shape == shape
     # each state on its own gives the same
     flat = tree.forward_dynamics(q, v, a).reshape(-1, n)
     for i, state in enumerate(zip(*(x.reshape(-1, n) for x in (q, v, a)), strict=True)):
@@ -186,29 +154,17 @@ def test_batches_broadcast(chain):
     q = torch.randn(3, 1, 4, generator=generator, dtype=torch.float64)
     v = torch.randn(5, 4, generator=generator, dtype=torch.float64)
     a = torch.randn(4, generator=generator, dtype=torch.float64)
-    wrist = chain.inertial_parameters("wrist")["wrist"] + 0.1 * torch.randn(2, 1, 1, 10, dtype=torch.float64)
-    full = (2, 3, 5)
-    expanded = [x.expand(*full, 4) for x in (q, v, a)]
-    given, all_given = {"wrist": wrist}, {"wrist": wrist.expand(*full, 10)}
+    expanded = [x.expand(3, 5, 4) for x in (q, v, a)]
     for name in ("inverse_dynamics", "forward_dynamics"):
         function = getattr(chain, name)
-        torch.testing.assert_close(function(q, v, a, given), function(*expanded, all_given))
-    torch.testing.assert_close(chain.mass_matrix(q, given), chain.mass_matrix(expanded[0], all_given)[:, :, :1])
-    torch.testing.assert_close(chain.bias_forces(q, v, given), chain.bias_forces(*expanded[:2], all_given))
+        torch.testing.assert_close(function(q, v, a), function(*expanded))
+    torch.testing.assert_close(chain.bias_forces(q, v), chain.bias_forces(*expanded[:2]))
     points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
     ours = chain.frame_jacobian(q, "tool", points)
     assert ours.shape == (3, 5, 6, 4)
     torch.testing.assert_close(ours[1, 2], chain.frame_jacobian(q[1, 0], "tool", points[2]))
     ours = chain.frame_bias_acceleration(q, v, "tool", points)
     torch.testing.assert_close(ours[1, 2], chain.frame_bias_acceleration(q[1, 0], v[2], "tool", points[2]))
-
-
-def test_inertials_of_a_batch_at_one_state(chain):
-    q = torch.ones(4, dtype=torch.float64)
-    wrist = chain.inertial_parameters("wrist")["wrist"] + torch.linspace(0, 1, 7, dtype=torch.float64)[:, None]
-    masses = chain.mass_matrix(q, {"wrist": wrist})
-    assert masses.shape == (7, 4, 4)
-    torch.testing.assert_close(masses[4], chain.mass_matrix(q, {"wrist": wrist[4]}))
 
 
 def test_one_kinematics_serves_everything(chain):
@@ -241,7 +197,7 @@ def test_unknown_names_list_the_valid_ones(tree):
     with pytest.raises(UnknownLink, match="no link 'boddy' in tree; did you mean 'body'"):
         tree.link("boddy")
     with pytest.raises(UnknownLink, match="did you mean 'camera'"):
-        tree.mass_matrix(q, {"camra": torch.zeros(10, dtype=torch.float64)})
+        tree.with_link("camra", 1.0, (0, 0, 0), np.eye(3))
     with pytest.raises(UnknownJoint, match="did you mean 'torso'"):
         tree.joint("torsoo")
     with pytest.raises(UnknownJoint, match="did you mean 'torso'"):
@@ -250,22 +206,13 @@ def test_unknown_names_list_the_valid_ones(tree):
         Robot.from_urdf_text(TREE, locked={"torsoo": 1.0})
 
 
-def test_links_without_inertial_parameters_say_why(tree):
+def test_links_that_cannot_be_given_an_inertia_say_why(tree):
     with pytest.raises(InvalidInput, match=r"'base' of tree .*fixed in the world"):
-        tree.inertial_parameters("base")
-    with pytest.raises(InvalidInput, match="'base' of tree is fixed in the world"):
-        tree.mass_matrix(torch.zeros(6, dtype=torch.float64), {"base": torch.zeros(10, dtype=torch.float64)})
-    with pytest.raises(InvalidInput, match=r"'lens' of tree is a massless frame.*<inertial>"):
-        tree.inertial_parameters("lens")
-
-
-def test_ideal_rod_moves_but_is_no_parameter():
-    rod = CHAIN.replace('ixx="0.002" ixy="0" ixz="0.0005" iyy="0.02" iyz="0" izz="0.021"', 'ixx="0" ixy="0" ixz="0" '
-                        'iyy="0.02" iyz="0" izz="0.02"')  # fmt: skip
-    robot = Robot.from_urdf_text(rod)
-    assert torch.linalg.eigvalsh(robot.mass_matrix(torch.ones(4, dtype=torch.float64))).min() > 0
-    with pytest.raises(NonPhysicalInertia, match=r"link 'forearm' .*line-like.*thickness"):
-        robot.inertial_parameters("forearm")
+        tree.with_link("base", 1.0, (0, 0, 0), np.eye(3))
+    with pytest.raises(InvalidInput, match="give 9 finite numbers"):
+        tree.with_link("body", 1.0, (0, 0, 0), np.ones(3))
+    with pytest.raises(NonPhysicalInertia, match="triangle"):
+        tree.with_link("body", 1.0, (0, 0, 0), np.diag([1.0, 1.0, 3.0]))
 
 
 @pytest.mark.parametrize(
@@ -295,17 +242,6 @@ def test_wrong_batches_points_and_parameters(chain):
         chain.bias_forces(two, three)
     with pytest.raises(InvalidInput, match=r"do not broadcast: the states \(2,\), tau \(3,\)"):
         chain.forward_dynamics(two, two, three)
-    with pytest.raises(InvalidInput, match=r"do not broadcast: the states \(2,\), inertials \(3,\)"):
-        chain.mass_matrix(two, {"wrist": torch.zeros(3, 10, dtype=torch.float64)})
-    zeros = torch.zeros(3, 10, dtype=torch.float64)
-    with pytest.raises(InvalidInput, match=r"inertials\['hub'\] \(2,\), inertials\['wrist'\] \(3,\)"):
-        chain.mass_matrix(two, {"hub": zeros[:2], "wrist": zeros})
-    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] .*\(9,\).* 10"):
-        chain.mass_matrix(two, {"wrist": torch.zeros(9, dtype=torch.float64)})
-    with pytest.raises(InvalidInput, match=r"inertials\['wrist'\] .*\(2, 10\)"):
-        chain.with_inertials({"wrist": torch.zeros(2, 10, dtype=torch.float64)})
-    with pytest.raises(InvalidInput, match="inertials is a list; give a mapping from link names"):
-        chain.mass_matrix(two, [zeros[0]])
     with pytest.raises(InvalidInput, match=r"point is .* give 3 finite numbers"):
         chain.frame_jacobian(two, "tool", (1.0, 2.0))
     with pytest.raises(InvalidInput, match=r"point has shape \(2,\)"):
@@ -332,13 +268,10 @@ def test_singular_mass_matrix_is_an_error():
     body = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
       <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
       <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
-    vanishing = torch.zeros(10, dtype=torch.float64)
-    vanishing[0] = -400.0  # the mass e^-800 underflows to zero
-    one = torch.ones(1, dtype=torch.float64)
+    one, nowhere = torch.ones(2, 1, dtype=torch.float64)
+    nowhere = nowhere * torch.nan
     with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
-        Robot.from_urdf_text(body).forward_dynamics(one, one, one, {"b": vanishing})
-    acceleration = Robot.from_urdf_text(body, armature=(0.5,)).forward_dynamics(one, one, one, {"b": vanishing})
-    torch.testing.assert_close(acceleration, 2.0 * one)
+        Robot.from_urdf_text(body).forward_dynamics(nowhere, one, one)
 
 
 def test_constants_move_to_another_device(chain):
@@ -351,12 +284,3 @@ def test_constants_move_to_another_device(chain):
     assert chain.device.type == "cpu"
     with pytest.raises(InvalidInput, match="q is on cpu but the robot on meta"):
         moved.mass_matrix(torch.zeros(4, dtype=torch.float64))
-
-
-def test_a_frame_is_given_as_a_copy(chain):
-    name = chain.frame_names[-1]
-    body, offset = chain.frame(name)
-    kept = offset.clone()
-    offset.fill_(7.0)
-    assert chain.frame(name)[0] == body
-    torch.testing.assert_close(chain.frame(name)[1], kept, rtol=0, atol=0)

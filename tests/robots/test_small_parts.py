@@ -13,6 +13,8 @@ from forcegp.robots.inertia import (
     inverse,
     pseudo_inertia_of_standard,
     rotation_about,
+    rotation_from_rpy,
+    rpy_from_rotation,
     standard_of_pseudo_inertia,
     transform,
 )
@@ -74,3 +76,10 @@ def test_the_regressor_times_any_parameters_is_the_joint_force(model):
 def test_a_locked_position_that_is_no_number_is_named(position):
     with pytest.raises(InvalidInput, match=r"locked\['slide'\] is .*finite position"):
         locked_positions({"slide": position})
+
+
+@pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 2.5])
+def test_angles_of_a_rotation_give_it_back(pitch):
+    for roll, yaw in ((0.0, 0.0), (1.0, -2.0), (-3.0, 0.4)):
+        rotation = rotation_from_rpy((roll, pitch, yaw))
+        np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(rotation)), rotation, atol=1e-15)

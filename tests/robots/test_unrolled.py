@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from tests.robots.pinocchio_oracle import Oracle
-from tests.robots.robot_models import CHAIN, MODELS, TREE
+from tests.robots.robot_models import MODELS, TREE
 
 from forcegp.codegen.graph import Graph, evaluated, node_of
 from forcegp.robots import Robot
@@ -71,25 +71,6 @@ def test_structure_stays_structure():
     assert np.array_equal(L != 0.0, np.tril(related))
     L, D = scalars.numbers(L), scalars.numbers(D)
     close(np.swapaxes(L, 1, 2) @ (D[:, :, None] * L), robot.mass_matrix(q))
-
-
-def test_coarser_rounding_drops_what_angles_of_twelve_digits_leave():
-    """The iiwa's file turns by 1.57079632679, so that 5e-12 stands where zeros are meant."""
-    robot = Robot.from_urdf_text(MODELS["iiwa"]())
-    q = torch.randn(COUNT, robot.nv, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
-    fine, coarse = (UnrolledRobot(robot, rounding=rounding) for rounding in (1e-15, 1e-11))
-    entries = [[x for joint in of.joints for x in joint.rotation.ravel().tolist()] for of in (fine, coarse)]
-    assert entries[0].count(0.0) < entries[1].count(0.0) == 6 * robot.nv  # the turns are signed permutations
-    scalars = Scalars(q)
-    close(scalars.numbers(UnrolledKinematics(coarse, *scalars.given).mass_matrix()), robot.mass_matrix(q))
-
-
-def test_states_given_as_floats_are_constants():
-    robot = Robot.from_urdf_text(CHAIN)
-    at = UnrolledKinematics(UnrolledRobot(robot), [0.1, 0.0, 0.3, -0.4], [0.0, 1.0, 0.0, 2.0])
-    q, v = torch.tensor([[0.1, 0.0, 0.3, -0.4], [0.0, 1.0, 0.0, 2.0]], dtype=torch.float64)
-    assert all(isinstance(x, float) for x in at.bias_forces())
-    assert at.bias_forces().tolist() == pytest.approx(robot.bias_forces(q, v).tolist(), rel=1e-11)
 
 
 def test_solvers_against_dense_ones():

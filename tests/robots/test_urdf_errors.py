@@ -332,7 +332,7 @@ def test_prefixes_that_nobody_declared_are_those_of_parts_that_are_not_read():
 
 def test_whitespace_before_the_declaration_is_no_error():
     robot = Robot.from_urdf_text('\n <?xml version="1.0"?>' + SMALL)
-    assert robot.with_inertials(robot.inertial_parameters("arm")).nv == 1
+    assert robot.with_link("arm", 1.0, (0, 0, 0), np.eye(3)).nv == 1
 
 
 def test_files_that_are_too_large_or_too_deep_are_refused_at_once(tmp_path):

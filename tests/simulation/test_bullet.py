@@ -17,8 +17,8 @@ POINT = (0.01, -0.02, 0.1)
 STEP = 1.0 / 240.0
 
 
-def urdf(**changes: object) -> str:
-    return kuka_urdf(KukaSurfaceConfig(**{"tool_center_of_mass": (0.01, 0.0, 0.02), **changes}))
+def urdf(**constants: object) -> str:
+    return kuka_urdf(type("Odd", (KukaSurfaceConfig,), {"tool_center_of_mass": (0.01, 0.0, 0.02), **constants})())
 
 
 @pytest.fixture(scope="module")

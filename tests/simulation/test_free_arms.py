@@ -24,7 +24,7 @@ def simulated(arm, **options):
 
 @pytest.mark.parametrize("arm", TEXTS)
 def test_rows_satisfy_pinocchios_inverse_dynamics(arm):
-    data = simulated(arm, seconds=2.0, seed=3)
+    data = simulated(arm, seed=3)
     oracle = Oracle(TEXTS[arm], data.model.robot)  # with the rotors as armature
     forces = np.array([oracle.inverse_dynamics(*row) for row in zip(data.q, data.v, data.a, strict=True)])
     np.testing.assert_allclose(forces, data.u + data.truth["Q_U"], rtol=1e-9, atol=1e-9)
@@ -44,7 +44,7 @@ def test_rows_are_one_motion(arm):
 
 @pytest.mark.parametrize(("kind", "near_rest"), [("stribeck", 0.03), ("coulomb", 0.02), ("none", 0.0)])
 def test_friction_follows_its_law(kind, near_rest):
-    data = simulated("double-pendulum", joint_friction=kind, seconds=4.0)
+    data = simulated("double-pendulum", joint_friction=kind, seconds=1.5)
     v, share = data.v, 0.0 if kind == "none" else 1.0
     law = (0.02 + (near_rest - 0.02) * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02) + 0.01 * v
     np.testing.assert_allclose(data.truth["Q_U"], -20.0 * share * law, atol=1e-12)
@@ -67,16 +67,16 @@ def test_the_ur5_is_that_of_its_published_parameters():
 
 
 def test_seeds_and_noise_have_streams_of_their_own():
-    plain, noisy = simulated("ur5-free"), simulated("ur5-free", noise=0.1)
+    plain, noisy = (simulated("double-pendulum", noise=noise) for noise in (0.0, 0.1))
     np.testing.assert_array_equal(plain.q, noisy.q)
     np.testing.assert_array_equal(plain.a, noisy.truth["a"])
     assert np.std(noisy.a - plain.a) == pytest.approx(0.1, rel=0.1)
-    assert noisy.noise_std.tolist() == [0.1] * 6
+    assert noisy.noise_std.tolist() == [0.1] * 2
     assert plain.noise_std is None
-    both = simulated("ur5-free", episodes=2)
+    both = simulated("double-pendulum", episodes=2)
     np.testing.assert_array_equal(both.q[:240], plain.q)
     assert abs(both.q[240:] - plain.q).max() > 0.1
-    assert abs(simulated("ur5-free", seed=1).q - plain.q).max() > 0.1
+    assert abs(simulated("double-pendulum", seed=1).q - plain.q).max() > 0.1
     limits = [joint.effort_limit for joint in plain.model.robot.joints]
     assert (abs(both.u) <= limits).all()
 
@@ -85,7 +85,7 @@ def test_seeds_and_noise_have_streams_of_their_own():
     ("options", "message"),
     [
         ({"arm": "ur10"}, "arm"),
-        ({"arm": "ur5-free", "seconds": 0.0}, "seconds is 0.0; it must be finite and > 0"),
+        ({"arm": "ur5-free", "seconds": 0.0}, "seconds is 0.0; it must be one number, from 0.1 to 1e5 s"),
         ({"arm": "ur5-free", "noise": float("nan")}, "noise is nan"),
         ({"arm": "ur5-free", "episodes": 0}, "episodes is 0; it must be an integer from 1"),
         ({"arm": "ur5-free", "seed": -1}, "seed is -1"),

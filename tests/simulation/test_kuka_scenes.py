@@ -14,20 +14,18 @@ from forcegp.simulation.joint_friction import JointFrictionLaw
 pytest.importorskip("pybullet")
 
 SCENES = {
-    "coulomb": {"friction": "coulomb"},
     "stribeck": {"friction": "stribeck", "joint_friction": "stribeck"},
     "patch": {"patch_factor": 4.0},
     "tilted": {"surface": "tilted", "friction": "stribeck"},
     "sphere": {"surface": "sphere", "friction": "coulomb"},
     "none": {"surface": "none", "joint_friction": "stribeck"},
-    "coulomb-joints": {"joint_friction": "coulomb"},
     "bullet": {"contact": "bullet", "seconds": 6.0},
     "bullet-sphere": {"contact": "bullet", "surface": "sphere"},
 }
 
 
 def config(name: str) -> KukaSurfaceConfig:
-    return KukaSurfaceConfig(**{"seconds": 2.0, "settle_seconds": 2.0, "seed": 5, **SCENES[name]})
+    return KukaSurfaceConfig(**{"seconds": 1.5, "settle_seconds": 1.5, "seed": 5, **SCENES[name]})
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +75,7 @@ def test_parts_of_the_unknown_force_exist_where_the_force_does_and_add_up(scenes
     assert KukaSurfaceConfig(**data.metadata["config"]) == made
 
 
-@pytest.mark.parametrize("name", ["coulomb", "stribeck", "tilted", "sphere"])
+@pytest.mark.parametrize("name", ["stribeck", "tilted", "sphere"])
 def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
     data, made = scenes[name], config(name)
     jacobian, velocity, normal, _ = tool_motion(data)
@@ -94,11 +92,10 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
     assert 10.0 < np.median(load) < 40.0
 
 
-@pytest.mark.parametrize("scene", ["none", "coulomb-joints"])
-def test_joint_friction_is_its_law(scenes, scene):
-    data = scenes[scene]
+def test_joint_friction_is_its_law(scenes):
+    data = scenes["none"]
     np.testing.assert_array_equal(
-        data.truth["Q_U.joint-friction"], -JointFrictionLaw(config(scene), data.model.robot).curve(data.v)
+        data.truth["Q_U.joint-friction"], -JointFrictionLaw(config("none"), data.model.robot).curve(data.v)
     )
 
 
@@ -145,9 +142,8 @@ def test_the_tool_leaves_bullets_surface_now_and_then(scenes):
     assert 0.02 < share < 0.6
 
 
-@pytest.mark.parametrize("name", ["stribeck", "bullet"])
-def test_equal_seeds_give_equal_data(scenes, name):
-    assert_equal(simulate_kuka_surface(config(name)), scenes[name])
+def test_equal_seeds_give_equal_data(scenes):
+    assert_equal(simulate_kuka_surface(config("stribeck")), scenes["stribeck"])
 
 
 @pytest.mark.parametrize(
@@ -159,10 +155,6 @@ def test_equal_seeds_give_equal_data(scenes, name):
         ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),
         ({"contact": "bullet", "patch_factor": 2.0}, "ideal contact"),
         ({"surface": "none", "patch_factor": 2.0}, "needs a surface"),
-        ({"lift_share": 0.1}, "cannot be left"),
-        ({"surface": "sphere", "waypoint_x": (-5.0, 5.0)}, "sphere_radius"),
-        ({"tilt_axis": (0.0, 0.0)}, "horizontal direction"),
-        ({"press": -1.0}, ">= 0"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(changes, message):

@@ -61,15 +61,13 @@ def test_without_wind_at_rest_only_thrust_and_lag_are_unknown():
 
 
 def test_equal_seeds_give_equal_flights(test):
-    again = simulate_quadrotor(QuadrotorConfig(seconds=6.0, seed=2, wind=8.0))
-    np.testing.assert_array_equal(again.a, test.a)
+    again = simulate_quadrotor(QuadrotorConfig(seconds=0.5, seed=2, wind=8.0))
+    np.testing.assert_array_equal(again.truth["a"], test.truth["a"][: len(again)])
 
 
-@pytest.mark.parametrize("lag", [0.04, 0.1])
-def test_the_lag_of_the_rotors_is_found(lag):
-    dataset = simulate_quadrotor(QuadrotorConfig(seconds=15.0, seed=1, lag=lag))
-    found, std = estimate_thruster_lag(dataset)
-    assert found == pytest.approx(lag, rel=0.2)
+def test_the_lag_of_the_rotors_is_found(train):
+    found, std = estimate_thruster_lag(train)
+    assert found == pytest.approx(0.06, rel=0.2)
     assert 0.0 < std < 0.02
 
 
@@ -101,7 +99,7 @@ def test_a_load_on_an_arm_beneath_is_no_lag(lag):
         Robot.from_urdf_text(text.format(body.format(at, mass, inertia, inertia, inertia)), base="floating")
         for at, mass, inertia in ((-0.1, 0.2, 0.001), (-0.25, 0.4, 0.005))
     )
-    time = np.arange(3000) / 200
+    time = np.arange(1600) / 200
     draw = np.random.default_rng(1)
     rates, phases = 2 * np.pi * draw.uniform(0.2, 1.5, (7, 5)), draw.uniform(0, 6, (7, 5))
     size = 0.2 * np.array([1, 1, 1, 0.7, 0.7, 0.7, 3.0])
@@ -243,7 +241,7 @@ def test_known_physics_alone_has_no_observer(posterior, test):
 
 def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
     rows = acting(test).rows(np.arange(3))
-    predictor = posterior.predictor()
+    predictor = posterior.predictor(compile=False)
     for q, v, u in zip(rows.q, rows.v, rows.u, strict=True):
         expected = posterior.predict(q, v, u, covariance=False).mean
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
@@ -252,7 +250,7 @@ def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
 def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
     """Wind and wrench as inputs, at the rate of a controller; the program of it in C as well."""
     seeing, seen = observing(posterior, acting(test))
-    predictor = seeing.predictor()
+    predictor = seeing.predictor(compile=False)
     for k in (0, 500):
         q, v, u = seen.q[k], seen.v[k], seen.u[k]
         expected = seeing.predict(q, v, u, covariance=False).mean
@@ -287,7 +285,7 @@ def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
     assert posterior.model.unknown_forces[0].wind == posterior.settings["air"]["wind"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        again = fit(posterior.model, rows, restarts=1)  # too few rows to show their wind
+        again = fit(posterior.model, rows, points=40, restarts=1)  # too few rows to show their wind
     assert again.model.inputs == train.model.inputs
 
 

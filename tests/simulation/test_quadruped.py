@@ -14,7 +14,7 @@ from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 @pytest.fixture(scope="module")
 def clean():
-    return simulate_quadruped(QuadrupedConfig(seconds=6.0, seed=1, noise=0.0, payload=0.0))
+    return simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=1, noise=0.0, payload=0.0))
 
 
 def test_rows_obey_the_equations_of_motion(clean):
@@ -54,7 +54,7 @@ def test_feet_push_and_never_pull(clean):
 
 
 def test_payload_friction_and_foot_forces_are_found():
-    train = simulate_quadruped(QuadrupedConfig(seconds=8.0, seed=1))
+    train = simulate_quadruped(QuadrupedConfig(seconds=6.0, seed=1))
     test = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=2))
     trunk = train.model.robot.link("trunk")
     learned = RigidBodies({"trunk": Body(0.01, ("mass", "center_of_mass"))})

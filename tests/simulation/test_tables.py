@@ -32,7 +32,7 @@ def test_heights_lie_on_the_surface_through_its_middle(kind):
 
 
 def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
-    height, _, _ = table_of(KukaSurfaceConfig(surface="tilted", tilt_degrees=10)).height(np.array([[1.0, 0.5]]))
+    height, _, _ = table_of(KukaSurfaceConfig(surface="tilted")).height(np.array([[1.0, 0.5]]))
     assert height[0] == pytest.approx(-np.tan(np.deg2rad(10)))
 
 

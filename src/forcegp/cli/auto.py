@@ -300,7 +300,7 @@ class Auto(Resuming, LogOptions):
         """The folder of the model's C program; None where there is no compiler, or none of this model."""
         try:
             with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
-                forcegp.export_c(cast(forcegp.posterior.StructuredPosterior, posterior), folder)
+                forcegp.export_c(cast(forcegp.posterior.Posterior, posterior), folder)
         except (CompilerError, InvalidInput, NumericalError) as error:
             terminal.note(f"no C program: {error}")
             return None

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, get_type_hints
 
 from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -102,7 +102,7 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
-OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html", "rerun")
+OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html")
 """Names of the fields with what a command writes: never an input, nor another output."""
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
@@ -234,20 +234,6 @@ def _same(one: Path, other: Path) -> bool:
     with contextlib.suppress(OSError):  # one of them does not exist
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BackendOptions(Command):
-    """What every command asks that can compute in several processes."""
-
-    jobs: Annotated[int | None, unless_given("J", "1", int)] = None
-    """So many pieces of work at once, each on one core."""
-    backend: Annotated[str | None, unless_given("serial|joblib", "serial for one job, else joblib", str)] = None
-    """serial: in this process. joblib: in processes of this machine."""
-
-    def _backend(self, default: str | None = None) -> forcegp.parallel.Backend:
-        """The backend that is asked for, or else the default. Raises InvalidInput for contradicting options."""
-        return forcegp.parallel.backend_for(self.backend or default, self.jobs)
 
 
 @dataclass(frozen=True, kw_only=True)

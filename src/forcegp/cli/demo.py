@@ -111,7 +111,7 @@ class Demo(Command):
         self,
         terminal: Terminal,
         folder: Path,
-        posterior: forcegp.posterior.StructuredPosterior,
+        posterior: forcegp.posterior.Posterior,
         test: forcegp.Dataset,
         evaluations: Mapping[str, forcegp.Evaluation],
         results: Mapping[str, Any],
@@ -148,7 +148,7 @@ class Demo(Command):
 
     def _fitted(
         self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: bool
-    ) -> tuple[forcegp.posterior.StructuredPosterior, dict[str, Any]]:
+    ) -> tuple[forcegp.posterior.Posterior, dict[str, Any]]:
         """The fitted model, and what the fit came to."""
         assert train.model is not None
         start = time.monotonic()

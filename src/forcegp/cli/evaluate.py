@@ -101,7 +101,7 @@ class Evaluate(Overwriting):
             terminal.note(f"plots: {self.plots}")
         if self.report is not None:
             self._write_report(terminal, posterior, dataset, evaluation, scores)
-        known = isinstance(posterior, forcegp.posterior.StructuredPosterior) and not posterior.latent_names
+        known = isinstance(posterior, forcegp.posterior.Posterior) and not posterior.latent_names
         why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests_on_prior else NORMAL_FORCES_SEEN
         forces_table = force_facts(forces, why) | slip_facts(scores.get("slip", {}))
         terminal.show(*_report(posterior, evaluation, dataset, self.data, forces_table))
@@ -158,7 +158,7 @@ def draw(
 ) -> list[str]:
     """Write every plot that these data allow to `folder`; returns the names of the files."""
     figures = {"prediction.png": lambda: forcegp.evaluation.prediction_figure(posterior, dataset)}
-    if posterior.model.contacts and posterior.predicts_forces:
+    if posterior.model.contacts:
         figures["normal_force.png"] = lambda: forcegp.evaluation.normal_force_figure(posterior, dataset)
     if mu is not None:
         figures["friction_margins.png"] = lambda: forcegp.evaluation.friction_margins_figure(posterior, dataset, mu)

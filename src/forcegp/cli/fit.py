@@ -20,7 +20,7 @@ import forcegp.evidence
 import forcegp.posterior
 import forcegp.robots
 from forcegp.atomic_files import file_digest, write_json, write_text
-from forcegp.cli.command import DATASET, FIELDS, NUMBERS, BackendOptions, Overwriting, listed, numbers_of, unless_given
+from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.estimates import estimates_table, what_is_open
 from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of
@@ -38,7 +38,7 @@ LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torqu
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(BackendOptions, RobotOptions, Overwriting):
+class Fit(RobotOptions, Overwriting):
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown forces.
 
     The dataset carries its robot, contacts and forces; --robot, --contact and --forces replace or add to them. The
@@ -93,8 +93,8 @@ class Fit(BackendOptions, RobotOptions, Overwriting):
     """Starts of the search; the best is kept."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the starts of the search after the first."""
-    jobs: Annotated[int | None, unless_given("J", "1, or all that --backend has", int)] = None
-    """Restarts at once."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """Restarts at once, each on one core."""
     hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
     """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
     rows: Literal["auto", "in-contact", "all"] = "auto"
@@ -108,7 +108,8 @@ class Fit(BackendOptions, RobotOptions, Overwriting):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, save and show."""
         self.require_free(self.out)
-        workers, noise = self._backend(), self._noise()  # refused now, not after the data are read
+        forcegp.parallel.checked_jobs(self.jobs)  # refused now, not after the data are read
+        noise = self._noise()
         forcegp.robots.usable_device(self.device)
         evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
         start, notes = time.monotonic(), []
@@ -134,7 +135,6 @@ class Fit(BackendOptions, RobotOptions, Overwriting):
                 evidence,
                 recording=recording,
                 baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
-                backend=workers,
                 report=report,
                 **{name: getattr(self, name) for name in SAME},
             )
@@ -234,7 +234,7 @@ class Fit(BackendOptions, RobotOptions, Overwriting):
                 write_estimates(folder, posterior)
 
 
-SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed", "hyperprior")
+SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed", "jobs", "hyperprior")
 """Options that `forcegp.evaluation.learn` takes by the same names."""
 
 

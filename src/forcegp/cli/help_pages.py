@@ -34,8 +34,8 @@ GROUPS: Mapping[str, str] = {
     "Fit": "points learning_points rows engine restarts iterations hyperprior checks correct accept",
     "Score": "split guard seeds seed_list horizon margin strict",
     "Program": "to steps covariance jacobian unchecked",
-    "Compute": "preset seed jobs backend device port",
-    "Output": "out plots report html browser rerun write_mapping docs overwrite json",
+    "Compute": "preset seed jobs device port",
+    "Output": "out plots report html browser write_mapping docs overwrite json",
     "Other": "debug",
 }
 """Options of all commands by purpose, in the order of the pages: a name means the same everywhere."""

@@ -1,5 +1,6 @@
 """`forcegp reproduce`: every figure and number of the paper, by `benchmarks/paper` of the repository."""
 
+import os
 import sys
 import time
 from collections.abc import Mapping
@@ -9,15 +10,16 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from forcegp.cli.command import BackendOptions, Resuming, listed, unless_given
+from forcegp.cli.command import Resuming, listed, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
+from forcegp.parallel import checked_jobs
 
 EXPERIMENTS = Path("benchmarks", "paper", "reproduction.py")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reproduce(Resuming, BackendOptions):
+class Reproduce(Resuming):
     """Compute figures of Rath, Geist, Trimpe (2021) beside the published values. Needs a clone of the repository.
 
     FIGURE is fig2b, fig2c, fig3, fig4 or all. Finished work is kept in the folder; after an interruption the same
@@ -49,7 +51,7 @@ class Reproduce(Resuming, BackendOptions):
         if any(seed < 0 for seed in self.seed_list):
             raise InvalidInput(f"--seed-list is {self.seed_list}; give numbers of at least 0.")
         root = _repository()
-        backend = self._backend("joblib")
+        jobs = checked_jobs(os.cpu_count() or 1 if self.jobs is None else self.jobs)
         start = time.monotonic()
         if root not in sys.path:
             sys.path.insert(0, root)
@@ -63,7 +65,7 @@ class Reproduce(Resuming, BackendOptions):
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
             summaries = reproduce(
-                experiments, self.preset, out, command=self._command(), docs=self.docs, backend=backend, progress=report
+                experiments, self.preset, out, command=self._command(), docs=self.docs, jobs=jobs, progress=report
             )
         page, beside = out / PAPER_PAGE.file(experiments), out / PAPER_PAGE.name
         terminal.show(f"{page} reports the results; figures, JSON and CSV are in {beside}.")

@@ -42,8 +42,6 @@ class Robot(RobotFileOptions, Overwriting):
 
     file: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
     """The robot file."""
-    strict: bool = False
-    """Refuse what is ignored otherwise: a negative limit, a second axis, a missing name."""
     out: Annotated[Path | None, unless_given("FILE.png|xml|urdf", "no file")] = None
     """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
     browser: bool = False
@@ -59,8 +57,7 @@ class Robot(RobotFileOptions, Overwriting):
         self.require_free_file(self.out, own, "a PNG or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
-            options = {"inertias": self.inertias, "strict": self.strict, **self._changes()}
-            model = forcegp.Model.from_file(self.file, **options)
+            model = forcegp.Model.from_file(self.file, inertias=self.inertias, **self._changes())
             robot = model.robot
         repaired = [str(warning.message) for warning in caught]
         for text in repaired:

@@ -12,9 +12,10 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.parallel
 import forcegp.validation
 from forcegp.atomic_files import file_digest
-from forcegp.cli.command import DATASET, FIELDS, BackendOptions, Resuming, listed, unless_given
+from forcegp.cli.command import DATASET, FIELDS, Resuming, listed, unless_given
 from forcegp.cli.input_options import PreparationOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import NONE, Terminal, columns, number, percent
 
@@ -26,7 +27,7 @@ BRIEF = ("models", "winners", "verdicts", "against_baseline", "splits", "prepara
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
+class Validate(Resuming, PreparationOptions, RobotOptions):
     """Fit models side by side, score them on rows that are held out, and write one page about them.
 
     Every model learns from the same rows; what is held out is whole episodes, or blocks of time with a guard around
@@ -75,12 +76,14 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
     """Starts of every search for hyper-parameters; the best is kept."""
     iterations: Annotated[int | None, unless_given("N", "200", int)] = None
     """Most iterations of each start."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """So many pieces of work at once, each on one core."""
     overwrite: bool = False
     """Compute everything anew where the folder holds results."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Compute what is missing, and write the page."""
-        backend = self._backend()
+        forcegp.parallel.checked_jobs(self.jobs)
         start = time.monotonic()
 
         comparison, digest = self._comparison(terminal), file_digest(self.data)
@@ -93,7 +96,7 @@ class Validate(Resuming, BackendOptions, PreparationOptions, RobotOptions):
                 self.out,
                 models=self.models or None,
                 seeds=self.seeds,
-                backend=backend,
+                jobs=self.jobs,
                 source={"title": str(self.data), "data": [text, *robot], "sha256": digest},
                 margin=self.margin,
                 overwrite=self.overwrite,

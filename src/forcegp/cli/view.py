@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.report
-from forcegp.cli.command import URDF, InputPath, Overwriting, begins, unless_given
+from forcegp.cli.command import URDF, InputPath, Overwriting, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -28,7 +28,6 @@ class View(Overwriting):
     For example:
       forcegp view run test.h5 --shapes arm.urdf
       forcegp view log.h5 --html log.html
-      forcegp view run test.h5 --rerun test.rrd
     """
 
     interrupted = "the page is closed"
@@ -45,8 +44,6 @@ class View(Overwriting):
     """Where the page is served."""
     html: Annotated[Path | None, unless_given("FILE.html", "no file")] = None
     """Write the scene to this file instead of serving it."""
-    rerun: Annotated[Path | None, unless_given("FILE.rrd", "no file")] = None
-    """Write a log for the viewer of rerun instead of serving."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Serve, or write."""
@@ -55,7 +52,6 @@ class View(Overwriting):
         *runs, data = self.shown
         run = runs[0] if runs else None
         self.require_free_file(self.html, forcegp.report.is_page, "a report")
-        self.require_free_file(self.rerun, begins(b"RRF"), "a log of rerun")
         posterior = None if run is None else forcegp.load_posterior(run)
         recorded = forcegp.report.recorded_scene(
             forcegp.Dataset.load(data), posterior, start=self.start, seconds=self.seconds, shapes=self.shapes
@@ -72,13 +68,10 @@ class View(Overwriting):
             )
             forcegp.report.write_page(self.html, page, overwrite=self.overwrite)
             terminal.note(f"page: {self.html}")
-        if self.rerun is not None:
-            forcegp.report.write_rerun(self.rerun, recorded, overwrite=self.overwrite)
-            terminal.note(f"log for rerun: {self.rerun}")
-        if self.html is None and self.rerun is None:
+        else:
             forcegp.report.serve(
                 recorded, port=self.port, ready=lambda url: terminal.note(f"open {url}; Ctrl-C ends it")
             )
         forces = [{"name": each.title, "unit": each.unit, "arrows": list(each.names)} for each in recorded.arrows]
-        written = {name: str(path) for name in ("html", "rerun") if (path := getattr(self, name)) is not None}
+        written = {} if self.html is None else {"html": str(self.html)}
         return {"rows": len(recorded.time), "seconds": float(recorded.time[-1]), "forces": forces, **written}

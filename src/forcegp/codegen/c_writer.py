@@ -28,15 +28,13 @@ COMPARED = {"less": "<", "at_most": "<=", "equal": "=="}
 class Program:
     """Named vectors of nodes that are computed from named vectors of inputs; all `positive` must be > 0.
 
-    `inputs` follow each other as those of the graph do. Where `sums` names an output, a caller may ask for its sum over
-    all states instead.
+    `inputs` follow each other as those of the graph do.
     """
 
     graph: Graph
     inputs: dict[str, int]
     outputs: Mapping[str, Sequence[int]]
     positive: Sequence[int] = ()
-    sums: tuple[str, ...] = ()
 
     @property
     def nodes(self) -> list[int]:
@@ -136,20 +134,18 @@ def head(lanes: int) -> str:
 def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str, int]] | None = None) -> str:
     """`evaluate(first, last, t, a0, s0, ..., o0, r0, ...)`: all states, rows of arrays.
 
-    A stride `s` or `r` is that from one state to the next; 0 serves all states with one row, and sums an output.
+    A stride `s` or `r` is that from one state to the next; 0 serves all states with one row.
     `finish` names outputs that a C function (t, y, out) makes of the vector y of that name, and their lengths. Returns
     bits: 1 for inputs that are not finite, 2 for what should be positive, 4 for results that are not finite.
     """
     finish = finish or {}
     arguments = [f"const double *a{k}, long s{k}" for k in range(len(program.inputs))]
     arguments += [f"double *o{k}, long r{k}" for k in range(len(program.outputs))]
-    sums = [(k, len(program.outputs[name])) for k, name in enumerate(program.outputs) if name in program.sums]
     text = [
         ROWS,
         f"int evaluate(long first, long last, const double *const *t, {', '.join(arguments)}) {{",
         f"  real x[{max(sum(program.inputs.values()), 1)}], y[{max(len(program.nodes), 1)}];",
         "  int found = 0;",
-        *(f"  real m{k}[{size}]; for (int j = 0; j < {size}; j++) m{k}[j] = R(0.0);" for k, size in sums),
         "  for (long i = first; i < last; i += LANES) {",
         "    const long live = last - i < LANES ? last - i : LANES;",
     ]
@@ -171,8 +167,7 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
                 f"      {made}(t, g, p); for (int j = 0; j < {final}; j++) found |= !(p[j] - p[j] == 0.0) << 2; }}",
             ]
         else:
-            add = f"if (!r{k}) rows_add(y + {place}, {size}, live, m{k}); else " if name in program.sums else ""
-            text.append(f"    {add}found |= rows_write(y + {place}, {size}, live, o{k} + i * r{k}, r{k}) << 2;")
+            text.append(f"    found |= rows_write(y + {place}, {size}, live, o{k} + i * r{k}, r{k}) << 2;")
         place += size
     if program.positive:
         text.append(
@@ -180,7 +175,6 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
             "found |= !(AT(y[j], k) > 0.0) << 1;"
         )
     text.append("  }")
-    text += [f"  if (!r{k}) for (int j = 0; j < {size}; j++) o{k}[j] = TOTAL(m{k}[j]);" for k, size in sums]
     text.append("  return found;\n}")
     return "\n".join(text)
 

@@ -195,7 +195,7 @@ def opened_library(path: Path, purpose: Purpose) -> ctypes.CDLL:
 def code_digest() -> str:
     """Hash of the sources of this package: all that decide what is written, and more."""
     here = Path(__file__).parent.parent
-    rooms = ("codegen", "robots", "mechanics", "priors", "inference", "models")
+    rooms = ("codegen", "robots", "mechanics", "forces", "inference", "posterior")
     files = sorted(path for room in rooms for path in (here / room).rglob("*") if path.suffix in (".py", ".c", ".h"))
     return hashlib.sha256(b"\0".join(path.read_bytes() for path in files)).hexdigest()
 
@@ -263,25 +263,22 @@ class RowFunction:
     def rows(self, count: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> int:
         """Fill `outputs` for `count` states; what is to be reported.
 
-        Inputs and outputs are contiguous tensors (count, size), or (1, size) for all states; such an output receives
-        the sum over the states. Large batches take as many threads as torch has.
+        Inputs and outputs are contiguous tensors (count, size); an input may be (1, size), for all states. Large
+        batches take as many threads as torch has.
         """
         threads = max(1, min(torch.get_num_threads(), count // STATES_PER_THREAD))
-        if threads == 1:
-            return self._evaluate(0, count, self._tables, *_pointers(count, (*inputs, *outputs)))
-        # each thread has sums of its own
-        sums = {k: x.new_zeros(threads, 1, x.shape[1]) for k, x in enumerate(outputs) if x.shape[0] != count}
+        pointers = [number for x in (*inputs, *outputs) for number in (x.data_ptr(), _stride(count, x))]
         bounds = [count * k // threads for k in range(threads + 1)]
 
         def part(thread: int) -> int:
-            filled = [sums[k][thread] if k in sums else x for k, x in enumerate(outputs)]
-            pointers = _pointers(count, (*inputs, *filled))
             return self._evaluate(bounds[thread], bounds[thread + 1], self._tables, *pointers)
 
-        found = reduce(or_, in_threads(part, threads))
-        for k, values in sums.items():
-            outputs[k].copy_(values.sum(0))
-        return found
+        return reduce(or_, in_threads(part, threads))
+
+
+def _stride(count: int, rows: Tensor) -> int:
+    """Numbers from one state to the next."""
+    return rows.shape[1] if rows.shape[0] == count else 0
 
 
 def in_threads(part: Callable[[int], int], count: int) -> list[int]:
@@ -296,11 +293,6 @@ def in_threads(part: Callable[[int], int], count: int) -> list[int]:
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     """Threads that stay, for to start them takes as long as many states; those of a parent process are not there."""
     return ThreadPoolExecutor(threads)
-
-
-def _pointers(count: int, rows: Iterable[Tensor]) -> list[int]:
-    """Addresses and strides from one state to the next."""
-    return [number for x in rows for number in (x.data_ptr(), x.shape[1] if x.shape[0] == count else 0)]
 
 
 def are_plain(given: Sequence[object], size: int) -> bool:

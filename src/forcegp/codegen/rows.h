@@ -52,9 +52,3 @@ static APART int rows_write(const real *y, int size, long live, double *p, long 
   }
   return found;
 }
-static APART void rows_add(const real *y, int size, long live, real *sum) {
-  for (int j = 0; j < size; j++) {
-    if (live == LANES) sum[j] += y[j];
-    else for (int k = 0; k < live; k++) AT(sum[j], k) += AT(y[j], k);
-  }
-}

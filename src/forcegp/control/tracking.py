@@ -1,7 +1,6 @@
 """Tracking of a reference in joint space, with and without a model of the forces, and along a surface."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -90,10 +89,9 @@ class TrackingController(Controller):
         self.summed = self.summed + self.dt * torch.where(self.saturated, 0.0, q_d - q)
         return self._torques(q, v, v_d, a_d, q_d - q, v_d - v)
 
-    def feedback(self, e: Tensor, e_v: Tensor, factor: Tensor | float = 1.0) -> Tensor:
-        """The acceleration against errors of position and velocity, with gains `factor` times as stiff."""
-        root = factor**0.5
-        return factor * self.stiffness * e + root * self.damping * e_v + factor * root * self.integral * self.summed
+    def feedback(self, e: Tensor, e_v: Tensor) -> Tensor:
+        """The acceleration against errors of position and velocity."""
+        return self.stiffness * e + self.damping * e_v + self.integral * self.summed
 
     @abstractmethod
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
@@ -122,9 +120,6 @@ class ComputedTorque(TrackingController):
       `TrackingController` has them.
     * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
       velocity dry friction follows the noise of v and every overshoot, one sample late (docs/how-to/control.md).
-    * gain_factor: a factor (nv,) on the stiffness from the standard deviations (nv,) of the model's acceleration in
-      rad/s^2 (m/s^2): firm where the model is not sure, as in Beckers, Kulic, Hirche (2019), "Stable Gaussian process
-      based tracking control". It needs a predictor with covariance.
     """
 
     def __init__(
@@ -132,7 +127,6 @@ class ComputedTorque(TrackingController):
         model: Moving,
         *,
         forces_at: Literal["desired", "measured"] = "desired",
-        gain_factor: Callable[[Tensor], Tensor] | None = None,
         **settings: Any,
     ) -> None:
         known = model_of(model)
@@ -142,18 +136,14 @@ class ComputedTorque(TrackingController):
                 "posterior.with_contacts([])."
             )
         require_known("forces_at", forces_at, "ComputedTorque", ("desired", "measured"))
-        if gain_factor is not None and not (isinstance(model, Predictor) and model.kind != "none"):
-            raise InvalidInput("gain_factor needs standard deviations: give posterior.predictor() with a covariance.")
-        self.model, self.forces_at, self.gain_factor = model, forces_at, gain_factor
+        self.model, self.forces_at = model, forces_at
         super().__init__(known.robot, **settings)
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at_v, factor = v_d if self.forces_at == "desired" else v, 1.0
-        if self.gain_factor is not None and isinstance(self.model, Predictor):
-            factor = self.gain_factor(self.model(q, at_v, self.last)[1].diagonal().sqrt())
+        at_v = v_d if self.forces_at == "desired" else v
         at = joint_forces(self.model, q, at_v, self.last)
-        u = torques_for(self.model, q, at_v, at.M @ (a_d + self.feedback(e, e_v, factor)), self.last, at)
+        u = torques_for(self.model, q, at_v, at.M @ (a_d + self.feedback(e, e_v)), self.last, at)
         if u is None:
             raise NumericalError(NO_TORQUES)
         return u

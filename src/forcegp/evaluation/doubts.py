@@ -14,7 +14,6 @@ from torch import Tensor
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.summary import listed
 
@@ -137,7 +136,7 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
     curves that each have an input of their own, and constants (a payload), are no such processes: one state does not
     separate them, but all together do.
     """
-    if not isinstance(posterior, StructuredPosterior) or not posterior.trained.contacts:
+    if not isinstance(posterior, Posterior) or not posterior.trained.contacts:
         return False
     training = posterior.training
     q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
@@ -230,7 +229,7 @@ def _tried(posterior: Posterior, dataset: Dataset, model: Model) -> str:
     A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
     data more than those of another recording: the rows decide, not a rule.
     """
-    if not isinstance(posterior, StructuredPosterior):
+    if not isinstance(posterior, Posterior):
         return ""
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
     try:

@@ -17,7 +17,6 @@ from forcegp.errors import InvalidInput
 from forcegp.evaluation import metrics
 from forcegp.evaluation.evaluation import Numbers
 from forcegp.evaluation.predicted_rows import in_blocks
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.components import Curve
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.prediction import Gaussian
@@ -119,7 +118,7 @@ def force_scores(posterior: Posterior, dataset: Dataset) -> ForceScores:
     mean, where the processes hold the known forces, too. Raises InvalidInput for data of other joints.
     """
     require_rows("dataset", dataset, posterior.joint_names, "the model")
-    comparable = isinstance(posterior, StructuredPosterior) and not posterior.carries_known_forces
+    comparable = isinstance(posterior, Posterior) and not posterior.carries_known_forces
     terms = posterior.trained.unknown.named(posterior.model.robot) if comparable else ()
     named = true_names([name for name, *_ in terms], dataset)
     if not named and "lambda" not in dataset.truth:
@@ -189,7 +188,7 @@ def _predict(
 def _forces(
     posterior: Posterior, named: Collection[str], q: np.ndarray, v: np.ndarray, u: np.ndarray
 ) -> dict[str, Gaussian]:
-    if not named or not isinstance(posterior, StructuredPosterior):
+    if not named or not isinstance(posterior, Posterior):
         multiplier = posterior.predict(q, v, u).multiplier
         return {} if multiplier is None else {"lambda": multiplier}
     components = posterior.components(q, v, u)

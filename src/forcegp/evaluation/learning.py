@@ -26,7 +26,7 @@ from forcegp.forces import (
 from forcegp.inference import Inducing
 from forcegp.model import Model
 from forcegp.noise import Noise
-from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.posterior import Posterior
 
 Report = Callable[[int, int, str], None]
 """Called as report(done, total, what happens)."""
@@ -154,7 +154,7 @@ def learn(
 
     Functions of one or two inputs learn from all rows, which count for less where their errors resemble each other;
     others from `points`, `POINTS` where that is None. Motions among the evidence are those of `recording`, which may
-    have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, backend.
+    have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, jobs.
     """
     motions = [each for each in evidence if isinstance(each, Motions)]
     others = [each for each in evidence if not isinstance(each, Motions)] or [usual_evidence(model)]
@@ -256,8 +256,8 @@ def with_force_noise(model: Model, dataset: Dataset) -> Model:
 
 
 def allowing_for_correlation(
-    posterior: StructuredPosterior, dataset: Dataset, hyperprior: bool = True
-) -> tuple[StructuredPosterior, str | None]:
+    posterior: Posterior, dataset: Dataset, hyperprior: bool = True
+) -> tuple[Posterior, str | None]:
     """The posterior from all rows of a log, learned from them as the independent rows that they are worth; and a note.
 
     Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would

@@ -28,7 +28,7 @@ from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.fit import fit
 from forcegp.forces import Force
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import Summary
 
@@ -68,7 +68,7 @@ class PriorComparison(Summary):
     points: int
     blocks: int
     block_seconds: float
-    posteriors: Mapping[str, StructuredPosterior] = field(default_factory=dict)
+    posteriors: Mapping[str, Posterior] = field(default_factory=dict)
 
     @property
     def supported(self) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ def compare_priors(
     points: rows to train on, far apart in (q, v, u); None takes all. All are conditioned on exactly.
     model: what is known; None takes that of the dataset.
     block_seconds: length of the stretches of time that are left out; None cuts the recording into 20.
-    search: restarts, seed, jobs, backend, hyperprior, options and progress as for `fit`, for each of them.
+    search: restarts, seed, jobs, hyperprior, options and progress as for `fit`, for each of them.
 
     Raises
     ------

@@ -177,16 +177,24 @@ class MarginalLikelihood:
 
         Raises InvalidInput for a parameter of a name that means nothing here.
         """
+        return self.of_terms(*self.checked_terms(kernels, parameters))
+
+    def checked_terms(
+        self, kernels: LatentKernels, parameters: Mapping[str, Tensor]
+    ) -> tuple[Terms, list[Float[Tensor, "N N"]]]:
+        """Terms and kernel matrices at `parameters`. Raises InvalidInput for a name that means nothing here."""
         known = {*kernels.initial_parameters(), ACCELERATION, FORCE}
         unknown = next((name for name in parameters if name not in known), None)
         if unknown is not None:
             raise InvalidInput(f"no parameter {unknown!r}; there are {', '.join(sorted(known))}")
         terms = self.terms(parameters)
-        features, W, residual, noise = terms
-        matrices = kernels.matrices(parameters, features)
+        return terms, kernels.matrices(parameters, terms.features)
+
+    def of_terms(self, terms: Terms, matrices: Sequence[Float[Tensor, "N N"]]) -> Float[Tensor, ""]:
+        """-log p of rows, or of windows, with these terms."""
         if self.training.weights is not None:
             return functional_negative_log_likelihood(self.training.weights, terms, matrices)
-        return negative_log_likelihood(W, residual, noise, matrices)
+        return negative_log_likelihood(terms.W, terms.residual, terms.noise, matrices)
 
     def bound(
         self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]

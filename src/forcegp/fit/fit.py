@@ -1,7 +1,8 @@
 """`fit`: the numbers and functions of a model, found from a log; the one entry for every kind of evidence."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,8 +19,14 @@ from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.checks import check_forces, refuse_what_looks_alike, warn_of_contacts
-from forcegp.fit.independent import fit_independent
-from forcegp.fit.joint import CHANGE, MOST_ROUNDS, estimates_beside, numbers_beside
+from forcegp.fit.joint import (
+    CHANGE,
+    MOST_ROUNDS,
+    FreeNumbers,
+    estimates_beside,
+    numbers_beside,
+    with_free_numbers,
+)
 from forcegp.fit.motion_fit import refine_on_motions
 from forcegp.fit.objective import LOG_VARIANCE_SPREAD, FitObjective, Search, with_variance_priors
 from forcegp.fit.physical import fit_physical, typical_sizes, with_payloads_placed
@@ -40,12 +47,12 @@ from forcegp.fit.search import (
     resolved_noise,
 )
 from forcegp.fit.widening import widened
-from forcegp.forces import IndependentAccelerations, UnknownForces
+from forcegp.forces import UnknownForces
 from forcegp.forces.registry import described_force
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
-from forcegp.parallel import backend_for
-from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.parallel import checked_jobs
+from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
 from forcegp.robots.arguments import whole_number
@@ -65,8 +72,7 @@ def fit(
     rows: int | None = None,
     restarts: int | None = None,
     seed: int = 0,
-    jobs: int | None = None,
-    backend: Any = None,
+    jobs: int | Executor = 1,
     hyperprior: bool = True,
     options: OptimizerOptions | None = None,
     start: Mapping[str, Tensor] | Posterior | None = None,
@@ -77,8 +83,9 @@ def fit(
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
     Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
-    kernels and noise by marginal likelihood; where both are open, in turn. Then the functions are conditioned on the
-    rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
+    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then functions are
+    conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`,
+    `posterior.predict(q, v, u)`.
 
     Parameters
     ----------
@@ -97,9 +104,8 @@ def fit(
         local optima cost most and searches cost little, and 1 beyond, which then begins where searches on 250 and
         500 of the rows ended.
     seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
-    jobs: restarts at once; None is 1, or as many as the backend can. Results do not depend on it.
-    backend: where restarts run: `Serial()`, `Joblib(jobs)`, a `Backend` of your own, or a name, "serial", "joblib".
-        None is this process for one job and processes of this machine for several.
+    jobs: restarts at once, in as many processes of this machine, or an executor in which they run, such as Dask's
+        `client.get_executor()`. Results do not depend on it.
     hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
         maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
     options: the search itself; None is `fit.search.default_options`, which is content sooner beyond 400 points.
@@ -144,7 +150,7 @@ def fit(
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
-        search = Search(backend_for(backend, jobs), restarts, seed, hyperprior, options, start, progress)
+        search = Search(checked_jobs(jobs), restarts, seed, hyperprior, options, start, progress)
         posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points, rest)
     if refinement is None:
         return posterior
@@ -201,7 +207,7 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
 
 def _of_numbers(
     model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int, progress: FitProgress | None
-) -> StructuredPosterior:
+) -> Posterior:
     """Laws and bodies alone, from all rows."""
     report = None if progress is None else partial(progress, ALL_ROWS)
     if rows is not None:
@@ -219,7 +225,7 @@ def _of_numbers(
         "noise": found.noise.to_dict(),
     }
     noise = found.noise.parameters(model.robot.nv, model.robot.device)
-    return StructuredPosterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)
+    return Posterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,8 +244,6 @@ class _Functions:
         plain = unobserved(self.model)
         if len(plain.inputs) < len(self.model.inputs) and dataset.u.shape[1] == len(plain.inputs):
             return replace(self, model=plain).fitted(dataset, points, evidence)
-        if any(isinstance(force, IndependentAccelerations) for force in self.model.unknown_forces):
-            return fit_independent(self.model, dataset, points, self.search)
         if found := in_air(self.model, dataset):
             settings, seen = found
             assert seen.model is not None, "it was given one"
@@ -249,7 +253,7 @@ class _Functions:
             return learned.with_model(unobserved(learned.model)).with_settings(**settings)
         return self._of_rows(dataset, points)
 
-    def _of_rows(self, dataset: Dataset, points: int | None) -> StructuredPosterior:
+    def _of_rows(self, dataset: Dataset, points: int | None) -> Posterior:
         """From accelerations: hyper-parameters from some of the rows, the posterior from all."""
         chosen = engine_of(self.engine)
         all_rows = dataset
@@ -272,7 +276,7 @@ class _Functions:
         report = None if progress is None else partial(progress, ALL_ROWS)
         return on_all_rows(fitted, all_rows, chosen, described, hyperprior, report)
 
-    def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> StructuredPosterior:
+    def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> Posterior:
         """From windows: hyper-parameters and the posterior from all of them."""
         if not isinstance(engine_of(self.engine) or Exact(), Exact) or self.learning_points is not None:
             raise InvalidInput(
@@ -305,8 +309,8 @@ class _Functions:
                 start = closed._search(ordered.rows(slice(stage)), dataset).hyperparameters
         return start
 
-    def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
-        """Searches for functions and for numbers of laws and bodies in turn, where these are open."""
+    def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> Posterior:
+        """Searches for functions with numbers of laws and bodies free, where these are open."""
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
         given = rows.nodes if isinstance(rows, WindowedRows) else rows
@@ -314,43 +318,34 @@ class _Functions:
         typical = typical_sizes(self.model, [given])
         model = with_payloads_placed(self.model, [dataset], typical)
         space = ParameterSpace(model, typical)
-        x = self._first_numbers(space, dataset)
-        again, posterior, found, change = self, None, None, np.inf
-        for _ in range(MOST_ROUNDS):
+        x = space.start
+        again, found, change = self, None, np.inf
+        for number in range(MOST_ROUNDS):
             with warnings.catch_warnings():
-                if posterior is not None:
+                if number:
                     warnings.simplefilter("ignore", DataWarning)  # the first search gave it, of the same rows
-                here = replace(space.model_at(x), noise=self.model.noise)
-                posterior = replace(again, model=here)._search(rows, dataset, beside_numbers=True)
-            x, found, change = numbers_beside(posterior, space, x)
+                posterior = again._beside_numbers(rows, dataset, space, x)
             again = replace(self, search=replace(self.search, restarts=1, start=posterior.hyperparameters))
+            x, found, change = numbers_beside(posterior, space, x)
             if change < CHANGE:
                 break
         assert found is not None, "there was a round"
-        here = replace(space.model_at(x), noise=self.model.noise)
-        posterior = replace(again, model=here)._search(rows, dataset, beside_numbers=True)
+        posterior = again._beside_numbers(rows, dataset, space, x)
         estimates = replace(estimates_beside(space, found, len(rows)), settled=change < CHANGE)
         return replace(posterior, estimates=estimates)
 
-    def _first_numbers(self, space: ParameterSpace, dataset: Dataset) -> np.ndarray:
-        """Where numbers begin: what all rows show without unknown functions, or the numbers of the model."""
-        if not space.model.robot.space.is_vector_space:  # unknown forces look like mass there
-            return space.start
-        bare = replace(space.model, forces=space.model.laws, noise=None)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)
-                solution = fit_physical(bare, [dataset], Accelerations())
-        except InvalidInput:  # contacts that slide, which only functions beside it explain
-            return space.start
-        low, high = space.bounds
-        return np.clip(solution.x, low, high) if len(solution.x) == space.size else space.start
+    def _beside_numbers(
+        self, rows: Dataset | WindowedRows, dataset: Dataset, space: ParameterSpace, x: np.ndarray
+    ) -> Posterior:
+        """One search with the numbers about x free."""
+        here = replace(space.model_at(x), noise=self.model.noise)
+        return replace(self, model=here)._search(rows, dataset, lambda given: with_free_numbers(given, space, x))
 
-    def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
+    def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> Posterior:
         """One search, or more under the normal force that friction changes."""
         first = self._search(rows, dataset)
 
-        def again(forces: UnknownForces, last: StructuredPosterior) -> StructuredPosterior:
+        def again(forces: UnknownForces, last: Posterior) -> Posterior:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DataWarning)  # the first fit gave it, of the same rows
                 begin = replace(self.search, restarts=1, start=last.hyperparameters)
@@ -360,9 +355,15 @@ class _Functions:
         return fit_with_refined_loads(first, again)
 
     def _search(
-        self, rows: Dataset | WindowedRows, dataset: Dataset, beside_numbers: bool = False
-    ) -> StructuredPosterior:
-        """One search on these rows or windows of the log with the model as it is, and the exact posterior there."""
+        self,
+        rows: Dataset | WindowedRows,
+        dataset: Dataset,
+        beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None,
+    ) -> Posterior:
+        """One search on these rows or windows of the log with the model as it is, and the exact posterior there.
+
+        `beside` gives the likelihood in which numbers are free.
+        """
         noise = resolved_noise(self.model.noise, rows)
         model = replace(self.model, noise=noise)
         training = TrainingData.of(rows, model.robot.device)
@@ -376,10 +377,11 @@ class _Functions:
         described["forces"] = [described_force(force) for force in model.forces]
         learned_noise, fixed = likelihood.split_noise
         kernels = likelihood.kernels
-        if beside_numbers and self.search.hyperprior:
+        if beside is not None and self.search.hyperprior:
             kernels, described["log_variance_spread"] = with_variance_priors(kernels), LOG_VARIANCE_SPREAD
-        objective = FitObjective(likelihood, kernels, noise, fixed, self.search.hyperprior)
+        searched = likelihood if beside is None else beside(likelihood)
+        objective = FitObjective(searched, kernels, noise, fixed, self.search.hyperprior)
         starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
         result, of_search = self.search.best(objective, starts)
         found = result.parameters | fixed, result, {**described, **of_search}
-        return StructuredPosterior.conditioned(model, training, *found, estimates=Estimates())
+        return Posterior.conditioned(model, training, *found, estimates=Estimates())

@@ -1,4 +1,4 @@
-"""Numbers of laws and bodies beside unknown functions: Gauss-Newton on rows whose covariance contains the functions.
+"""Numbers of laws and bodies beside unknown functions: least squares on rows whose covariance contains the functions.
 
 With kernels and noise given, the rows y = m(x) + W f + e have the covariance S = R + W K W^T, and
 
@@ -7,97 +7,144 @@ With kernels and noise given, the rows y = m(x) + W f + e have the covariance S 
 is least squares (generalised least squares; Rasmussen & Williams 2006, section 2.7). Whitened and deflated as in
 `forcegp.inference.likelihood`, r^T S^-1 r = |(1 - U U^T) y~|^2 + |L^-1 U^T y~|^2 with T = L L^T, so it costs one factor
 of T and a solution for each number. That the directions W change with x as well is left out of the derivative.
+
+Kernels are sought at the best numbers of every kernel (`FreeNumbers`; variable projection, Golub & Pereyra 1973), with
+the residual linear about the numbers of the last round. Sought in turn, functions learn at first what wrong numbers do,
+and are then known too well to give it back: the mass of a tool ended 6 cm away.
 Information about x does not depend on that about kernels: a mean and a covariance (Kay 1993, eq. 3.31).
 """
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.evidence import TrainingData
 from forcegp.evidence.least_squares import Fit, weighted_least_squares
+from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.inference.cholesky import factorize
-from forcegp.inference.likelihood import deflate, deflated_covariance, whiten
-from forcegp.posterior import StructuredPosterior
+from forcegp.inference import LatentKernels, Terms
+from forcegp.inference.cholesky import CholeskyFactor, factorize
+from forcegp.inference.likelihood import deflated_covariance, whiten
+from forcegp.inference.linear_functionals import Functionals
+from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 
 MOST_ROUNDS = 6
-"""Searches for kernels and for numbers in turn."""
+"""Searches, each about the numbers of the last one."""
 CHANGE = 0.1
 """They end where numbers change by fewer of their standard deviations."""
 
 
-class JointRows:
-    """The learning rows of a posterior, and the directions in which its functions act, whitened."""
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """What columns of residuals are over their covariance, functions included."""
 
-    def __init__(self, posterior: StructuredPosterior, space: ParameterSpace) -> None:
-        likelihood, training = posterior.likelihood, posterior.likelihood.training
+    terms: Terms
+    weights: Float[Tensor, "N n"] | None
+    U: Float[Tensor, "N D r"] | None
+    factor: CholeskyFactor | None
+
+    @classmethod
+    def of(
+        cls, terms: Terms, weights: Float[Tensor, "N n"] | None, matrices: Sequence[Float[Tensor, "N N"]]
+    ) -> "Whitening":
+        """That of rows, or of windows with these weights. Raises NumericalError without a factorisation."""
+        if weights is not None:
+            S = Functionals.of(weights, terms).covariance(matrices)
+            return cls(terms, weights, None, factorize(lambda: 0.5 * (S + S.mT)))
+        found = terms.deflated()
+        factor = factorize(lambda: deflated_covariance(found.C, matrices)) if found.rank else None
+        return cls(terms, None, found.U, factor)
+
+    def __call__(self, values: Float[Tensor, "rows D k"]) -> Float[Tensor, "n k"]:
+        """Of every state."""
+        if self.weights is not None:
+            assert self.factor is not None, "windows have one"
+            columns = Functionals.of(self.weights, self.terms._replace(W=values)).G.sum(2)
+            return self.factor.solve_lower(columns.flatten(0, 1))
+        columns, *_ = whiten(values, self.terms.residual, self.terms.noise)
+        if self.U is None or self.factor is None:
+            return columns.flatten(0, 1)
+        along = self.U.mT @ columns
+        across = (columns - self.U @ along).flatten(0, 1)
+        return torch.cat([across, self.factor.solve_lower(along.flatten(0, 1))])
+
+
+class Slopes:
+    """Residuals of the learning rows as functions of the numbers."""
+
+    def __init__(self, training: TrainingData, space: ParameterSpace) -> None:
         self.space = space
         q, v, u = (x.cpu().numpy() for x in (training.q, training.v, training.u))
         self.rows = RecordedRows(space, q, v, u, any_contact=True)
         self.a = training.a.cpu().numpy()  # of windows, their mean, which weights of sum 1 leave as it is
-        features, W, _, noise = likelihood.terms(posterior.hyperparameters)
-        kernels, self.weights = posterior.kernels, training.weights
-        matrices = kernels.matrices(posterior.hyperparameters, features)
-        self.noise, self.like = noise.expand(len(W), *noise.shape[1:]), W
-        self.U: Tensor | None = None
-        if self.weights is not None:
-            self.factor = factorize(self._of_windows(W, matrices).clone)
-            return
-        nothing = torch.zeros_like(training.a)
-        white, *_ = whiten(W, nothing, self.noise)
-        found = deflate(white, nothing)
-        self.U = found.U
-        self.factor = factorize(deflated_covariance(found.C, matrices).clone) if found.rank else None
+        self.device = training.a.device
 
-    def _of_windows(self, W: Tensor, matrices: list[Tensor]) -> Float[Tensor, "n n"]:
-        """S of all windows, dense: sums over their nodes."""
-        assert self.weights is not None, "there are windows"
-        windows, nodes = self.weights.shape
-        nv = W.shape[1]
-        S = W.new_zeros(windows * nv, windows * nv)
-        for c, K in enumerate(matrices):
-            own = self.weights.reshape(-1, 1) * W[..., c]  # (N, nv)
-            for k in range(nv):
-                part = (own[:, k, None] * K).unflatten(0, (windows, nodes)).sum(1)
-                both = torch.einsum("wn,nj->wnj", part, own).unflatten(1, (windows, nodes)).sum(2)
-                S[k::nv] += both.flatten(1)
-        R = self.noise.unflatten(0, (windows, nodes))
-        first = torch.diag_embed(R[:, 0]) if R.dim() == 3 else (self.weights[..., None, None].square() * R).sum(1)
-        return S + torch.block_diag(*first)
-
-    def white(self, values: Float[np.ndarray, "N nv k"]) -> Float[Tensor, "rows k"]:
-        """Columns of residuals over their covariance."""
-        given = torch.as_tensor(values, device=self.like.device)
-        if self.U is None:
-            assert self.weights is not None, "there are windows"
-            assert self.factor is not None, "there are windows"
-            summed = (self.weights[..., None, None] * given.unflatten(0, self.weights.shape)).sum(1)
-            return self.factor.solve_lower(summed.flatten(0, 1))
-        columns, *_ = whiten(given, torch.zeros_like(given[..., 0]), self.noise)
-        along = self.U.mT @ columns
-        across = (columns - self.U @ along).flatten(0, 1)
-        return across if self.factor is None else torch.cat([across, self.factor.solve_lower(along.flatten(0, 1))])
-
-    def residual(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `weighted_least_squares` takes it: one whitened equation in a row."""
+    def at(self, x: Float[np.ndarray, " k"]) -> Float[Tensor, "rows nv columns"]:
+        """The residual and then its derivatives."""
         r, Y, in_terms = self.rows.in_acceleration(x, self.a)
         of_bodies = self.space.bodies.chained(x[: self.space.bodies.size], Y)
-        both = np.concatenate([r[..., None], of_bodies, in_terms], axis=-1)
-        white = self.white(both).cpu().numpy()
-        return white[:, :1], white[:, None, 1:]
+        return torch.as_tensor(np.concatenate([r[..., None], of_bodies, in_terms], axis=-1), device=self.device)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeNumbers:
+    """The marginal likelihood at the best numbers, in nats: a function of kernels and noise alone.
+
+    `slopes` (rows, nv, k) are derivatives of the residual about the numbers of the model; `prior` is the distance from
+    the prior there, and its Jacobian. Derivatives in kernels are those at numbers that stay (envelope theorem).
+    """
+
+    likelihood: MarginalLikelihood
+    slopes: Tensor
+    prior: tuple[Tensor, Tensor]
+
+    @property
+    def training(self) -> TrainingData:
+        """The learning rows."""
+        return self.likelihood.training
+
+    def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+        """Differentiable once in every parameter."""
+        terms, matrices = self.likelihood.checked_terms(kernels, parameters)
+        distance, jacobian = self.prior
+        with torch.no_grad():
+            white = Whitening.of(terms, self.training.weights, matrices)
+            of_data = white(torch.cat([terms.residual[..., None], self.slopes], -1))
+            columns = torch.cat([of_data, torch.cat([distance[:, None], jacobian], -1)])
+            step = torch.linalg.lstsq(columns[:, 1:], -columns[:, :1]).solution[:, 0]
+        moved = terms._replace(residual=terms.residual + self.slopes @ step)
+        return self.likelihood.of_terms(moved, matrices) + 0.5 * (distance + jacobian @ step).square().sum()
+
+
+def with_free_numbers(likelihood: MarginalLikelihood, space: ParameterSpace, x: Float[np.ndarray, " k"]) -> FreeNumbers:
+    """The likelihood of a model whose numbers are x, as they change."""
+    slopes = Slopes(likelihood.training, space).at(x)[..., 1:]
+    distance, jacobian = (torch.as_tensor(part, device=slopes.device) for part in space.prior(x))
+    return FreeNumbers(likelihood, slopes, (distance, jacobian))
 
 
 def numbers_beside(
-    posterior: StructuredPosterior, space: ParameterSpace, x: Float[np.ndarray, " k"]
+    posterior: Posterior, space: ParameterSpace, x: Float[np.ndarray, " k"]
 ) -> tuple[np.ndarray, Fit, float]:
     """Coordinates at fixed kernels, the search, and by how many standard deviations the farthest moved."""
+    likelihood, slopes = posterior.likelihood, Slopes(posterior.training, space)
     with torch.no_grad():
-        rows = JointRows(posterior, space)
+        terms = likelihood.terms(posterior.hyperparameters)
+        matrices = posterior.kernels.matrices(posterior.hyperparameters, terms.features)
+        white = Whitening.of(terms, posterior.training.weights, matrices)
+
+        def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            columns = white(slopes.at(x)).cpu().numpy()  # one equation in a row
+            return columns[:, :1], columns[:, None, 1:]
+
         fit = weighted_least_squares(
-            rows.residual,
+            residual,
             space.prior,
             x,
             space.bounds,

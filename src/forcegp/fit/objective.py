@@ -26,7 +26,7 @@ from forcegp.forces.basic_kernels import register_log_normal_prior
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, best_of, minimize_objective
 from forcegp.inference.threads import blas_threads
 from forcegp.noise import Noise
-from forcegp.parallel import Backend
+from forcegp.parallel import Jobs
 
 LOG_VARIANCE_SPREAD = 2.0
 """Standard deviation of the prior on the logarithm of a latent's variance, where physical parameters are learned."""
@@ -89,7 +89,7 @@ class Search:
     Raises InvalidInput for numbers out of range.
     """
 
-    backend: Backend
+    jobs: Jobs
     restarts: int | None
     seed: int
     hyperprior: bool
@@ -123,7 +123,7 @@ class Search:
         restarts, options = self.resolved(len(objective.likelihood.training))
         one = partial(_one_start, objective, starts, options)
         with blas_threads(objective.likelihood.training.q.numel()):
-            results = run_restarts(one, restarts, options.patience, self.backend, self.progress)
+            results = run_restarts(one, restarts, options.patience, self.jobs, self.progress)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))

@@ -16,7 +16,7 @@ from forcegp.errors import DataWarning, FitError, InvalidInput, usable_arguments
 from forcegp.evidence.windows import WindowedRows
 from forcegp.inference import OptimizationResult, OptimizerOptions
 from forcegp.noise import Noise
-from forcegp.parallel import Backend, Joblib, Serial
+from forcegp.parallel import Jobs, mapped
 from forcegp.robots.arguments import whole_number
 
 MOST_RESTARTS = 10_000
@@ -172,9 +172,9 @@ def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, T
 
 
 def run_restarts(
-    search: Callable[..., Outcome], restarts: int, patience: int, backend: Backend, progress: FitProgress | None
+    search: Callable[..., Outcome], restarts: int, patience: int, jobs: Jobs, progress: FitProgress | None
 ) -> Sequence[Outcome]:
-    """`search(index, before=outcomes, progress=progress)` from 0 on, on a backend, on which outcomes do not depend.
+    """`search(index, before=outcomes, progress=progress)` from 0 on, so many at once, on which outcomes do not depend.
 
     Those before are given with `patience` only, and then `AT_ONCE` run at once. Only this process can report progress.
     A single search needs no other process of this machine.
@@ -183,10 +183,10 @@ def run_restarts(
     while len(outcomes) < restarts:
         last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
         indices, before = range(len(outcomes), last), tuple(outcomes)
-        if isinstance(backend, Serial) or (restarts == 1 and isinstance(backend, Joblib)):
+        if jobs == 1 or (restarts == 1 and isinstance(jobs, int)):
             outcomes += [search(index, before=before, progress=progress) for index in indices]
         else:
-            outcomes += backend.map(partial(search, before=before, progress=None), indices)
+            outcomes += mapped(partial(search, before=before, progress=None), indices, jobs)
     return outcomes
 
 

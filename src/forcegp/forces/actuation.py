@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_type
 from forcegp.forces.force import Law, as_numbers
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
@@ -26,6 +26,9 @@ class Actuation(Law):
     matrix: Sequence[Sequence[float]] | np.ndarray | Tensor | None = None
     names: tuple[str, ...] = ()
     known: bool = True
+
+    def __post_init__(self) -> None:
+        require_type("Actuation known", self.known, bool)
 
     @override
     def bound_to(self, robot: Robot) -> "Actuation":

@@ -18,8 +18,7 @@ from forcegp import __version__
 from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, require_writable, write_json
 from forcegp.errors import BackendError, FileFormatError, FitError, ForceGPError, InvalidInput, OutdatedWarning
 from forcegp.jobs.job import Job, digests, machine
-from forcegp.parallel import Backend, Joblib
-from forcegp.parallel.backend import outcome_of
+from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
 
 FORMAT_VERSION = 1
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
@@ -138,10 +137,8 @@ Progress = Callable[[int, int, str], None]
 """Called as `progress(work done, work in total, note)`; work is an estimate in CPU seconds."""
 
 
-def run_jobs(
-    store: JobStore, jobs: Sequence[Job], backend: Backend | None = None, progress: Progress | None = None
-) -> int:
-    """Compute all jobs that the store lacks, on a backend (None: in one other process); returns how many.
+def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: Progress | None = None) -> int:
+    """Compute all jobs that the store lacks, so many at once, or in an executor; returns how many.
 
     Every finished job is kept at once, so a run that is killed at any moment goes on where it was. A job that fails
     stops only what depends on it. Results of other code or settings are computed anew, with a warning. Raises FitError
@@ -157,7 +154,7 @@ def run_jobs(
         if missing:
             require_writable(store.place("trial"))
             _warn_of_outdated(store, missing)
-            _Run(store, by_name, dict(missing), wanted, progress).on(backend or Joblib(1))
+            _Run(store, by_name, dict(missing), wanted).on(at_once, progress)
     return len(missing)
 
 
@@ -175,42 +172,39 @@ def _warn_of_outdated(store: JobStore, missing: Mapping[str, Job]) -> None:
         )
 
 
-@dataclass
 class _Run:
-    """The jobs that wait, those that run, and those that are done."""
+    """The jobs that wait, and those that are done."""
 
-    store: JobStore
-    jobs: Mapping[str, Job]
-    waiting: dict[str, Job]
-    digests: Mapping[str, str]
-    progress: Progress | None
-
-    def __post_init__(self) -> None:
-        self.finished = self.jobs.keys() - self.waiting.keys()
-        self.total, self.count = sum(job.cost for job in self.waiting.values()), len(self.waiting)
-        self.done: list[str] = []
-        self.done_cost = 0.0
+    def __init__(self, store: JobStore, jobs: Mapping[str, Job], waiting: dict[str, Job], wanted: Mapping[str, str]):
+        self.store, self.waiting, self.digests = store, waiting, wanted
+        self.finished = jobs.keys() - waiting.keys()
+        self.total, self.count = sum(job.cost for job in waiting.values()), len(waiting)
+        self.done, self.done_cost = 0, 0.0
         self.failed: dict[str, str] = {}
         self.stopped = False
 
-    def on(self, backend: Backend) -> None:
+    def on(self, at_once: Jobs, progress: Progress | None) -> None:
         """Compute all."""
-        at_work: dict[Future[None], Job] = {}
+        executor, at_work = executor_for(at_once), dict[Future[Any], Job]()
+        most = at_once if isinstance(at_once, int) else self.count
         try:
             while True:
-                for job in self._ready(backend.jobs - len(at_work)):
+                for job in self._ready(most - len(at_work)):
                     bare = replace(job, arguments=())  # arguments go by themselves
                     known = {"digest": self.digests[job.name], "code": job.code_digest}
-                    at_work[backend.submit(compute, self.store, bare, known, *job.arguments)] = job
+                    at_work[submit(executor, compute, self.store, bare, known, *job.arguments)] = job
                 if not at_work:
                     break  # what still waits depends on jobs that failed
                 for future in wait(at_work, return_when=FIRST_COMPLETED).done:
-                    self._record(at_work.pop(future), future)
+                    job = at_work.pop(future)
+                    self._record(job, future)
+                    if progress is not None:
+                        note = f"{self.done + len(self.failed)} of {self.count} jobs, last {job.name}"
+                        progress(int(self.done_cost * 10), max(1, int(self.total * 10)), note)
         except BackendError as error:
             raise BackendError(f"{error}. {self._kept()}") from None
         finally:
-            if at_work:
-                backend.stop()
+            stop(executor, at_work)
             remove_leftovers(self.store.folder)
         if self.failed:
             name, cause = next(iter(self.failed.items()))
@@ -219,28 +213,21 @@ class _Run:
             raise FitError(f"{name}{others}{skipped} ({cause}); {self._kept()}")
 
     def _kept(self) -> str:
-        return f"{len(self.done)} of {self.count} jobs are kept, so the same command goes on from here"
+        return f"{self.done} of {self.count} jobs are kept, so the same command goes on from here"
 
     def _ready(self, free: int) -> list[Job]:
-        """The next jobs whose inputs are finished: those that others wait for longest come first."""
+        """The next jobs whose inputs are finished, and which no longer wait: the longest come first."""
         ready = [job for job in self.waiting.values() if not self.stopped and self.finished.issuperset(job.inputs)]
-        ready.sort(key=lambda job: -self._work_behind(job.name))
-        chosen = ready[:free]
+        chosen = sorted(ready, key=lambda job: -job.cost)[:free]
         for job in chosen:
             del self.waiting[job.name]
         return chosen
 
-    def _work_behind(self, name: str) -> float:
-        """Cost of this job and of the longest chain of jobs that wait for it."""
-        job = self.waiting[name]
-        return job.cost + max(
-            (self._work_behind(other.name) for other in self.waiting.values() if name in other.inputs), default=0.0
-        )
-
-    def _record(self, job: Job, future: Future[None]) -> None:
+    def _record(self, job: Job, future: Future[Any]) -> None:
+        self.done_cost += job.cost
         try:
             outcome_of(future)
-            self.done.append(job.name)
+            self.done += 1
             self.finished.add(job.name)
         except BackendError:
             raise
@@ -250,10 +237,6 @@ class _Run:
             self.failed[job.name], self.stopped = str(error), True
         except Exception as error:  # also a defect in one job must not cost what other jobs have done
             self.failed[job.name] = f"{type(error).__name__}: {error}"
-        self.done_cost += job.cost
-        if self.progress is not None:
-            note = f"{len(self.done) + len(self.failed)} of {self.count} jobs, last {job.name}"
-            self.progress(int(self.done_cost * 10), max(1, int(self.total * 10)), note)
 
 
 def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: Any) -> None:

@@ -89,10 +89,6 @@ class Contact:
                 "name a frame that moves."
             )
 
-    def more(self) -> dict[str, object]:
-        """The fields that other contacts lack, as plain JSON values."""
-        return {}
-
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:
         """World position p(q) of the contact point (..., 3) in m."""
         return placed(kinematics, self.frame, self.point)[1]

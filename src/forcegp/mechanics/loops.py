@@ -28,8 +28,6 @@ from forcegp.robots.arguments import finite_vector
 from forcegp.robots.mjcf_model import LoopDescription
 
 Point = tuple[float, float, float]
-SECOND = ("second_frame", "second_point", "turning")
-"""What files carry of a closed loop beside what they carry of a contact."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +61,6 @@ class LoopClosure(Contact):
                 f"frames {self.frame!r} and {self.second_frame!r} of {robot.name} do not move against each other, so "
                 "they close no loop; name frames of two bodies."
             )
-
-    @override
-    def more(self) -> dict[str, object]:
-        return dict(zip(SECOND, (self.second_frame, list(self.second_point), self.turning), strict=True))
 
     @property
     def _ends(self) -> tuple[tuple[str, Point], tuple[str, Point]]:

@@ -1,30 +1,31 @@
 """Contacts of every kind as plain JSON values."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
+from forcegp.errors import ContactError
 from forcegp.mechanics.gauss_principle import Contact
-from forcegp.mechanics.loops import SECOND, LoopClosure
+from forcegp.mechanics.loops import LoopClosure
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
-from forcegp.mechanics.wheels import WHEEL, RollingContact
+from forcegp.mechanics.wheels import RollingContact
+
+CONTACTS: dict[str, type[Contact]] = {"contact": Contact, "loop": LoopClosure, "rolling": RollingContact}
+"""By the name that files have for them."""
 
 
 def contact_to_dict(contact: Contact) -> dict[str, Any]:
-    """Raises ContactError for a surface that holds code."""
-    return {
-        **{"frame": contact.frame, "point": list(contact.point)},
-        **({} if contact.switch is None else {"switch": contact.switch}),
-        "surface": surface_to_dict(contact.surface),
-        **contact.more(),
-    }
+    """Its name in `CONTACTS` and its fields. Raises ContactError for other contacts and a surface that holds code."""
+    name = next((name for name, kind in CONTACTS.items() if type(contact) is kind), None)
+    if name is None:
+        raise ContactError(f"a {type(contact).__name__} cannot be stored; files carry {', '.join(CONTACTS)}.")
+    given = {each.name: getattr(contact, each.name) for each in fields(contact)}
+    listed = {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}
+    return {"type": name, **listed, "surface": surface_to_dict(contact.surface)}
 
 
 def contact_from_dict(entry: Mapping[str, Any]) -> Contact:
     """The contact that `contact_to_dict` stored. Raises KeyError or TypeError for anything else."""
-    entry = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
-    place, switch = (entry["frame"], tuple(entry["point"])), entry.get("switch")
-    surface = object_from_dict("surface", SURFACES, entry["surface"])
-    for kind, names in ((LoopClosure, SECOND), (RollingContact, WHEEL)):
-        if names[0] in entry:
-            return kind(*place, surface, switch, **{name: entry[name] for name in names if name in entry})  # type: ignore[arg-type]  # the constructors check
-    return Contact(*place, surface, switch)
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
+    given["surface"] = object_from_dict("surface", SURFACES, given["surface"])
+    return CONTACTS[given.pop("type")](**given)

@@ -24,9 +24,6 @@ from forcegp.mechanics.gauss_principle import Contact, Row
 from forcegp.mechanics.surfaces import Held, Plane, Vector, direction, positive, surface_axes
 from forcegp.robots import Kinematics
 
-WHEEL = ("radius", "axis", "normal")
-"""What files carry of a rolling contact beside what they carry of a contact."""
-
 LYING = 1e-9
 """Sine of the angle between axis and normal below which a wheel lies flat and touches everywhere."""
 
@@ -52,10 +49,6 @@ class RollingContact(Contact):
         object.__setattr__(self, "normal", direction("RollingContact normal", self.normal)[0])
         if self.axis is not None:
             object.__setattr__(self, "axis", direction("RollingContact axis", self.axis)[0])
-
-    @override
-    def more(self) -> dict[str, object]:
-        return {"radius": self.radius, "axis": self.axis and list(self.axis), "normal": list(self.normal)}
 
     @override
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:

@@ -1,4 +1,4 @@
-"""What people look at: one HTML file with the robot in motion, the same live in a browser, and as a log for rerun."""
+"""What people look at: one HTML file with the robot in motion, and the same live in a browser."""
 
 import lazy_loader as lazy
 

@@ -2,7 +2,6 @@ from .motion import Arrows as Arrows, RecordedScene as RecordedScene, recorded_s
 from .page import (
     Finding as Finding, Page as Page, Picture as Picture, Table as Table, is_page as is_page, write_page as write_page,
 )
-from .rerun_log import write_rerun as write_rerun
 from .results import (
     scene_notes as scene_notes,
     evaluation_sentence as evaluation_sentence, evaluation_table as evaluation_table, model_page as model_page,

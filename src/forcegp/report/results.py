@@ -61,7 +61,7 @@ def model_page(
         "error, the band its 95 % interval.",
         motion_bands_figure(posterior, dataset, seconds=PICTURED),
     )
-    if posterior.model.contacts and posterior.predicts_forces:
+    if posterior.model.contacts:
         steps["normal force"] = lambda: (
             "The forces of contacts, which no sensor measured.",
             normal_force_figure(posterior, dataset),

@@ -107,7 +107,6 @@ def _why() -> str:
 
 
 Vector = Sequence[float | int] | np.ndarray | Tensor
-Inertials = Mapping[str, Tensor]
 JointValues = Float[Tensor, "*#batch nv"]
 """One value per joint, float64 (..., nv); the batch dimensions of several arguments broadcast."""
 Positions = Float[Tensor, "*#batch nq"]

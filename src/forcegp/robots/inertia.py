@@ -1,4 +1,4 @@
-"""Inertial parameters of a rigid body: mass, centre of mass, inertia <-> pseudo-inertia <-> log-Cholesky.
+"""Inertial parameters of a rigid body: mass, centre of mass, inertia <-> pseudo-inertia.
 
 The 4x4 pseudo-inertia of a body (Wensing, Kim & Slotine, "Linear matrix inequalities for physically consistent inertial
 parameter identification", RA-L 2018) in the axes of its link frame is
@@ -16,8 +16,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
-from forcegp.errors import InvalidInput, NonPhysicalInertia
 
 Array = np.ndarray
 
@@ -81,12 +79,8 @@ def inverse(pose: Array) -> Array:
 ROUNDING = 1e-10
 # m^2; the square of a hundred millionth of a metre: a point, whatever the digits of a file say
 SMALLEST = 1e-16
-# relative thickness squared below which log-Cholesky parameters (logarithms) lose all digits
+# relative second moment below which is what rounding left of zero
 SINGULAR = 1e-12
-
-# e^(d1, d2, d3), s12, s23, s13, t1, t2, t3, 1 -> row-major 4x4 upper triangle
-_PLACE = np.zeros((10, 16))
-_PLACE[np.arange(10), [0, 5, 10, 1, 6, 2, 3, 7, 11, 15]] = 1.0
 
 # standard parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz -> pseudo-inertia (4, 4), row by row
 _STANDARD = np.zeros((16, 10))
@@ -113,63 +107,6 @@ def pseudo_inertia_of_standard(parameters: Float[Tensor, "*batch 10"]) -> Float[
 def standard_of_pseudo_inertia(pseudo: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 10"]:
     """Standard parameters of a symmetric pseudo-inertia: the inverse of :func:`pseudo_inertia_of_standard`."""
     return pseudo.flatten(-2) @ torch.linalg.pinv(standard_basis(pseudo.device)).mT
-
-
-def pseudo_inertia_factor(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
-    """Upper-triangular ``U`` with ``P = U U^T`` from log-Cholesky parameters, differentiable.
-
-    ``U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]`` for parameters in the
-    order ``alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3`` (Rucker & Wensing, "Smooth parameterization of rigid-body
-    inertia", RA-L 2022). Mass is ``e^(2 alpha)`` and the centre of mass is ``t``.
-    """
-    place = torch.as_tensor(_PLACE, dtype=parameters.dtype, device=parameters.device)
-    scale = parameters[..., :1].exp()
-    entries = torch.cat([parameters[..., 1:4].exp(), parameters[..., 4:], torch.ones_like(scale)], dim=-1)
-    return ((scale * entries) @ place).unflatten(-1, (4, 4))
-
-
-def pseudo_inertia_from_parameters(parameters: Float[Tensor, "*batch 10"]) -> Float[Tensor, "*batch 4 4"]:
-    """Pseudo-inertia ``P = U U^T`` of log-Cholesky parameters; positive definite by construction."""
-    factor = pseudo_inertia_factor(parameters)
-    return factor @ factor.mT
-
-
-def physical_from_parameters(
-    parameters: Float[Tensor, "*batch 10"],
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes) of log-Cholesky parameters."""
-    factor = pseudo_inertia_factor(parameters)
-    mass = factor[..., 3, 3].square()
-    upper = factor[..., :3, :3]
-    # U U^T - m c c^T without the cancellation: the last column of U carries the centre of mass alone
-    second_moment = upper @ upper.mT
-    trace = second_moment.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    identity = torch.eye(3, dtype=parameters.dtype, device=parameters.device)
-    return mass, parameters[..., 7:10], trace * identity - second_moment
-
-
-def parameters_from_physical(
-    mass: Float[Tensor, "*batch"], center_of_mass: Float[Tensor, "*batch 3"], inertia: Float[Tensor, "*batch 3 3"]
-) -> Float[Tensor, "*batch 10"]:
-    """Log-Cholesky parameters of a mass (kg), centre of mass (m) and inertia about it (kg m^2, link axes).
-
-    The inverse of :func:`physical_from_parameters`. Raises :class:`~forcegp.errors.InvalidInput` for a non-positive
-    mass or a pseudo-inertia that is not positive definite, for which no logarithm exists.
-    """
-    trace = inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    identity = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
-    second_moment = (0.5 * trace * identity - 0.5 * (inertia + inertia.mT)) / mass[..., None, None]
-    # reversing rows and columns turns the lower Cholesky factor into the upper one
-    lower, failed = torch.linalg.cholesky_ex(second_moment.flip(-2, -1))
-    if bool((failed != 0).any()) or not bool((mass > 0).all()):
-        raise InvalidInput(
-            "log-Cholesky parameters exist only for a positive mass and an inertia that satisfies the triangle "
-            "inequality strictly; give the body some thickness in every direction."
-        )
-    upper = lower.flip(-2, -1)
-    logs = upper.diagonal(dim1=-2, dim2=-1).log()
-    off_diagonal = torch.stack([upper[..., 0, 1], upper[..., 1, 2], upper[..., 0, 2]], dim=-1)
-    return torch.cat([0.5 * mass.log()[..., None], logs, off_diagonal, center_of_mass], dim=-1)
 
 
 def pseudo_inertia(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -231,27 +168,3 @@ def turns_with_inertia(kind: str, pseudo: np.ndarray) -> bool:
     second = pseudo[:3, :3] - (0.0 if kind == "spherical" else np.outer(first, first) / mass)
     least = second[0, 0] + second[1, 1] if kind == "planar" else np.linalg.eigvalsh(second)[1]
     return bool(least > SINGULAR * pseudo.diagonal()[:3].sum())
-
-
-def log_cholesky_of_link(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, link: str) -> Tensor:
-    """Log-Cholesky parameters (10,) of a link, called ``link`` in errors.
-
-    Raises :class:`~forcegp.errors.InvalidInput` for a massless frame and :class:`~forcegp.errors.NonPhysicalInertia`
-    where the mass is a line, plate or point.
-    """
-    if mass == 0.0:
-        raise InvalidInput(
-            f"link {link} is a massless frame, so it has no inertial parameters; name the link that carries the mass, "
-            "or give this one an <inertial> element."
-        )
-    moments = np.linalg.eigvalsh(inertia)
-    if moments[0] + moments[1] - moments[2] <= SINGULAR * moments.sum():
-        raise NonPhysicalInertia(
-            f"link {link} has a flat, line-like or point-like mass distribution (mass {mass:g} kg, principal moments "
-            f"{', '.join(f'{moment:.6g}' for moment in moments)} kg m^2), for which log-Cholesky parameters do not "
-            "exist. Its dynamics is fine; to make its inertia a parameter, give it some thickness in every direction "
-            "so that the two smaller principal moments add up to more than the largest."
-        )
-    return parameters_from_physical(
-        torch.tensor(mass, dtype=torch.float64), torch.as_tensor(center_of_mass), torch.as_tensor(inertia)
-    )

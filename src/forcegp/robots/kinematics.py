@@ -19,13 +19,14 @@ differentiable operations without branches on values, so vmap, jacrev, jacfwd an
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.robots.arguments import Inertials, JointValues, Vector, broadcast_batch, checked_point
+from forcegp.robots.arguments import JointValues, Vector, broadcast_batch, checked_point
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
 from forcegp.robots.manifold import Group, pose
@@ -196,8 +197,7 @@ def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor
 class Kinematics:
     """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
 
-    All methods are differentiable in q, v and their arguments. ``inertials`` maps link names to log-Cholesky parameters
-    (..., 10); links not named keep the inertia of the URDF. Batch dimensions broadcast. Methods that need velocities
+    All methods are differentiable in q, v and their arguments. Batch dimensions broadcast. Methods that need velocities
     raise :class:`~forcegp.errors.InvalidInput` if the kinematics was made without.
 
     The fields are internal: the batch is flattened and trails.
@@ -222,45 +222,44 @@ class Kinematics:
         v = of_bodies(robot.tree, _columns(v, batch))
         return cls(robot, batch, poses, vectors, twists, v, body_accelerations(robot.tree, twists, v))
 
-    def mass_matrix(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
+    @cached_property
+    def inertias(self) -> Bodies:
+        """Pseudo-inertias of the bodies in the world."""
+        return world_inertias(self.poses, self.robot.tree.inertias)
+
+    def mass_matrix(self) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
-        at, inertias = self._with_inertias(inertials)
-        return at._rows(at._mass_matrix(inertias))
+        return self._rows(self._mass_matrix(self.inertias))
 
-    def bias_forces(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def bias_forces(self) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: the tau that gives zero acceleration."""
-        at, inertias = self._with_inertias(inertials)
-        return at._rows(at._bias_forces(inertias))
+        return self._rows(self._bias_forces(self.inertias))
 
-    def mass_matrix_and_bias(
-        self, inertials: Inertials | None = None
-    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
-        """:meth:`mass_matrix` and :meth:`bias_forces` from the same inertias."""
-        at, inertias = self._with_inertias(inertials)
-        return at._rows(at._mass_matrix(inertias)), at._rows(at._bias_forces(inertias))
+    def mass_matrix_and_bias(self) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+        """:meth:`mass_matrix` and :meth:`bias_forces`."""
+        return self.mass_matrix(), self.bias_forces()
 
-    def gravity_forces(self, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
-        at, inertias = self._with_inertias(inertials)
-        return at._rows(gravity_forces(self.robot.tree, at.twists, inertias))
+        return self._rows(gravity_forces(self.robot.tree, self.twists, self.inertias))
 
-    def inverse_dynamics(self, a: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, a: JointValues) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
         a = self.robot.checked_input("a", a)
-        at, inertias = self._expanded("a", a.shape[:-1])._with_inertias(inertials)
+        at = self._expanded("a", a.shape[:-1])
         _, v = at._moving("inverse_dynamics")
         tree, a = self.robot.tree, _columns(a, at.batch_shape)
         accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, a))
-        forces = joint_forces(tree, at.twists, accelerations, inertias)
+        forces = joint_forces(tree, at.twists, accelerations, at.inertias)
         return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
-    def forward_dynamics(self, tau: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
         tau = self.robot.checked_input("tau", tau)
-        at, inertias = self._expanded("tau", tau.shape[:-1])._with_inertias(inertials)
-        net = _columns(tau, at.batch_shape).mT - at._bias_forces(inertias)
+        at = self._expanded("tau", tau.shape[:-1])
+        net = _columns(tau, at.batch_shape).mT - at._bias_forces(at.inertias)
         try:
-            factor = torch.linalg.cholesky(at._mass_matrix(inertias))
+            factor = torch.linalg.cholesky(at._mass_matrix(at.inertias))
         except torch.linalg.LinAlgError as error:
             raise NumericalError(NOT_POSITIVE_DEFINITE) from error
         return at._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
@@ -345,17 +344,6 @@ class Kinematics:
             raise InvalidInput(f"{what} needs velocities; make the kinematics with robot.kinematics(q, v).")
         return self.accelerations, self.v
 
-    def _with_inertias(self, inertials: Inertials | None) -> "tuple[Kinematics, Tensor]":
-        """These states broadcast against the batch of ``inertials``, and the bodies' pseudo-inertias in the world."""
-        if not inertials:
-            return self, world_inertias(self.poses, self.robot.tree.inertias)
-        inertias = self.robot.body_inertias(inertials)  # (n, 4, 4, *batch)
-        batch = inertias.shape[3:]
-        if not batch:
-            return self, world_inertias(self.poses, inertias[..., None])
-        at = self._expanded("inertials", batch)
-        return at, world_inertias(at.poses, _expand_trailing(inertias, 3, at.batch_shape))
-
     def _world_point(self, frame: str, point: Vector | None) -> "tuple[Kinematics, int, Tensor]":
         """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
         body, offset = self.robot.frame(frame)
@@ -382,7 +370,8 @@ class Kinematics:
             lead = values.shape[:-1]
             return _expand_trailing(values.reshape(*lead, *self.batch_shape), len(lead), batch)
 
-        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        names = ("poses", "vectors", "twists", "v", "accelerations")
+        tensors = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(self, batch_shape=batch, **{name: wider(value) for name, value in tensors.items()})
 
 

@@ -352,7 +352,7 @@ class CompiledModel:
         return {name: value for name, value in out.items() if value}
 
     def _lose(self, what: str, where: str) -> None:
-        self.problems.ignore(f"left out: {what}", where, what)
+        self.problems.note(f"left out: {what}", where)
 
     def _note_losses(self, motors: bool) -> None:
         """Note what acts on the joints in MuJoCo and not here."""

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from forcegp.errors import InvalidNumber, RobotFileWarning, RobotModelError
+from forcegp.errors import RobotFileWarning, RobotModelError
 
 LISTED = 12
 """Problems of one kind that a message lists; the error has all of them."""
@@ -16,18 +16,11 @@ class Problems:
     """What is wrong with a file, and what was repaired.
 
     Parameters: ``source``, which every message begins with; ``given``, arguments of ``Robot.from_urdf`` that the
-    remedy keeps; ``strict``, whether what could be ignored is an error; ``reader``, the function that reads the file.
+    remedy keeps; ``reader``, the function that reads the file.
     """
 
-    def __init__(
-        self,
-        source: str,
-        given: Mapping[str, Any] | None = None,
-        *,
-        strict: bool = False,
-        reader: str = "Robot.from_urdf",
-    ) -> None:
-        self.source, self.given, self.strict, self.reader = source, dict(given or {}), strict, reader
+    def __init__(self, source: str, given: Mapping[str, Any] | None = None, reader: str = "Robot.from_urdf") -> None:
+        self.source, self.given, self.reader = source, dict(given or {}), reader
         self.errors: list[RobotModelError] = []
         self.broken: set[str] = set()
         """Links of which something is reported, so that nothing else need be."""
@@ -42,14 +35,6 @@ class Problems:
             self.errors.append(error)
             if link is not None:
                 self.broken.add(link)
-
-    def ignore(self, what: str, where: str, seen: str) -> None:
-        """Note ``what`` is ignored of the element ``where``. With `strict` this is an error: what was ``seen``."""
-        if self.strict:
-            advice = f"; correct it, or leave strict out: {what}."
-            self.errors.append(InvalidNumber(f"{self.source}: {where} has {seen}", advice))
-        else:
-            self.note(what, where)
 
     def note(self, what: str, where: str) -> None:
         """Note what was ignored or repaired, and of which element."""

@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, RobotFileWarning, UnstatedBase, usable_arguments
+from forcegp.errors import RobotFileWarning, UnstatedBase, usable_arguments
 from forcegp.robots.arguments import (
-    Inertials,
     JointValues,
     Positions,
     Vector,
@@ -26,7 +25,7 @@ from forcegp.robots.arguments import (
 )
 from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.robots.inertia import SINGULAR, physical_from_parameters
+from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import lay_out
 from forcegp.robots.mjcf import is_mjcf, translate
@@ -61,8 +60,7 @@ class Robot(RobotStructure):
     leading batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth
     first, branches in file order. On a base that moves, q has other entries than v (:mod:`forcegp.robots.manifold`):
     `nq` of them, called :attr:`position_names`; :meth:`integrate` and :meth:`difference` add and subtract. Batch
-    dimensions of all arguments broadcast. ``inertials`` maps names of moving links to log-Cholesky parameters (..., 10)
-    (see :mod:`forcegp.robots.inertia`); links not named keep the inertia of the URDF.
+    dimensions of all arguments broadcast.
 
     Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
     :class:`~forcegp.errors.UnknownName`.
@@ -71,42 +69,16 @@ class Robot(RobotStructure):
     @classmethod
     @usable_arguments("Robot.from_urdf")
     def from_urdf(
-        cls,
-        path: str | Path,
-        *,
-        gravity: Vector = GRAVITY,
-        armature: Vector | Mapping[str, float | int] | None = None,
-        locked: Mapping[str, float | int] | None = None,
-        inertias: InertiaChoice = "strict",
-        base: BaseChoice | None = None,
-        root: str | None = None,
-        strict: bool = False,
+        cls, path: str | Path, *, armature: Vector | Mapping[str, float | int] | None = None, **options: Any
     ) -> "Robot":
         """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
-        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
-        joint or by joint name, by default what :meth:`to_urdf` wrote beside the file, or 0; ``locked`` maps joint names
-        to positions at which movable joints become fixed; ``inertias`` of "nearest" replaces one that no body has by
-        the nearest possible; ``base`` says how the root is held, "fixed", "floating", "planar" or "spherical", which
-        files of robots that do not look bolted to the world are asked; ``root`` names a link that the file does not
-        define, "world" for example, to be the root. A RobotFileWarning names what was ignored or repaired; with
-        ``strict`` what could be ignored is an error.
-
-        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, all links and joints
-        that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``). Raises
-        :class:`~forcegp.errors.MissingExtra` for a .xacro file without the package xacro.
+        ``armature`` and ``options`` are those of :meth:`from_urdf_text`; without, rotor inertias are what
+        :meth:`to_urdf` wrote beside the file. Raises what that raises, and :class:`~forcegp.errors.MissingExtra` for a
+        .xacro file without the package xacro.
         """
-        return cls.from_urdf_text(
-            read_robot_file(path),
-            source=str(path),
-            gravity=gravity,
-            armature=read_armature(path) if armature is None else armature,
-            locked=locked,
-            inertias=inertias,
-            base=base,
-            root=root,
-            strict=strict,
-        )
+        text, armature = read_robot_file(path), read_armature(path) if armature is None else armature
+        return cls.from_urdf_text(text, source=str(path), armature=armature, **options)
 
     @classmethod
     @usable_arguments("Robot.from_urdf_text")
@@ -121,16 +93,23 @@ class Robot(RobotStructure):
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
         root: str | None = None,
-        strict: bool | None = False,
     ) -> "Robot":
-        """As :meth:`from_urdf`, from text; ``source`` is what error messages call it.
+        """Read URDF text; ``source`` is what error messages call it.
 
-        ``strict`` of None warns of nothing: for text that was warned of before.
+        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
+        joint or by joint name, by default 0; ``locked`` maps joint names to positions at which movable joints become
+        fixed; ``inertias`` of "nearest" replaces one that no body has by the nearest possible; ``base`` says how the
+        root is held, "fixed", "floating", "planar" or "spherical", which files of robots that do not look bolted to the
+        world are asked; ``root`` names a link that the file does not define, "world" for example, to be the root. A
+        RobotFileWarning names what was ignored or repaired.
+
+        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, all links and joints
+        that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``).
         """
         text = well_formed(text.lstrip())
         text = text if root is None else with_root(text, root)
         given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
-        return cls._made(text, Problems(source, given, strict=bool(strict)), gravity, armature, quiet=strict is None)
+        return cls._made(text, Problems(source, given), gravity, armature)
 
     @classmethod
     @usable_arguments("Robot.from_mjcf")
@@ -142,12 +121,12 @@ class Robot(RobotStructure):
         linear is a mimic joint. Meshes are needed only where a mass follows from them. q is MuJoCo's `qpos`, but
         quaternions are x, y, z, w, and the linear velocity of a free body has the axes of the body.
 
-        Parameters are those of :meth:`from_urdf`, without ``root``: ``gravity`` (default: the file's), ``armature``
-        (default: the file's), ``locked``, ``inertias``, ``base`` (default: as in the file) and ``strict``. A
+        Parameters are those of :meth:`from_urdf_text`, without ``root``: ``gravity`` (default: the file's),
+        ``armature`` (default: the file's), ``locked``, ``inertias`` and ``base`` (default: as in the file). A
         RobotFileWarning names what acts in MuJoCo and not here: springs, tendons, gains of actuators, closed loops
         (which :meth:`Model.from_mjcf <forcegp.Model.from_mjcf>` has) and others.
 
-        Raises what :meth:`from_urdf` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
+        Raises what :meth:`from_urdf_text` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
         :class:`~forcegp.errors.MissingExtra` without the package mujoco.
         """
         return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
@@ -176,12 +155,11 @@ class Robot(RobotStructure):
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
-        strict: bool = False,
         for_system: bool = False,
     ) -> "tuple[Robot, Translation]":
         """The robot of MJCF text, and what a model takes from it, which is noted as left out unless ``for_system``."""
         given = {"locked": locked, "inertias": inertias, "base": base}
-        problems = Problems(source, given, strict=strict, reader="Robot.from_mjcf")
+        problems = Problems(source, given, "Robot.from_mjcf")
         found = translate(text, path, inertias == "nearest", for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
@@ -207,7 +185,7 @@ class Robot(RobotStructure):
         numbers = finite_vector("gravity", gravity, 3), armature, beside or {}, locked, inertias
 
         def read(held: BaseChoice | None) -> tuple[Robot | None, Problems]:
-            problems = Problems(found.source, named, strict=found.strict, reader=found.reader)
+            problems = Problems(found.source, named, found.reader)
             problems.errors, problems.notes = [*found.errors], {what: [*where] for what, where in found.notes.items()}
             return cls._read(text, problems, held, *numbers), problems
 
@@ -259,8 +237,15 @@ class Robot(RobotStructure):
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
         """The robot that :meth:`to_stored` gave."""
-        given = {name: stored[name] for name in ("gravity", "armature", "locked", "base")}
-        return cls.from_urdf_text(stored["urdf"], source="stored URDF", strict=None, **given)
+        return cls._again(
+            stored["urdf"], "stored URDF", *(stored[x] for x in ("gravity", "armature", "locked", "base"))
+        )
+
+    @classmethod
+    def _again(cls, text: str, source: str, gravity: Any, armature: Any, locked: Any, base: BaseChoice) -> "Robot":
+        """Of a text that was warned of before."""
+        given = {"locked": locked, "inertias": "strict", "base": base, "root": None}
+        return cls._made(well_formed(text.lstrip()), Problems(source, given), gravity, armature, quiet=True)
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
@@ -276,19 +261,16 @@ class Robot(RobotStructure):
         values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
-    def with_inertials(self, inertials: Inertials) -> "Robot":
-        """A robot whose URDF holds the given log-Cholesky parameters (10,) of the named links (values, no gradient)."""
-        text = self.urdf_text
-        for name, parameters in inertials.items():
-            self.layout.require_moving(name, self.name)
-            parameters = self.checked_parameters(name, parameters)
-            if parameters.dim() != 1:
-                raise InvalidInput(
-                    f"inertials[{name!r}] has shape {tuple(parameters.shape)}; a robot holds one set, give shape (10,)."
-                )
-            mass, center, inertia = (value.detach().cpu().numpy() for value in physical_from_parameters(parameters))
-            text = replace_inertial(text, name, float(mass), center, inertia, source=self.source)
-        return self.with_text(text)
+    def with_link(self, name: str, mass: float, center_of_mass: Vector, inertia: Any) -> "Robot":
+        """A robot whose URDF gives a moving link this mass (kg), centre (3,) of mass (m) and inertia (3, 3).
+
+        The inertia is about the centre of mass, in the axes of the link frame, in kg m^2. Raises UnknownLink,
+        InvalidInput for a link that is fixed in the world, and NonPhysicalInertia for what no body has.
+        """
+        self.layout.require_moving(name, self.name)
+        center = finite_vector("center_of_mass", center_of_mass, 3)
+        moments = finite_vector("inertia", np.ravel(inertia), 9, ", shape (3, 3)").reshape(3, 3)
+        return self.with_text(replace_inertial(self.urdf_text, name, float(mass), center, moments, source=self.source))
 
     def with_armature(self, armature: Vector | Mapping[str, float | int]) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
@@ -308,9 +290,8 @@ class Robot(RobotStructure):
 
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
         """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
-        given: dict[str, Any] = {"gravity": self.gravity, "locked": self.locked, "base": self.base}
-        given["armature"] = self.armature if armature is None else armature
-        robot = Robot.from_urdf_text(text, source=self.source, strict=None, **given)
+        armature = self.armature if armature is None else armature
+        robot = Robot._again(text, self.source, self.gravity, armature, self.locked, self.base)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def with_note(self, note: str) -> "Robot":
@@ -397,38 +378,34 @@ class Robot(RobotStructure):
             q[:, group.places][:, group.motion.turn] = turn
         return self.space.normalized(q).to(self.device)
 
-    def mass_matrix(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
-        return self.kinematics(q).mass_matrix(inertials)
+        return self.kinematics(q).mass_matrix()
 
-    def bias_forces(self, q: Positions, v: JointValues, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
-        return self.kinematics(q, v).bias_forces(inertials)
+        return self.kinematics(q, v).bias_forces()
 
     def mass_matrix_and_bias(
-        self, q: Positions, v: JointValues, inertials: Inertials | None = None
+        self, q: Positions, v: JointValues
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """:meth:`mass_matrix` and :meth:`bias_forces` from one kinematics pass."""
-        return self.kinematics(q, v).mass_matrix_and_bias(inertials)
+        return self.kinematics(q, v).mass_matrix_and_bias()
 
-    def gravity_forces(self, q: Positions, inertials: Inertials | None = None) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
-        return self.kinematics(q).gravity_forces(inertials)
+        return self.kinematics(q).gravity_forces()
 
-    def inverse_dynamics(
-        self, q: Positions, v: JointValues, a: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
         """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
-        return self.kinematics(q, v).inverse_dynamics(a, inertials)
+        return self.kinematics(q, v).inverse_dynamics(a)
 
-    def forward_dynamics(
-        self, q: Positions, v: JointValues, tau: JointValues, inertials: Inertials | None = None
-    ) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``, by Cholesky.
 
         Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
         """
-        return self.kinematics(q, v).forward_dynamics(tau, inertials)
+        return self.kinematics(q, v).forward_dynamics(tau)
 
     def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""

@@ -1,6 +1,5 @@
 """What a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -10,12 +9,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
-from forcegp.robots.arguments import Inertials, checked_tensor
+from forcegp.robots.arguments import checked_tensor
 from forcegp.robots.base import BaseChoice
-from forcegp.robots.inertia import log_cholesky_of_link
 from forcegp.robots.layout import WORLD, Layout
 from forcegp.robots.manifold import ConfigurationSpace, pose
-from forcegp.robots.tree import Tree, merged_inertias
+from forcegp.robots.tree import Tree
 from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
 from forcegp.summary import Summary, listed
 
@@ -132,11 +130,6 @@ class RobotStructure(Summary):
         return tuple(self.description.links)
 
     @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of all frames: those of the links."""
-        return self.link_names
-
-    @property
     def gravity(self) -> Float[Tensor, "3"]:
         """Gravitational acceleration in m/s^2."""
         return self.tree.gravity.clone()
@@ -175,20 +168,6 @@ class RobotStructure(Summary):
         require_known("joint", name, self.name, self.joint_names, UnknownJoint)
         return self.joints[self.joint_names.index(name)]
 
-    def inertial_parameters(self, *links: str) -> dict[str, Float[Tensor, "10"]]:
-        """Log-Cholesky parameters (10,) of the named links, to start an identification from.
-
-        Raises :class:`~forcegp.errors.InvalidInput` for links fixed in the world and for massless frames, and
-        :class:`~forcegp.errors.NonPhysicalInertia` for ideal rods, plates and points: their parameters are infinite.
-        """
-        out = {}
-        for name in links:
-            self.layout.require_moving(name, self.name)
-            own = self.description.links[name] or MASSLESS
-            owner = f"{name!r} of {self.name}"
-            out[name] = log_cholesky_of_link(own.mass, own.center_of_mass, own.inertia, owner).to(self.device)
-        return out
-
     @override
     def facts(self) -> dict[str, object]:
         """Name, sizes and joints."""
@@ -217,20 +196,6 @@ class RobotStructure(Summary):
         self.space.check(q)
         return q
 
-    def body_inertias(self, inertials: Inertials) -> Float[Tensor, "bodies 4 4 *batch"]:
-        """Merged pseudo-inertias of the bodies with ``inertials`` in place of those of the URDF, differentiable."""
-        return merged_inertias(self.tree, self.layout, self.checked_inertials(inertials))
-
-    def checked_inertials(self, inertials: Inertials) -> dict[str, Tensor]:
-        """In float64; :class:`~forcegp.errors.InvalidInput` unless they are parameters of moving links by name."""
-        if not isinstance(inertials, Mapping):
-            raise InvalidInput(
-                f"inertials is a {type(inertials).__name__}; give a mapping from link names to tensors (..., 10)."
-            )
-        for name in inertials:
-            self.layout.require_moving(name, self.name)
-        return {name: self.checked_parameters(name, parameters) for name, parameters in inertials.items()}
-
     def require_vectors(self, what: str) -> None:
         """Raise InvalidInput where positions do not add up; `what` needs that, in the plural: "filters"."""
         if self.layout.groups:
@@ -239,7 +204,3 @@ class RobotStructure(Summary):
                 f"{what} need a base that is fixed; {self.name} has the {group.kind} joint {group.name!r}. Fitting, "
                 "prediction, identification, predictors and `posterior.rollout` work without."
             )
-
-    def checked_parameters(self, link: str, parameters: object) -> Tensor:
-        """In float64; :class:`~forcegp.errors.InvalidInput` unless they can be log-Cholesky parameters of ``link``."""
-        return checked_tensor(f"inertials[{link!r}]", parameters, 10, "log-Cholesky parameters", self.device)

@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import MissingInertia, NonPhysicalInertia, RobotModelError
-from forcegp.robots.arguments import Inertials, broadcast_batch, usable_device
+from forcegp.robots.arguments import usable_device
 from forcegp.robots.inertia import (
     axis_inertia_vanishes,
     pseudo_inertia,
-    pseudo_inertia_factor,
     skew,
     turns_with_inertia,
 )
@@ -101,9 +99,6 @@ class Tree:
     related: Tensor  # (n, n, 1): 1 where one of the two joints moves the other
     velocity_sum: Tensor  # (n, n): 2 ancestors - own joint, body velocity plus that of the parent body
     twist_basis: Tensor  # (12, 6): [w; v] -> [[w]x, v], row by row
-    link_inertias: Tensor  # (links, 4, 4): pseudo-inertias of the moving links, in the frames of their bodies
-    link_offsets: Tensor  # (links, 4, 4): poses of the moving links in those frames
-    carried: Tensor  # (n, links): 1 where the body carries the link
     inertias: Tensor  # (n, 4, 4, 1): pseudo-inertias of the bodies, their links merged
     gravity: Tensor  # (3,)
     fall: Tensor  # (3, 4, 1): the acceleration T'' T^-1 of free fall
@@ -163,14 +158,12 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     for k, axis in enumerate(np.eye(3)):
         twist_basis[k, :, :3] = skew(axis)
         twist_basis[3 + k, :, 3] = axis
-    link_inertias = np.zeros((len(layout.moving), 4, 4))
-    carried = np.zeros((n, len(layout.moving)))
-    for k, name in enumerate(layout.moving):
+    inertias = np.zeros((n, 4, 4))
+    for name in layout.moving:
         placement, inertial = layout.links[name], description.links[name]
-        carried[placement.body, k] = 1.0
         if inertial is not None:
             local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
-            link_inertias[k] = placement.offset @ local @ placement.offset.T
+            inertias[placement.body] += placement.offset @ local @ placement.offset.T
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
     related = np.maximum(moves, moves.T)
@@ -200,10 +193,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         related=constant(related[..., None]),
         velocity_sum=constant(2.0 * moves.T - own),
         twist_basis=constant(twist_basis.reshape(6, 12).T),
-        link_inertias=constant(link_inertias),
-        link_offsets=constant(np.stack([layout.links[name].offset for name in layout.moving])),
-        carried=constant(carried),
-        inertias=constant(np.tensordot(carried, link_inertias, 1)[..., None]),
+        inertias=constant(inertias[..., None]),
         gravity=constant(gravity),
         fall=constant(fall[..., None]),
         armature=constant(armature),
@@ -212,22 +202,6 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         shift=constant([[drive.offset] for drive in layout.drives]),
         coupled=layout.coupled,
     )
-
-
-def merged_inertias(tree: Tree, layout: Layout, inertials: Inertials) -> Float[Tensor, "n 4 4 *batch"]:
-    """Pseudo-inertias of the bodies where the named links have these log-Cholesky parameters (..., 10) instead."""
-    names, moving = tuple(inertials), layout.moving
-    batch = broadcast_batch({f"inertials[{name!r}]": inertials[name].shape[:-1] for name in names})
-    parameters = torch.stack([inertials[name].expand(*batch, 10) for name in names])
-    change = [moving.index(name) for name in names]
-    offsets = tree.link_offsets[change].reshape(len(names), *(1 for _ in batch), 4, 4)
-    factor = offsets @ pseudo_inertia_factor(parameters)
-    given = (factor @ factor.mT).movedim((-2, -1), (1, 2))
-    # sum over the links that stay rather than subtract those that change: no cancellation
-    stay = [i for i, name in enumerate(moving) if name not in inertials]
-    kept = tree.carried[:, stay] @ tree.link_inertias[stay].flatten(1)
-    added = (tree.carried[:, change] @ given.flatten(1)).unflatten(1, given.shape[1:])
-    return kept.reshape(-1, 4, 4, *(1 for _ in batch)) + added
 
 
 def _levels(parents: tuple[int, ...]) -> tuple[tuple[Level, ...], Tensor | None]:

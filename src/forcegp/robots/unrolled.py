@@ -16,10 +16,8 @@ the wrench of the composite body under A of one unit of joint j (Featherstone, "
 ch. 5 and 6), carried to the joints above.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,7 +34,8 @@ Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
 """Floats and expressions; the operators of NumPy are theirs, entry by entry."""
 _Values: TypeAlias = Sequence[Any] | Scalars
 
-# What is smaller in a rotation matrix or an inertia is rounding, as of the turn onto the joint axis: sin(pi) = 1e-16.
+# What is smaller in a rotation matrix, an origin in m or, beside its largest entry, an inertia, is rounding, as of the
+# turn onto the joint axis: sin(pi) = 1e-16.
 ROUNDING = 1e-15
 
 
@@ -64,15 +63,11 @@ class UnrolledJoint:
 
 
 class UnrolledRobot:
-    """The constants of a robot as floats, from which `UnrolledKinematics` unrolls its algorithms.
+    """The constants of a robot as floats, from which `UnrolledKinematics` unrolls its algorithms."""
 
-    Parameters: ``robot``; ``rounding``, below which entries of rotation matrices, of origins in m and of the merged
-    inertias (relative to the largest entry) count as zero. They are those of the robot on the CPU.
-    """
-
-    def __init__(self, robot: RobotStructure, *, rounding: float = ROUNDING) -> None:
+    def __init__(self, robot: RobotStructure) -> None:
         layout, tree = robot.layout, robot.tree
-        self.robot, self.rounding = robot, rounding
+        self.robot = robot
         places = range(robot.nv) if tree.positions is None else tree.positions.tolist()
         whole = {body: group for group in layout.groups for body in range(*group.bodies.indices(len(layout.bodies)))}
         joints = []
@@ -102,24 +97,10 @@ class UnrolledRobot:
         """Number of coordinates."""
         return self.robot.nv
 
-    @cached_property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Each joint with each of those above it, where the mass matrix has entries below its diagonal.
-
-        All pairs where joints mimic others: what they couple fills in.
-        """
-        if self.coupled:
-            return [(k, i) for k in range(self.nv) for i in range(k)]
-        above: list[list[int]] = []
-        for k, joint in enumerate(self.joints):
-            parent = joint.parent if k == joint.rows[0] else k - 1  # that of a chain of single degrees of freedom
-            above.append([] if parent == WORLD else [*above[parent], parent])
-        return [(k, i) for k, found in enumerate(above) for i in found]
-
     def _scalars(self, values: torch.Tensor, scale: float = 1.0) -> Scalars:
         """The numbers, with 0.0 for what is rounding beside ``scale``."""
         values = values.detach().cpu()
-        return scalars(torch.where(values.abs() <= self.rounding * scale, 0.0, values).tolist())
+        return scalars(torch.where(values.abs() <= ROUNDING * scale, 0.0, values).tolist())
 
 
 def scalars(values: list) -> Scalars:
@@ -138,8 +119,8 @@ class UnrolledKinematics:
     """The rigid-body algorithms at given states; one scalar per joint; ``v`` only if they are needed.
 
     A scalar is a float, which is a constant, or an :class:`~forcegp.codegen.graph.Expression`. All results are arrays
-    of scalars, in the units of :class:`~forcegp.robots.Robot`. ``inertias`` is one symmetric 4x4 pseudo-inertia
-    (kg m^2, kg m, kg) per body in body axes, in place of the robot's. An entry that is structurally zero is 0.0.
+    of scalars, in the units of :class:`~forcegp.robots.Robot`. An entry that is structurally
+    zero is 0.0.
     """
 
     def __init__(self, unrolled: UnrolledRobot, q: Sequence[Any], v: Sequence[Any] | None = None) -> None:
@@ -158,18 +139,17 @@ class UnrolledKinematics:
             if unrolled.coupled:
                 position = position * joint.drive.multiplier + joint.drive.offset
             if joint.revolute:
-                known = isinstance(position, float)
-                c, s = (math.cos(position), math.sin(position)) if known else (position.cos(), position.sin())
+                c, s = position.cos(), position.sin()
                 self.rotations.append(joint.rotation @ scalars([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
                 self.origins.append(joint.origin)
             else:
                 self.rotations.append(joint.rotation)
                 self.origins.append(joint.origin + joint.rotation[:, 2] * position)
 
-    def mass_matrix(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def mass_matrix(self) -> Scalars:
         """Mass matrix (nv, nv), armature on the diagonal; 0.0 between joints of different branches."""
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
-        composite = list(self.unrolled.inertias if inertias is None else inertias)
+        composite = list(self.unrolled.inertias)
         for i in reversed(range(n)):
             if joints[i].parent != WORLD and i == joints[i].rows[-1]:
                 composite[joints[i].parent] = composite[joints[i].parent] + self._inertia_in_parent(i, composite[i])
@@ -189,17 +169,17 @@ class UnrolledKinematics:
         M[np.diag_indices(len(M))] = M.diagonal() + self.unrolled.armature
         return M
 
-    def bias_forces(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def bias_forces(self) -> Scalars:
         """Coriolis, centrifugal and gravity forces (nv,): the tau that gives zero acceleration."""
-        return self._joint_forces(self.v, None, inertias)
+        return self._joint_forces(self.v, None)
 
-    def inverse_dynamics(self, a: Scalars, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def inverse_dynamics(self, a: Scalars) -> Scalars:
         """Joint forces (nv,) that give the accelerations ``a``: ``M a + bias``."""
-        return self._joint_forces(self.v, self._of_bodies(a), inertias) + self.unrolled.armature * a
+        return self._joint_forces(self.v, self._of_bodies(a)) + self.unrolled.armature * a
 
-    def gravity_forces(self, inertias: Sequence[Scalars] | None = None) -> Scalars:
+    def gravity_forces(self) -> Scalars:
         """Joint forces (nv,) that hold the robot still."""
-        return self._joint_forces([0.0] * len(self.unrolled.joints), None, inertias)
+        return self._joint_forces([0.0] * len(self.unrolled.joints), None)
 
     def _of_bodies(self, values: _Values) -> Any:
         """Velocities or accelerations of the joints of all bodies."""
@@ -241,7 +221,7 @@ class UnrolledKinematics:
             A.append(np.column_stack([_turning(w[i], dw[i]), acceleration]))
         return A
 
-    def _joint_forces(self, v: _Values | None, a: _Values | None, inertias: Sequence[Scalars] | None) -> Scalars:
+    def _joint_forces(self, v: _Values | None, a: _Values | None) -> Scalars:
         assert v is not None, "forces that depend on velocities need some"
         joints, n = self.unrolled.joints, len(self.unrolled.joints)
         forces, moments = ([scalars([0.0] * 3) for _ in range(n)] for _ in range(2))
@@ -250,7 +230,7 @@ class UnrolledKinematics:
         for i in reversed(range(n)):
             if i != joints[i].rows[-1]:
                 continue
-            F = accelerations[i] @ (self.unrolled.inertias if inertias is None else inertias)[i]
+            F = accelerations[i] @ self.unrolled.inertias[i]
             force = forces[i] + F[:, 3]
             moment = moments[i] + scalars([F[x, y] - F[y, x] for x, y in ((2, 1), (0, 2), (1, 0))])
             for k in joints[i].rows:

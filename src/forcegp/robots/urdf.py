@@ -98,7 +98,7 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     refuse_xacro(element, source)
     name = (element.get("name") or "").strip() or "robot"
     if "name" not in element.attrib:
-        problems.ignore("a <robot> without a name is called 'robot'", "<robot>", "no name")
+        problems.note("a <robot> without a name is called 'robot'", "<robot>")
     named, parts = (_named(element, kind, problems) for kind in ("link", "joint"))
     problems.raise_all()  # nothing can be said of what has no name
     links: dict[str, InertialDescription | None] = dict.fromkeys(named)
@@ -169,7 +169,7 @@ def _child(element: Element, tag: str, place: _Place) -> Element:
 def _optional_child(element: Element, tag: str, place: _Place) -> Element | None:
     children = element.findall(tag)
     if len(children) > 1:  # as in other readers
-        place.problems.ignore(f"the first of several <{tag}> counts", place.owner, f"{len(children)} <{tag}>")
+        place.problems.note(f"the first of several <{tag}> counts", place.owner)
     return children[0] if children else None
 
 
@@ -204,8 +204,7 @@ def _loss(element: Element | None, attribute: str, place: _Place) -> float:
 def _non_negative(element: Element | None, attribute: str, default: float, place: _Place, none: str) -> float:
     value = _scalar(element, attribute, default, place)
     if element is not None and value < 0.0:
-        what = f"a negative <{element.tag}> {attribute} is taken as {none}"
-        place.problems.ignore(what, place.owner, f"<{element.tag}> {attribute}={value:g}")
+        place.problems.note(f"a negative <{element.tag}> {attribute} is taken as {none}", place.owner)
         return default
     return value
 
@@ -236,7 +235,7 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
         return None
     mass_element = _optional_child(element, "mass", place)
     if mass_element is None or "value" not in mass_element.attrib:  # as in other readers
-        place.problems.ignore("an <inertial> without mass is left out", place.owner, "no <mass value=...>")
+        place.problems.note("an <inertial> without mass is left out", place.owner)
         return None
     mass = _number(mass_element.attrib["value"], "<mass> value", place)
     if 0.0 < mass < LIGHTEST:
@@ -244,7 +243,7 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     entries = _optional_child(element, "inertia", place)
     products = [] if entries is None else [key for key in ("ixy", "ixz", "iyz") if key not in entries.attrib]
     if products:
-        place.problems.ignore("a product of inertia that is not given is 0", place.owner, f"no {', '.join(products)}")
+        place.problems.note("a product of inertia that is not given is 0", place.owner)
     given = {} if entries is None else {key: "0" for key in products} | entries.attrib
 
     def entry(key: str) -> float:
@@ -284,7 +283,7 @@ def _joint(
     origin = _origin(_optional_child(element, "origin", place), place)
     axis_element = _optional_child(element, "axis", place)
     if kind == "planar" and axis_element is None:  # x by the format: a base that moves up the wall
-        place.problems.ignore("a planar joint without <axis> moves along x and y", place.owner, "no <axis>")
+        place.problems.note("a planar joint without <axis> moves along x and y", place.owner)
     axis = _vector(axis_element, "xyz", (0.0, 0.0, 1.0) if kind == "planar" else (1.0, 0.0, 0.0), place)
     length, directed = float(np.linalg.norm(axis)), kind in (*MOVABLE, "planar")
     if directed and not (math.isfinite(length) and length > 0.0):
@@ -301,8 +300,7 @@ def _joint(
         # the format's default for the one that is left out is 0
         lower, upper = (_scalar(limit, side, 0.0, place) for side in ("lower", "upper"))
         if lower > upper:
-            what = "a lower limit above the upper one is taken as no limit"
-            place.problems.ignore(what, place.owner, f"the lower limit {lower:g} above the upper limit {upper:g}")
+            place.problems.note("a lower limit above the upper one is taken as no limit", place.owner)
             lower, upper = -math.inf, math.inf
     dynamics = _optional_child(element, "dynamics", place)
     mimic = _optional_child(element, "mimic", place)

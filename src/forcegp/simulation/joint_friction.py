@@ -3,7 +3,7 @@
 A plant of other form than every model tells what a model's own form is worth, so some laws are here alone.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,22 +121,24 @@ class JointFrictionLaw:
         """Torques of friction [Nm] during the next time step, from velocities [rad/s], applied torques and inertias."""
         if self.laws is not None:
             return self.laws(v, u)
-        return _STEPS.get(self.config.joint_friction, JointFrictionLaw._plain)(self, v, u, mass, time)
-
-    def _plain(self, v: np.ndarray, u: np.ndarray, mass: np.ndarray, time: float) -> np.ndarray:
+        config = self.config
+        match config.joint_friction:
+            case "asymmetric":
+                level = self._either_way(v)
+                stopping = v / (np.linalg.inv(mass).diagonal() * config.time_step)
+                return -(np.clip(stopping, -level, level) + self.viscous * v)
+            case "load":
+                share = np.where(u * v > 0.0, *config.joint_load)
+                return -(np.tanh(v / config.joint_smoothing) * share * np.abs(u) + self.curve(v))
+            case "drift":
+                share, seconds = config.joint_drift
+                level = self.coulomb * (1.0 + share * np.expm1(-time / seconds))
+                return -(np.tanh(v / config.joint_smoothing) * level + self.viscous * v)
+            case "lugre":
+                return self._lugre(v)
         return -self.curve(v)
 
-    def _asymmetric(self, v: np.ndarray, u: np.ndarray, mass: np.ndarray, time: float) -> np.ndarray:
-        level = self._either_way(v)
-        stopping = v / (np.linalg.inv(mass).diagonal() * self.config.time_step)
-        return -(np.clip(stopping, -level, level) + self.viscous * v)
-
-    def _load(self, v: np.ndarray, u: np.ndarray, mass: np.ndarray, time: float) -> np.ndarray:
-        driven, back = self.config.joint_load
-        smooth = np.tanh(v / self.config.joint_smoothing)
-        return -(smooth * np.where(u * v > 0.0, driven, back) * np.abs(u) + self.curve(v))
-
-    def _lugre(self, v: np.ndarray, u: np.ndarray, mass: np.ndarray, time: float) -> np.ndarray:
+    def _lugre(self, v: np.ndarray) -> np.ndarray:
         dt, config = self.config.time_step, self.config
         stiffness = self.coulomb / config.joint_presliding
         falling = np.exp(-((v / config.joint_breakaway_velocity) ** 2))
@@ -146,18 +148,5 @@ class JointFrictionLaw:
         self.bristles = self.bristles + steps * (v - rate * self.bristles)
         return -force
 
-    def _drift(self, v: np.ndarray, u: np.ndarray, mass: np.ndarray, time: float) -> np.ndarray:
-        share, seconds = self.config.joint_drift
-        level = self.coulomb * (1.0 + share * np.expm1(-time / seconds))
-        return -(np.tanh(v / self.config.joint_smoothing) * level + self.viscous * v)
-
     def _either_way(self, v: np.ndarray) -> np.ndarray:
         return self.coulomb * np.where(v < 0.0, self.config.joint_asymmetry, 1.0)
-
-
-_STEPS: dict[str, Callable[..., np.ndarray]] = {
-    "asymmetric": JointFrictionLaw._asymmetric,
-    "load": JointFrictionLaw._load,
-    "lugre": JointFrictionLaw._lugre,
-    "drift": JointFrictionLaw._drift,
-}

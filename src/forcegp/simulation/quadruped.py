@@ -18,7 +18,7 @@ from forcegp.errors import NumericalError
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
-from forcegp.robots import Robot, parameters_from_physical
+from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.recording import RATE, recorded
@@ -68,8 +68,7 @@ def _loaded(robot: Robot, payload: float) -> Robot:
     size = payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])
     total = pseudo_inertia(trunk.mass, np.array(trunk.center_of_mass), np.array(trunk.inertia))
     total = total + pseudo_inertia(payload, np.array(PLACE), size)
-    values = (torch.as_tensor(x, dtype=torch.float64) for x in physical_of_pseudo_inertia(total))
-    return robot.with_inertials({"trunk": parameters_from_physical(*values)})
+    return robot.with_link("trunk", *physical_of_pseudo_inertia(total))
 
 
 def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, steps: int) -> tuple[Tensor, ...]:

@@ -1,6 +1,7 @@
 """`validate`: compute what is missing of a comparison, and write its page, figures and numbers."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from forcegp.errors import FileFormatError, InvalidInput, require_type
 from forcegp.evaluation.metrics import median_and_range
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.jobs.job import machine
-from forcegp.parallel import Backend, backend_for
+from forcegp.parallel import checked_jobs
 from forcegp.validation.candidates import Candidate, candidates, default_models
 from forcegp.validation.comparison import Comparison
 from forcegp.validation.jobs import jobs_of, kept
@@ -182,8 +183,7 @@ def validate(
     *,
     models: Sequence[str] | None = None,
     seeds: int = 5,
-    jobs: int | None = None,
-    backend: Backend | str | None = None,
+    jobs: int | Executor = 1,
     source: Mapping[str, Any] | None = None,
     margin: float = MARGIN,
     overwrite: bool = False,
@@ -198,7 +198,7 @@ def validate(
     ----------
     models: names as in `validation.candidates`; None takes its `default_models`.
     seeds: how many choices of training rows, numbered from 0.
-    jobs, backend: how many pieces at once, and where: in this process, or in several of this machine.
+    jobs: pieces at once, in as many processes of this machine, or an executor in which they run.
     source: where the data come from, for the page: "title", and "data", a list of lines; plain JSON values.
     margin: ratios of errors within it of 1 count as no difference.
     overwrite: compute everything anew, also where the folder holds results.
@@ -208,7 +208,7 @@ def validate(
     InvalidInput: an argument is out of range, the folder holds something else, or another process is at work there.
     """
     require_type("comparison", comparison, Comparison)
-    workers = backend_for(backend, jobs)
+    checked_jobs(jobs)
     if isinstance(seeds, bool) or seeds < 1:
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     if not 0.0 <= margin < 1.0:
@@ -219,7 +219,7 @@ def validate(
     configuration = comparison.configuration()
     store = JobStore.open(Path(folder), KIND, configuration, overwrite=overwrite)
     identifications, fits = jobs_of(comparison, chosen, seeds)
-    run_jobs(store, [*identifications, *fits], workers, progress)
+    run_jobs(store, [*identifications, *fits], jobs, progress)
     runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
     for name in (name for name, model in chosen.items() if model.all_rows):
         runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]

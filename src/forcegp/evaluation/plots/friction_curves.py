@@ -30,7 +30,6 @@ from forcegp.forces import (
 )
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.components import Curve
 from forcegp.posterior.posterior import Posterior
 
@@ -71,7 +70,7 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
 
     Where there are none, the friction laws of the joints.
     """
-    if not isinstance(posterior, StructuredPosterior):
+    if not isinstance(posterior, Posterior):
         return []
     robot = posterior.model.robot
     names = posterior.latent_names
@@ -116,7 +115,7 @@ def friction_curves_figure(
     LARGEST_GRID. Raises InvalidInput if there is no curve.
     """
     panels = curve_panels(posterior)
-    if not isinstance(posterior, StructuredPosterior) or not panels:
+    if not isinstance(posterior, Posterior) or not panels:
         raise InvalidInput(
             f"a model of {posterior.description} has no process that is a curve; fit one with friction priors, for "
             "example JointFriction() or ContactFriction()."
@@ -155,7 +154,7 @@ def _velocity_along(term: Unknown, name: str, index: int) -> int | None:
     return index if of_velocity and name.startswith("force") else None
 
 
-def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> list[str]:
+def _titles(panels: Sequence[CurvePanel], posterior: Posterior) -> list[str]:
     """What every panel shows: the component where there are several, and the joint or axis."""
     robot = posterior.model.robot
     short = dict(zip(robot.joint_names, style.short_joint_names(robot.joint_names), strict=True))
@@ -169,7 +168,7 @@ def _titles(panels: Sequence[CurvePanel], posterior: StructuredPosterior) -> lis
 
 
 def _draw_curve(
-    axes: Axes, posterior: StructuredPosterior, panel: CurvePanel, truth: tuple[np.ndarray, np.ndarray] | None
+    axes: Axes, posterior: Posterior, panel: CurvePanel, truth: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[str, str]:
     """Mean and band, solid where the training data were; training velocities as ticks; the truth as dots.
 
@@ -219,7 +218,7 @@ def _draw_curve(
     return ("velocity [m/s]", "N") if slides else ("velocity [rad/s]", "Nm")
 
 
-def _curve(posterior: StructuredPosterior, panel: CurvePanel, at: Float[np.ndarray, " n"]) -> Curve:
+def _curve(posterior: Posterior, panel: CurvePanel, at: Float[np.ndarray, " n"]) -> Curve:
     """The process of a panel, at rest along its other features."""
     width = len(posterior.likelihood.standardization.shift[posterior.latent_names.index(panel.latent)])
     features = np.zeros((len(at), width))
@@ -227,7 +226,7 @@ def _curve(posterior: StructuredPosterior, panel: CurvePanel, at: Float[np.ndarr
     return posterior.curve(panel.latent, features)
 
 
-def _visited(posterior: StructuredPosterior, panel: CurvePanel) -> Float[np.ndarray, " N"]:
+def _visited(posterior: Posterior, panel: CurvePanel) -> Float[np.ndarray, " N"]:
     """The feature of a panel at the training points."""
     if panel.component == LAWS:
         return posterior.training.v[:, panel.index].cpu().numpy()
@@ -237,7 +236,7 @@ def _visited(posterior: StructuredPosterior, panel: CurvePanel) -> Float[np.ndar
 
 
 def _truth(
-    posterior: StructuredPosterior, dataset: Dataset, panels: Sequence[CurvePanel]
+    posterior: Posterior, dataset: Dataset, panels: Sequence[CurvePanel]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Feature and true value of the processes at rows of the Dataset, as far as its truth holds them."""
     if posterior.carries_known_forces:

@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset, recorded_motions
 from forcegp.evaluation.plots import style
 from forcegp.evaluation.rollout_scores import apart_from, rollout_errors
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.posterior import Posterior
 
 LARGEST_GRID = 12
@@ -31,7 +30,7 @@ def motion_bands_figure(
     recorded = recorded_motions(rows, [int(row) for row in starts] or 1, horizon)
     q0, v0, u = (torch.tensor(x) for x in (recorded.q[:, 0], recorded.v[:, 0], recorded.u))
     calibrated = posterior.motion_intervals is not None
-    drawn = isinstance(posterior, StructuredPosterior) and len(posterior.latent_names) > 0
+    drawn = isinstance(posterior, Posterior) and len(posterior.latent_names) > 0
     samples = SAMPLES if drawn and not calibrated else 0
     rollout = posterior.rollout(q0, v0, u, recorded.dt, integrator="rk4", samples=samples)
     errors = rollout_errors(rollout, recorded, posterior.model)

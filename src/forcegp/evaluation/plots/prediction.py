@@ -84,7 +84,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     the whole Dataset beside the standard normal distribution, which it follows if the intervals are right.
     Raises InvalidInput without contacts, and for models without forces.
     """
-    if not posterior.model.contacts or not posterior.predicts_forces:
+    if not posterior.model.contacts:
         raise InvalidInput(
             f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
             "forces."

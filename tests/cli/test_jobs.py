@@ -1,4 +1,4 @@
-"""`--backend`: the same model wherever it is computed; what is wrong is one line and exit code 2."""
+"""`--jobs`: the same model wherever it is computed; what is wrong is one line and exit code 2."""
 
 import json
 
@@ -18,27 +18,19 @@ def folder(tmp_path):
 
 
 def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
-    for backend, more in (("serial", ()), ("joblib", ("--jobs", 2))):
-        done = forcegp(*FIT, "--backend", backend, *more, "--out", backend, "--json", folder=folder)
+    for jobs in ("1", "2"):
+        done = forcegp(*FIT, "--jobs", jobs, "--out", jobs, "--json", folder=folder)
         assert done.returncode == 0, done.stderr
         assert [line for line in done.stderr.splitlines() if "did not converge" not in line] == []
         assert json.loads(done.stdout)["restarts"] == 2
-    one, two = (load_posterior(folder / name) for name in ("serial", "joblib"))
+    one, two = (load_posterior(folder / name) for name in ("1", "2"))
     assert one.settings["restart_objective"] == pytest.approx(two.settings["restart_objective"], rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--backend", "dask"), "no backend 'dask'; choose serial, joblib"),
-        (("--jobs", 0), "jobs is 0; give"),
-        (("--backend", "serial", "--jobs", 2), "choose joblib"),
-    ],
-)
-def test_options_that_cannot_be_meant_are_one_line(folder, words, message, monkeypatch, capsys):
+def test_jobs_that_cannot_be_meant_are_one_line(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
-    assert main([*map(str, (*FIT[:2], *words)), "--out", "run"]) == 2
+    assert main([*map(str, FIT[:2]), "--jobs", "0", "--out", "run"]) == 2
     told = capsys.readouterr().err
-    assert message in told
+    assert "jobs is 0; give" in told
     assert len(told.strip().splitlines()) == 1
     assert not (folder / "run").exists()

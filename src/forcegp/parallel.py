@@ -1,0 +1,182 @@
+"""Work at once: in this process, in processes that are kept between calls, or in any `concurrent.futures.Executor`.
+
+Where a function takes `jobs`, 1 is this process, a number is so many processes of this machine, and an executor is
+used as it is: `ProcessPoolExecutor`, Dask's `client.get_executor()`, the pool of Ray or MPI. Outcomes are the same.
+"""
+
+import contextlib
+import os
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
+from typing import Any, TypeAlias, TypeVar
+
+from typing_extensions import override
+
+from forcegp.errors import BackendError, InvalidInput
+
+Outcome = TypeVar("Outcome")
+Jobs: TypeAlias = int | Executor
+
+IDLE_SECONDS = 300
+"""So long processes without work are kept for the next call."""
+
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "BLIS")}
+"""Environment of an own process; the libraries read it when they are loaded."""
+
+
+class ThisProcess(Executor):
+    """One task after the other, on as many threads as this process has."""
+
+    @override
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def checked_jobs(jobs: object) -> Jobs:
+    """The argument. Raises InvalidInput for anything but an executor or a whole number of at least 1."""
+    if isinstance(jobs, Executor) or (isinstance(jobs, int) and not isinstance(jobs, bool) and jobs >= 1):
+        return jobs
+    raise InvalidInput(f"jobs is {jobs!r}; give the number of tasks at once, at least 1, or an Executor")
+
+
+def executor_for(jobs: Jobs) -> Executor:
+    """Where so many tasks run at once. Raises as `checked_jobs`."""
+    jobs = checked_jobs(jobs)
+    if isinstance(jobs, Executor):
+        return jobs
+    return ThisProcess() if jobs == 1 else _own_processes(jobs)
+
+
+def mapped(function: Callable[[Any], Outcome], arguments: Iterable[Any], jobs: Jobs) -> Iterator[Outcome]:
+    """`function(argument)` of every argument in their order, each as soon as it and all before it are there.
+
+    Raises what a task raised, in its place; as `checked_jobs`; BackendError where a process died or a task cannot
+    travel. What is at work ends with the iterator: own processes by force, others when their tasks end.
+    """
+    executor = executor_for(jobs)
+    if isinstance(executor, ThisProcess):
+        yield from map(function, arguments)
+        return
+    futures: list[Future[Any]] = []
+    try:
+        futures += [submit(executor, function, argument) for argument in arguments]
+        for future in futures:
+            yield outcome_of(future)
+    finally:
+        stop(executor, futures)
+
+
+def submit(executor: Executor, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Begin a task, whose outcome `outcome_of` returns. Functions without a module travel too.
+
+    Raises BackendError for what cannot travel, and where a process has died.
+    """
+    if isinstance(executor, ThisProcess):
+        return executor.submit(_recorded, (function, arguments), None)
+    import cloudpickle
+
+    try:
+        task = cloudpickle.dumps((function, arguments))
+    except Exception as error:  # whatever the objects raise
+        told = " ".join(str(error).split())
+        raise BackendError(f"this work cannot be sent to another process ({told}); use jobs=1") from error
+    with _told_of_dead_processes():
+        return executor.submit(_recorded, task, os.getpid())
+
+
+def outcome_of(future: Future[Any]) -> Any:
+    """What a task returned or raised. Shows its warnings. Raises BackendError if its process died (killed, memory)."""
+    with _told_of_dead_processes():
+        outcome, warned = future.result()
+    for text, category, file, line in warned:
+        warnings.warn_explicit(text, category, file, line, registry=_SHOWN)
+    return outcome
+
+
+@contextlib.contextmanager
+def _told_of_dead_processes() -> Iterator[None]:
+    try:
+        yield
+    except BrokenExecutor as error:
+        cause = " ".join(str(error).split())
+        remedy = "try fewer jobs if memory is short, or jobs=1"
+        raise BackendError(f"the processes broke off, which ends what was at work; {remedy} ({cause})") from error
+
+
+_SHOWN: dict[Any, Any] = {}
+"""What has been shown, so that each warning of a line of code is shown once, as in one process."""
+
+
+def _recorded(task: Any, caller: int | None) -> tuple[Any, list[tuple[Any, ...]]]:
+    """The outcome; text, category, file and line of every warning on the way, unless this process shows them."""
+    if caller is None:
+        function, arguments = task
+        return function(*arguments), []
+    import cloudpickle
+
+    function, arguments = cloudpickle.loads(task)
+    if caller == os.getpid():  # a pool of threads
+        return function(*arguments), []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        outcome = function(*arguments)
+    return outcome, [(str(each.message), each.category, each.filename, each.lineno) for each in caught]
+
+
+_own: Executor | None = None
+
+
+def _own_processes(jobs: int) -> Executor:
+    """The processes of the last call, or new ones where a process died or their number has changed."""
+    from joblib.externals.loky import get_reusable_executor
+
+    global _own
+    _own = get_reusable_executor(
+        jobs, timeout=IDLE_SECONDS, initializer=_begin_process, initargs=(os.getpid(),), env=ONE_THREAD
+    )
+    return _own
+
+
+def _begin_process(parent: int) -> None:
+    """One thread, and no life without the parent: a killed run must not go on in its children."""
+    import signal
+
+    from threadpoolctl import threadpool_limits
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its children itself
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threadpool_limits(1)  # processes share the cores: for libraries that are loaded already
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def stop(executor: Executor, futures: Collection[Future[Any]]) -> None:
+    """Cancel what has not begun; own processes that are at work end, and are new at the next call."""
+    for future in futures:
+        future.cancel()
+    if executor is not _own or all(future.done() for future in futures):
+        return
+    import psutil
+
+    # Not `shutdown(kill_workers=True)`: loky then looks for cancelled tasks that it has forgotten, and raises in its
+    # thread. A process that dies is what it handles at any time.
+    for process in list(getattr(executor, "_processes", ())):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            psutil.Process(process).kill()
+    executor.shutdown(wait=True)

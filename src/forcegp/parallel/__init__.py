@@ -1,5 +1,0 @@
-"""Work spread over processes and machines: the same outcomes, wherever they are computed."""
-
-import lazy_loader as lazy
-
-__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

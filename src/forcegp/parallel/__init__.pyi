@@ -1,1 +1,0 @@
-from .backend import Backend as Backend, Joblib as Joblib, Serial as Serial, backend_for as backend_for
