@@ -31,14 +31,13 @@ mutants: $(VENV)/.mutants  ## put faults into the source, one at a time, and see
 	$(BIN)/python -m tests.mutants $(ARGS)
 
 test-browser: $(VENV)/.browser  ## look at reports in a headless Chromium, which must be installed
-	$(BIN)/python -m pytest -q -rs tests/report $(ARGS)
+	$(BIN)/python -m pytest -q -rs tests/report/test_browser.py tests/report/test_page.py $(ARGS)
 
-check: $(VENV)/.check  ## lint, format, types and the rule of imports
+check: $(VENV)/.check  ## lint, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/pyright -p pyright-public.json
-	$(BIN)/python -m pytest -q tests/test_architecture.py
 
 # One thread: notebooks are small, and the cores belong to the tests.
 docs: $(VENV)/.docs  ## build the documentation into build/docs; a warning is an error

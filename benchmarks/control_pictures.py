@@ -33,8 +33,9 @@ from benchmarks.tracking import (
     task_of,
 )
 from forcegp import Model, PDGravity, Robot
-from forcegp.evaluation import contacts_figure, excitation_figure
-from forcegp.evaluation.plots.style import (
+from forcegp.posterior import Posterior
+from forcegp.scores import contacts_figure, excitation_figure
+from forcegp.scores.figures.style import (
     IDENTIFIED,
     KNOWN_PHYSICS,
     MEASUREMENT,
@@ -48,7 +49,6 @@ from forcegp.evaluation.plots.style import (
     quiet,
     save_figure,
 )
-from forcegp.posterior import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
@@ -63,7 +63,7 @@ COLORS = {
 }
 
 
-def motions() -> tuple[Robot, StructuredPosterior, dict[str, dict[str, np.ndarray]]]:
+def motions() -> tuple[Robot, Posterior, dict[str, dict[str, np.ndarray]]]:
     """The arm, the model that learned, and controller -> what the arm did."""
     robot = robot_of()
     given, task = Model(robot), task_of(SEED)
@@ -107,7 +107,7 @@ ARROW = 0.06
 PALETTE, PIXELS = 64, 100
 
 
-def film(robot: Robot, model: StructuredPosterior, done: dict[str, dict[str, np.ndarray]]) -> list[Image.Image]:
+def film(robot: Robot, model: Posterior, done: dict[str, dict[str, np.ndarray]]) -> list[Image.Image]:
     """The arm under two controllers, the reference in grey; learned friction as arrows, and as curves with bands."""
     figure = new_figure(7.6, 4.5)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
@@ -179,7 +179,7 @@ def draw_arrows(axes: Any, robot: Robot, q: np.ndarray, force: np.ndarray) -> li
 
 
 def draw_friction(
-    axes: Axes, robot: Robot, model: StructuredPosterior, joint: int, velocity: np.ndarray
+    axes: Axes, robot: Robot, model: Posterior, joint: int, velocity: np.ndarray
 ) -> Callable[[int], None]:
     """The learned friction of a joint over its velocity with its 95 % interval, and a dot where the joint is now."""
     name = robot.joint_names[joint]

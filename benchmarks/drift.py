@@ -29,6 +29,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
+from forcegp.posterior.structured import Posterior
 
 from benchmarks.tracking import (
     CONFIG,
@@ -45,7 +46,6 @@ from benchmarks.tracking import (
 )
 from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, Model, PDGravity, fit
 from forcegp.data import farthest_rows
-from forcegp.posterior.structured import StructuredPosterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SECONDS, LOST = 600, 0.3
@@ -95,7 +95,7 @@ class Plant:
             noise_std=np.full(7, NOISE),
         )  # fmt: skip
 
-    def errors(self, posterior: StructuredPosterior, rows: Dataset) -> tuple[float, float, float]:
+    def errors(self, posterior: Posterior, rows: Dataset) -> tuple[float, float, float]:
         """Mean squares of torque and acceleration against the simulation's, and the coverage by 95 % intervals."""
         t = float(rows.time.mean())
         true = np.array([self.acceleration(q, v, u, t) for q, v, u in zip(rows.q, rows.v, rows.u, strict=True)])
@@ -106,14 +106,14 @@ class Plant:
         return float(torque.square().mean()), float(away.square().mean()), float(within.double().mean())
 
 
-def first_model(plant: Plant, seed: int) -> tuple[StructuredPosterior, StructuredPosterior]:
+def first_model(plant: Plant, seed: int) -> tuple[Posterior, Posterior]:
     """Of all rows of a motion by inducing points, and of 100 of them, exact."""
     motion = followed(plant.robot, excitation(seed), PDGravity(plant.arm, **GAINS), 20.0)
     log = plant.rows(motion["q"], motion["v"], motion["u"][:-1], -100.0, seed)
     return fitted(log, seed), fit(plant.model.with_forces(JointFriction()), farthest_rows(log, 100), restarts=1)
 
 
-def fitted(log: Dataset, seed: int) -> StructuredPosterior:
+def fitted(log: Dataset, seed: int) -> Posterior:
     model = log.model.with_forces(JointFriction())
     return fit(model, log, points=len(log), learning_points=100, engine=ENGINE, restarts=1, seed=seed)
 
@@ -173,7 +173,7 @@ def late_calls(seconds: float = 20.0) -> dict[str, float]:
         control.model = control.model.refreshed(posterior)  # traces
         job: Future | None = None
 
-        def learn(posterior: StructuredPosterior, predictor, rows: Dataset):
+        def learn(posterior: Posterior, predictor, rows: Dataset):
             posterior = posterior.update(rows, horizon=HORIZON)
             return posterior, predictor.refreshed(posterior)
 

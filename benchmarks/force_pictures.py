@@ -41,8 +41,9 @@ from forcegp import (
     PeriodicJointForces,
     ToolForces,
 )
-from forcegp.evaluation import friction_curves_figure, normal_force_figure, save_figure
-from forcegp.evaluation.plots.style import (
+from forcegp.forces.contact_friction import ExpectedFriction
+from forcegp.scores import friction_curves_figure, normal_force_figure, save_figure
+from forcegp.scores.figures.style import (
     KNOWN_PHYSICS,
     MEASUREMENT,
     NORMAL,
@@ -52,7 +53,6 @@ from forcegp.evaluation.plots.style import (
     quiet,
     window,
 )
-from forcegp.forces.contact_friction import ExpectedFriction
 
 BAND = 1.959963984540054
 

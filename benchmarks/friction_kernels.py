@@ -18,9 +18,9 @@ import torch
 from gpytorch.kernels import AdditiveKernel, Kernel, ProductKernel
 from threadpoolctl import threadpool_limits
 
+from benchmarks.scores import scores_of
 from forcegp.data import farthest_rows
 from forcegp.errors import NumericalWarning
-from forcegp.evaluation import evaluate
 from forcegp.fit import fit
 from forcegp.forces import KERNELS, ContactFriction, kernel_of
 from forcegp.forces.basic_kernels import SmoothSignKernel, float64, linear
@@ -64,8 +64,8 @@ def run() -> dict[str, float]:
             prior = ContactFriction(load=True, kernel=name)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NumericalWarning)  # of fits that the table shows to be worse
-                scores = evaluate(fit(train.model.with_forces(prior), train), test)
-            shown = f"{scores.mae_noise_free:15.4f} {scores.nlpd:7.2f} {scores.coverage_95:13.3f}"
+                scores = scores_of(fit(train.model.with_forces(prior), train), test)
+            shown = f"{scores['mae_noise_free']:15.4f} {scores['nlpd']:7.2f} {scores['coverage_95']:13.3f}"
             print(f"{law:9} {label:38} {seed:5d} {shown}")
     return {}
 

@@ -23,6 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from forcegp.posterior.structured import Posterior
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
@@ -35,7 +36,6 @@ from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
 from forcegp.jobs.job import machine
 from forcegp.noise import Noise
-from forcegp.posterior.structured import StructuredPosterior
 from forcegp.robots.arguments import usable_device
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -94,11 +94,11 @@ class Questions:
 
         return evaluate
 
-    def posterior(self, rows: int) -> StructuredPosterior:
+    def posterior(self, rows: int) -> Posterior:
         training = TrainingData.of(self.data.rows(slice(0, rows)), self.device)
         likelihood = MarginalLikelihood(self.model, training)
         parameters = likelihood.kernels.initial_parameters() | Noise(0.1).parameters(JOINTS, self.device)
-        return StructuredPosterior.conditioned(self.model, training, parameters, NOT_SEARCHED, {})
+        return Posterior.conditioned(self.model, training, parameters, NOT_SEARCHED, {})
 
     def states(self, count: int) -> list[Tensor]:
         """Rows of the data, again and again."""
@@ -109,7 +109,7 @@ class Questions:
         states = self.states(count)
         return lambda: self.model.dynamics(*states).acceleration_map().offset
 
-    def prediction(self, posterior: StructuredPosterior, count: int) -> Callable[[], Tensor]:
+    def prediction(self, posterior: Posterior, count: int) -> Callable[[], Tensor]:
         states = self.states(count)
 
         def predict() -> Tensor:
@@ -119,7 +119,7 @@ class Questions:
 
         return predict
 
-    def rollout(self, posterior: StructuredPosterior, motions: int) -> Callable[[], Tensor]:
+    def rollout(self, posterior: Posterior, motions: int) -> Callable[[], Tensor]:
         q, v, u = self.states(motions)
         forces = u[:, None].expand(motions, STEPS, JOINTS)
         return lambda: posterior.rollout(q, v, forces, 1.0 / 240.0).q

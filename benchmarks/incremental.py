@@ -25,6 +25,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from forcegp.posterior.structured import Posterior
 
 from forcegp.data import Dataset, farthest_point_sampling, farthest_rows
 from forcegp.evidence import MarginalLikelihood, TrainingData
@@ -33,7 +34,6 @@ from forcegp.forces import JointForces
 from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptions
 from forcegp.inference.cholesky_update import rows_to_keep, with_only
 from forcegp.noise import Noise
-from forcegp.posterior.structured import StructuredPosterior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 SEEDS = (1, 2, 3)
@@ -51,12 +51,12 @@ def median_seconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
     return statistics.median(seconds)
 
 
-def conditioned(data: Dataset) -> StructuredPosterior:
+def conditioned(data: Dataset) -> Posterior:
     """On all rows, at the start values of a search."""
     model = data.model.with_forces(JointForces(), noise=Noise(0.1))
     training = TrainingData.of(data, torch.device("cpu"))
     parameters = MarginalLikelihood(model, training).kernels.initial_parameters()
-    return StructuredPosterior.conditioned(model, training, parameters | Noise(0.1).parameters(data.nv), NO_SEARCH, {})
+    return Posterior.conditioned(model, training, parameters | Noise(0.1).parameters(data.nv), NO_SEARCH, {})
 
 
 def update_speed(data: Dataset) -> float:
@@ -132,7 +132,7 @@ def rules() -> dict[str, Callable[[ExactPosterior, int], torch.Tensor]]:
     }
 
 
-def error(posterior: StructuredPosterior, test: Dataset) -> float:
+def error(posterior: Posterior, test: Dataset) -> float:
     mean = posterior.predict(test.q, test.v, test.u, covariance=False).mean
     return float((mean - torch.tensor(test.truth["a"])).abs().mean())
 

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
+from benchmarks.scores import scores_of
 from forcegp import KukaSurfaceConfig, fit
 from forcegp.data import Dataset
-from forcegp.evaluation import evaluate
 from forcegp.forces import parse_forces
 from forcegp.inference.pathwise import draw_functions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.simulation import simulate_kuka_surface
 
 SECONDS = 60.0
@@ -35,7 +35,7 @@ def recording(seed: int) -> Dataset:
     return simulate_kuka_surface(KukaSurfaceConfig(seconds=SECONDS, seed=seed))
 
 
-def drawn_below(posterior: StructuredPosterior) -> float:
+def drawn_below(posterior: Posterior) -> float:
     """Share of the functions drawn from the posterior as fitted of which less than 90 % lie in its 95 % intervals."""
     training = posterior.training
     with torch.no_grad():
@@ -63,13 +63,13 @@ def main() -> None:
         for points in given.points:
             model = train.model.with_forces(parse_forces(given.prior))
             posterior = fit(model, train, points=points)
-            scores = [evaluate(each, test) for each in (posterior, posterior.with_settings(widening=1.0))]
-            inside, plain = (score.coverage_95_noise_free for score in scores)
+            scores = [scores_of(each, test) for each in (posterior, posterior.with_settings(widening=1.0))]
+            inside, plain = (score["coverage_95_noise_free"] for score in scores)
             widened.append(inside)
             as_fitted.append(plain)
             drawn.append(drawn_below(posterior))
             factors.append(posterior.widening)
-            error = scores[0].mae_noise_free
+            error = scores[0]["mae_noise_free"]
             numbers = f"{inside:11.3f}  {plain:9.3f}  {drawn[-1]:16.2f}  {factors[-1]:6.2f}  {error:.4f}"
             print(f"{seed:4d} {points:4d}  {numbers}", flush=True)
     for name, values in (("as fitted", as_fitted), ("widened", widened)):

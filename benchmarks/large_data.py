@@ -23,7 +23,8 @@ from typing import Any
 
 import psutil
 
-from forcegp import Dataset, JointForces, KukaSurfaceConfig, ToolForces, evaluate, fit, simulate_kuka_surface
+from benchmarks.scores import scores_of
+from forcegp import Dataset, JointForces, KukaSurfaceConfig, ToolForces, fit, simulate_kuka_surface
 from forcegp.data import farthest_rows
 
 RECORDINGS = Path(__file__).resolve().parent.parent / "runs" / "benchmarks"
@@ -71,7 +72,7 @@ def measured_fit(name: str) -> dict[str, Any]:
         "evaluations": posterior.result.evaluations,
     }
     test = recording(case["seed"] + 1, TEST_SECONDS, **case["options"]).rows(slice(0, None, TEST_STEP))
-    scores = evaluate(posterior, test).to_dict()
+    scores = scores_of(posterior, test)
     chosen = ("mae", "mae_noise_free", "coverage_95", "coverage_95_noise_free")
     return measured | {key: scores[key] for key in chosen if key in scores}
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 import time
 
-from forcegp.evaluation import evaluate
+from benchmarks.scores import scores_of
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
@@ -32,7 +32,7 @@ def run() -> dict[str, float]:
             start, model = time.process_time(), train.model.with_forces(JointForces())
             posterior = fit(model if mean == "analytical" else model.without_mean(), train, points=POINTS, seed=seed)
             seconds = time.process_time() - start
-            score = evaluate(posterior, test).to_dict()
+            score = scores_of(posterior, test)
             collected.append(score)
             print(
                 f"{seed:4d} {mean:>10} {score['mae']:7.4f} {score['mae_noise_free']:10.4f} {score['nlpd']:7.3f} "

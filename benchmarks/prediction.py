@@ -22,14 +22,14 @@ from forcegp import KukaSurfaceConfig, Noise, fit, simulate_kuka_surface
 from forcegp.data import Dataset, farthest_rows
 from forcegp.evidence import TrainingData
 from forcegp.forces import JointForces
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.predictor import Predictor
 
 POINTS, FITTED, BATCH, COMPARED = 1000, 100, 10_000, 400
 SEEDS = 31, 1031
 
 
-def trained() -> tuple[StructuredPosterior, Dataset, Dataset]:
+def trained() -> tuple[Posterior, Dataset, Dataset]:
     """The posterior, the trajectory of its points, and another one."""
     along, apart = (simulate_kuka_surface(KukaSurfaceConfig(seconds=100.0, seed=seed)) for seed in SEEDS)
     rows = farthest_rows(along, POINTS)
@@ -69,7 +69,7 @@ def states_per_second(call: Callable[..., Any], at: list[torch.Tensor]) -> float
     return len(at[0]) / min(seconds)
 
 
-def inflation(posterior: StructuredPosterior, predictor: Predictor, at: list[torch.Tensor]) -> torch.Tensor:
+def inflation(posterior: Posterior, predictor: Predictor, at: list[torch.Tensor]) -> torch.Tensor:
     """Standard deviations of the predictor over the exact ones, minus 1."""
     exact = posterior.predict(*at)
     mean, covariance = predictor(*at)

@@ -33,7 +33,7 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.evidence import TrainingData
 from forcegp.forces import parse_forces
 from forcegp.integration import INTEGRATORS, integrate
-from forcegp.posterior import StructuredPosterior, casadi_function
+from forcegp.posterior import Posterior, casadi_function
 
 RECOMMENDED = "gp:joint-friction,gp:load-friction"
 PRIORS = ("gp:joint", "gp:tool-friction", "gp:joint-friction", RECOMMENDED)
@@ -41,12 +41,12 @@ MOTIONS, STEPS, DT, FUNCTIONS = 512, 25, 0.004, 8
 PARITY_STATES = 10_000
 
 
-def fitted(train: Dataset, prior: str, points: int) -> StructuredPosterior:
+def fitted(train: Dataset, prior: str, points: int) -> Posterior:
     """With the hyper-parameters of 100 rows."""
     model = train.model
     assert model is not None, "simulated datasets have one"
     first = fit(model.with_forces(parse_forces(prior), noise=Noise(0.1)), train, points=100, restarts=1)
-    assert isinstance(first, StructuredPosterior), "of processes on forces"
+    assert isinstance(first, Posterior), "of processes on forces"
     if points == 100:
         return first
     rows = TrainingData.of(farthest_rows(train, points), model.robot.device)
@@ -64,7 +64,7 @@ def seconds(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(taken))
 
 
-def predictors(posteriors: dict[tuple[str, int], StructuredPosterior], apart: Dataset) -> dict[str, float]:
+def predictors(posteriors: dict[tuple[str, int], Posterior], apart: Dataset) -> dict[str, float]:
     """One state, for every prior; the recommended one also at N = 400."""
     results: dict[str, float] = {}
     at = states(apart, 400)
@@ -80,7 +80,7 @@ def predictors(posteriors: dict[tuple[str, int], StructuredPosterior], apart: Da
     return results
 
 
-def motions(posterior: StructuredPosterior, apart: Dataset) -> dict[str, float]:
+def motions(posterior: Posterior, apart: Dataset) -> dict[str, float]:
     """The compiled loop against what a user would write without it."""
     generator = torch.Generator().manual_seed(0)
     q0, v0, u = states(apart, MOTIONS)
@@ -128,7 +128,7 @@ def motions(posterior: StructuredPosterior, apart: Dataset) -> dict[str, float]:
     }
 
 
-def exported(posterior: StructuredPosterior, apart: Dataset, timed: bool) -> dict[str, float]:
+def exported(posterior: Posterior, apart: Dataset, timed: bool) -> dict[str, float]:
     """The C program: compilation, times, parity."""
     at = [np.ascontiguousarray(x) for x in states(apart, PARITY_STATES)]
     expected = posterior.predict(*at, covariance=False).mean.numpy()
@@ -164,7 +164,7 @@ def exported(posterior: StructuredPosterior, apart: Dataset, timed: bool) -> dic
     return times | {"c_parity": worst, "c_compile_cpu_s": after.ru_utime - before.ru_utime}
 
 
-def casadi_parity(posterior: StructuredPosterior, apart: Dataset) -> dict[str, float]:
+def casadi_parity(posterior: Posterior, apart: Dataset) -> dict[str, float]:
     """Values and Jacobians at 200 states of another recording."""
     at = states(apart, 200)
     function = casadi_function(posterior)

@@ -26,9 +26,9 @@ from benchmarks.large_data import RECORDINGS, in_own_process, peak_bytes, record
 from forcegp import JointForces, ToolForces, fit, load_posterior, save_posterior
 from forcegp.atomic_files import write_json
 from forcegp.data import farthest_rows
-from forcegp.evaluation.plots.style import SMALL
 from forcegp.fit.refinement import on_all_rows
 from forcegp.inference import ENGINES, Inducing
+from forcegp.scores.figures.style import SMALL
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "benchmarks" / "performance"
 SEED, SECONDS = 903, 420.0
@@ -91,7 +91,7 @@ def run() -> dict[str, float]:
 
 def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     """Time and memory over the number of rows."""
-    from forcegp.evaluation.plots.style import SERIES, new_figure, quiet, save_figure
+    from forcegp.scores.figures.style import SERIES, new_figure, quiet, save_figure
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2)

@@ -38,7 +38,7 @@ from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import RigidBodies, Rotor
 from forcegp.forces.registry import usual_friction
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 from forcegp.simulation.kuka_motion import kuka_urdf
 
@@ -112,7 +112,7 @@ def rows_of(motion: dict[str, np.ndarray], model: Model, seed: int, count: int =
     return farthest_rows(data, count)
 
 
-def fits(data: Dataset, given: Model, seed: int) -> dict[str, StructuredPosterior]:
+def fits(data: Dataset, given: Model, seed: int) -> dict[str, Posterior]:
     """Name -> model; all but the first learn from the same rows."""
     laws = replace(
         given,

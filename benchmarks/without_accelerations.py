@@ -37,7 +37,7 @@ from forcegp.fit import fit
 from forcegp.forces import Actuation, CoupledRotors, JointForces, JointFriction, RigidBodies, Unknown
 from forcegp.model import Model
 from forcegp.noise import Noise
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.robots import Robot
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -154,7 +154,7 @@ def sources(rig: Rig) -> Iterator[tuple[str, Source]]:
     yield f"weak form, {short.seconds:g} s, {MORE_WINDOWS} x the points", Source(short, MORE_WINDOWS)
 
 
-def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPosterior:
+def fitted(rig: Rig, source: Source, points: int, seed: int) -> Posterior:
     how, points = source.how, source.times * points
     if how is None:
         return fit(rig.train.model.with_forces(noise=Noise(1.0)), rig.train, points=2)
@@ -165,7 +165,7 @@ def fitted(rig: Rig, source: Source, points: int, seed: int) -> StructuredPoster
         return fit(replace(model, noise=noise), _later(rig.train, 5 * seed), how, points=points, restarts=1)
     rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train).dataset
     noise = Noise(1.0, rig.force_noise, learn=True)
-    return fit(replace(model, noise=noise), farthest_rows(rows, points, seed=seed), restarts=1)
+    return fit(replace(model, noise=noise), farthest_rows(rows, points, start=seed), restarts=1)
 
 
 def _later(raw: Dataset, rows: int) -> Dataset:
@@ -192,7 +192,7 @@ class Targets:
         begin = motions.q[:, :1]
         return cls(filtered.rows(slice(None, None, 10)), replace(motions, q=np.hstack([begin, target.q[:, 1:]])))
 
-    def scores(self, posterior: StructuredPosterior) -> list[float]:
+    def scores(self, posterior: Posterior) -> list[float]:
         """nRMSE of the acceleration per joint, then RMSE of q after each horizon (both joints together)."""
         rows, motions = self.rows, self.motions
         error = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy() - rows.a

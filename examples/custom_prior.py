@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 import torch
 from two_links import NOMINAL
 
-from forcegp import Dataset, JointFriction, evaluate, fit
+from forcegp import Dataset, JointFriction, fit, score
 from forcegp.forces import Unknown, kernel_of
 
 
@@ -36,4 +36,4 @@ log = Dataset(**{name: x.numpy() for name, x in rows.items()}, model=NOMINAL, no
 train, test = log.rows(slice(0, 200)), log.rows(slice(200, 400))
 for prior in (JointFriction(), RoughGear()):
     posterior = fit(NOMINAL.with_forces(prior), train, points=60, restarts=1)
-    print(f"{type(prior).__name__}: mean absolute error {evaluate(posterior, test).mae:.2f} rad/s^2")
+    print(f"{type(prior).__name__}: mean absolute error {score(posterior, test).value('mae'):.2f} rad/s^2")

@@ -3,7 +3,7 @@
 import re
 
 FENCE = re.compile(r"^( *)(`{3,}|:{3,}).*?^\1\2 *$", re.DOTALL | re.MULTILINE)
-GENERATED = re.compile(r"^[>*\s]*\*\*(Yes|No|No difference that the data show)\*\* by ")  # verdicts of forcegp validate
+GENERATED = re.compile(r"^[>*\s]*\*\*(Better|Worse|No difference that the data show)\*\* by ")  # verdicts
 END = re.compile(r"(?<=[.!?])[)\"”*_]*\s+|(?<=[.!?][)\"”*_])\s+")
 ABBREVIATED = re.compile(r"\b(e\.g|i\.e|vs|cf|Fig|eq|eqs|No|al|p|pp|ca)\.\s", re.IGNORECASE)
 

@@ -38,12 +38,11 @@ PACKAGES |= {
     "evidence": MODEL | {"data", "inference"},
     "posterior": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence"},
     "fit": MODEL | {"parallel", "data", "inference", "integration", "evidence", "posterior"},
-    "checks": MODEL | {"data", "evidence", "posterior", "fit"},
+    "checks": MODEL | {"data", "evidence"},
     "control": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence", "posterior"},
     "simulation": {"errors", "robots", "mechanics", "forces", "model", "data"},
 }
-PACKAGES["evaluation"] = set(PACKAGES) - {"simulation"}
-PACKAGES["validation"] = set(PACKAGES) - {"simulation"}
+PACKAGES["scores"] = set(PACKAGES) - {"simulation"}
 PACKAGES["report"] = set(PACKAGES) - {"simulation"}
 PACKAGES["cli"] = set(PACKAGES)
 PACKAGES["__main__"] = {"cli"}
@@ -58,14 +57,14 @@ IMPORTED_WHERE_USED = {
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),
     "pybullet": (),
-    "matplotlib": ("forcegp.evaluation.plots", "forcegp.report", "forcegp.validation.figures"),
+    "matplotlib": ("forcegp.scores.figures", "forcegp.report"),
     "joblib": (),
     "rosbags": (),
     "tyro": ("forcegp.cli",),
     "rich": ("forcegp.cli",),
 }
 
-LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
+LONGEST_MODULE = 600  # lines; 100 to 300 are the rule, and what is one idea stays together, as `Posterior` does
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
 
 
@@ -263,7 +262,7 @@ def test_help_and_usage_errors_need_neither_torch_nor_numpy(words):
 
 
 def test_a_missing_input_is_refused_before_anything_slow_is_imported():
-    loaded = modules_loaded_by("from forcegp.cli.main import main; assert main(['evaluate', 'nope', 'test.h5']) == 2")
+    loaded = modules_loaded_by("from forcegp.cli.main import main; assert main(['score', 'nope', 'test.h5']) == 2")
     assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
 
 

@@ -4,18 +4,14 @@ import pytest
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import (
-    Comparison,
-    JointFriction,
     Model,
     Torques,
     calibrated,
     check,
-    compare_priors,
-    evaluate,
     fit,
     save_posterior,
+    score,
     split_named,
-    validate,
 )
 from forcegp.errors import InvalidInput
 from forcegp.evidence import motion_residuals
@@ -34,18 +30,17 @@ def posterior(data):
 
 
 CALLS = [
-    (lambda d, p: evaluate(d, p), "posterior is a Dataset; give a Posterior"),
-    (lambda d, p: evaluate(p, p), "dataset is a StructuredPosterior; give a Dataset"),
+    (lambda d, p: score(d, p), "log is a Posterior; give a Dataset"),
+    (lambda d, p: score(d, d), "models is a Dataset; give a Posterior, a mapping from names, or names"),
+    (
+        lambda d, p: score({"a": 5}, d, split=split_named(d, "blocks:2:1", 0.0), points=3),
+        "model 'a' is a int; give a name, a Model, a Posterior or a function",
+    ),
     (lambda d, p: check(d.model, d), "dataset is a Model; give a Dataset"),
     (lambda d, p: check(d, d.model.robot), "model is a Robot; give a Model"),
     (lambda d, p: motion_residuals(d.model, d), "dataset is a Model; give a Dataset"),
     (lambda d, p: held_out_noise(d, d.model, Torques()), "model is a Dataset; give a Model"),
     (lambda d, p: calibrated(d, p), "posterior is a Dataset; give a Posterior"),
-    (lambda d, p: compare_priors({"a": JointFriction()}, d), "dataset is a dict; give a Dataset"),
-    (
-        lambda d, p: compare_priors(d, [JointFriction()] * 2),
-        "candidates is a list; give a Mapping from names to forces",
-    ),
     (lambda d, p: split_named("auto", "auto"), "dataset is a str; give a Dataset"),
     (
         lambda d, p: fit(d.model.with_forces(JointForces()), d.model),
@@ -60,9 +55,8 @@ CALLS = [
     (lambda d, p: p.with_model(d.model.robot), "model is a Robot; give a Model"),
     (lambda d, p: Model("arm.urdf"), r"robot is a str; give a Robot, for example Robot.from_urdf"),
     (lambda d, p: save_posterior("run", p), "posterior is a str; give a Posterior"),
-    (lambda d, p: validate("folder", d), "comparison is a str; give a Comparison"),
-    (lambda d, p: Comparison(d.model, d, d, ()), "model is a Dataset; give a Model"),
-    (lambda d, p: Comparison(d, d.model, d.model, ()), "recording is a Model; give a Dataset"),
+    (lambda d, p: score(["given"], d, points=4, model=d.model.robot), "model is a Robot; give a Model"),
+    (lambda d, p: score(["given"], d, points=4, recording=d.model), "recording is a Model; give a Dataset"),
 ]
 
 

@@ -10,8 +10,8 @@ from tests.devices import DEVICES, PRETEND, MixedDevices, PretendTensor, pretend
 from tests.inference.dense import dense_covariance
 from tests.posterior.arm import arm_data, arm_model
 
+from forcegp import score
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import evaluate
 from forcegp.evidence import MarginalLikelihood, TrainingData
 from forcegp.fit import fit
 from forcegp.forces import Coulomb, JointForces, RigidBodies, Viscous, parse_forces
@@ -196,7 +196,9 @@ def test_fits_with_several_starts_on_the_pretended_device():
         posterior = fit(model.with_forces(JointForces(), noise=Noise(0.05, learn=True)), data, **how)
         assert all(isinstance(value, PretendTensor) for value in posterior.hyperparameters.values())
         assert posterior.result.value == pytest.approx(expected.result.value, rel=1e-8)
-        assert evaluate(posterior, test).mae == pytest.approx(evaluate(expected, test).mae, rel=1e-6)
+        assert score(posterior, test, horizons=()).value("mae") == pytest.approx(
+            score(expected, test, horizons=()).value("mae"), rel=1e-6
+        )
         learned = fit(model.with_forces(RigidBodies(learn=("hand",)), JointForces()), data, restarts=1, options=QUICK)
         assert math.isfinite(learned.result.value)
         forces = fit(

@@ -47,6 +47,7 @@ def test_a_payload(run):
     assert (x, z) == (pytest.approx(20.0, abs=3.0), pytest.approx(50.0, abs=3.0))
 
 
+@pytest.mark.nightly
 def test_computed_torque(run):
     urdf, learned = (float(error) for error in re.findall(r": (\S+) mrad", run("computed_torque.py")))
     assert learned < 0.05 * urdf

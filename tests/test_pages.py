@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from tests.cli.in_process import run_here
 from tests.examples import run_example
+from tests.scores.moving_arm import moving_arm
 
 from forcegp import Dataset
 from forcegp.cli.main import parse_arguments
+from forcegp.scores.candidates import candidates, usual_identification
 
 
 def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
@@ -61,18 +63,25 @@ def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
         parse_arguments(shlex.split(command)[1:])
 
 
-def test_the_page_on_comparing_priors_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "comparing-priors.md").read_text(encoding="utf-8")
+def test_the_page_on_scoring_runs(repository: Path, tmp_path: Path):
+    page = (repository / "docs" / "how-to" / "scoring.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    verdict, joint, contact, none, left_out = printed.splitlines()
-    assert verdict.startswith("The data support contact: ")
-    scores = [float(re.search(r"functions, (\S+) nats per row", line)[1]) for line in (joint, contact, none)]
-    assert scores[1] > scores[0] > scores[2]
-    assert left_out.endswith("torch.Size([30, 7]) torch.Size([30, 7, 7])")
+    moving_arm(1.5, 2).save(tmp_path / "log.h5")
+    alone, *verdicts, found, left_out = run_example(example, tmp_path).splitlines()
+    assert len(re.findall(r"\d\.\d+", alone)) == 5
+    assert sum("mine / identified" in line for line in verdicts) == 3
+    assert "'median'" in found
+    assert "gp:joint" in left_out or "friction" in left_out
+    assert (tmp_path / "mine" / "report.md").exists()
+    model = moving_arm(0.1, 1).model
+    (table,) = re.findall(r"\| `--forces` \|.*?\n\n", page, re.DOTALL)
+    named = [name for row in table.split("|\n|")[2:] for name in re.findall(r"`([^`]+)`", row.split("|")[0])]
+    words = [word for name in named for word in ("--forces", name)]
+    command = parse_arguments(["score", "log.h5", *words])
+    assert len(candidates(command.candidates(), model, usual_identification(model))) == len(named) >= 8
     for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
-        for command in re.findall(r"^ *forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
-            parse_arguments(shlex.split(command.partition(">")[0].replace("$seed", "1")))
+        for line in re.findall(r"^ *forcegp ([^#\n]*)", commands, re.MULTILINE):
+            parse_arguments(shlex.split(line))
 
 
 def test_the_page_on_reports_runs(repository: Path, tmp_path: Path):
@@ -157,7 +166,7 @@ def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
     page = (repository / "docs" / "how-to" / "rollouts.md").read_text(encoding="utf-8")
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     names = [parse_arguments(command.split()[1:]).__class__.__name__ for command in commands.splitlines()]
-    assert names == ["Simulate", "Simulate", "Fit", "Rollout"]
+    assert names == ["Simulate", "Simulate", "Fit", "Score"]
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
@@ -171,6 +180,7 @@ def test_the_commands_of_the_page_on_rollouts_are_commands(repository: Path):
         ("shooting", r"cosines .*: (\S+), (\S+)\nmedian \S+ ms of CPU, of 20 ms, for 512 x 25 steps"),
     ],
 )
+@pytest.mark.nightly
 def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: Path, monkeypatch, program, lines):
     """A model, 15 s of CPU each: what the page promises of both."""
     pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
@@ -214,6 +224,7 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     assert "lbr_iiwa_acceleration(" in (tmp_path / "controller" / "lbr_iiwa_external.c").read_text()
 
 
+@pytest.mark.nightly
 def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "robots.md").read_text(encoding="utf-8")
     record, drone = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
@@ -227,5 +238,6 @@ def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, 
         assert done.returncode == 0, f"{command}: {done.stderr}"
     for name in ("arm", "gripper", "dog", "drone", "fourbar"):
         test = "test.h5" if name == "drone" else f"{name}_test.h5"
-        scores = json.loads(run_here("evaluate", name, test, "--json", folder=tmp_path).stdout)
-        assert scores["mae"] < 0.25 * scores["known_physics_mae"], name
+        scores = json.loads(run_here("score", name, test, "--json", folder=tmp_path).stdout)
+        errors = scores["models"][name]["scores"]["acceleration"]
+        assert errors["mae"]["all"]["median"] < 0.25 * errors["known_physics_mae"]["all"]["median"], name

@@ -28,11 +28,10 @@ from forcegp import (
     Noise,
     Viscous,
     check,
-    compare_priors,
-    evaluate,
     fit,
     load_posterior,
     save_posterior,
+    score,
 )
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
@@ -62,10 +61,11 @@ def whole_way() -> None:
         check(data)
         free = replace(data, model=data.model.with_contacts(()), truth={}) if compiled else data
         fit(free.model.with_forces(Viscous()), free).predict(free.q, free.v, free.u)
-        compare_priors(data, {"one": prior, "none": ()}, points=20, restarts=1, options=QUICK)
-        evaluate(fit(data.model.black_box(), data, points=20, restarts=1, options=QUICK), data)
+        models = {"one": data.model.with_forces(prior), "none": data.model.with_forces()}
+        score(models, data, split="leave-out", points=20, restarts=1, iterations=3)
+        score(fit(data.model.black_box(), data, points=20, restarts=1, options=QUICK), data, horizons=())
         posterior = fit(data.model.with_forces(prior, noise=Noise(0.05)), data, points=40, restarts=1, options=QUICK)
-        evaluate(posterior, data)
+        score(posterior, data, horizons=())
         with tempfile.TemporaryDirectory() as folder:
             data.save(f"{folder}/data.h5")
             save_posterior(posterior, f"{folder}/model")
@@ -158,6 +158,7 @@ def test_the_fields_of_a_dataclass_are_checked_once_they_are_there():
         Weights("all")
 
 
+@pytest.mark.nightly
 def test_a_wrong_shape_is_refused_and_right_ones_pass_from_the_robot_to_its_predicted_motions(repository):
     paths = os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "FORCEGP_CHECK_SHAPES": "1", "PYTHONPATH": paths}

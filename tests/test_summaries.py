@@ -7,7 +7,7 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 from tests.posterior.raw_log import motion
 
-from forcegp import Viscous, check, evaluate, fit
+from forcegp import Viscous, check, fit, score
 from forcegp.errors import ForceGPError
 from forcegp.forces import Actuation, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
@@ -29,11 +29,10 @@ def shown(data):
     prediction = posterior.predict(data.q, data.v, data.u)
     return {
         "Dataset": data,
-        "StructuredPosterior": posterior,
-        "IndependentPosterior": fit(data.model.black_box(), data, **quick),
+        "Posterior": posterior,
         "Prediction": prediction,
         "Gaussian": prediction.unknown_force,
-        "Evaluation": evaluate(posterior, arm_data(10, 1)),
+        "Scores": score(posterior, arm_data(10, 1), horizons=()),
         "Robot": data.model.robot,
         "Model": data.model,
         "Estimates": learned.estimates,
@@ -46,11 +45,10 @@ FACTS = {
     "CheckReport": ("wrong: none", "sampling"),
     "Predictor": ("joints: 3", "covariance"),
     "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
-    "StructuredPosterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
-    "IndependentPosterior": ["learned from: 20 rows"],
+    "Posterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
     "Prediction": ["batch: (20,)", "entries: 3", "forces: multiplier, contact_force, unknown_force"],
     "Gaussian": ["batch: (20,)", "largest std"],
-    "Evaluation": ["rows: 10", "mae: ", "noise floor 0.0399", "coverage 95: ", "warnings: "],
+    "Scores": ["mae: ", "noise floor: 0.0399", "coverage 95: ", "warnings: "],
     "Robot": ["name: 'arm'", "nv: 3", "pan (revolute), lift (revolute), bend (revolute)"],
     "Model": ["contacts: hand on Plane", "forces: Actuation, RigidBodies", "omega=5.0"],
     "Estimates": ["estimated: viscous.pan", "from: 20 rows, "],
@@ -81,7 +79,7 @@ def test_html_of_a_name_is_escaped():
 
 
 def test_a_prediction_of_means_shows_itself(shown, data):
-    prediction = shown["StructuredPosterior"].predict(data.q, data.v, data.u, covariance=False)
+    prediction = shown["Posterior"].predict(data.q, data.v, data.u, covariance=False)
     assert "only the mean was predicted" in repr(prediction)
     for name in ("std", "variance"):
         with pytest.raises(ForceGPError, match="call predict"):
@@ -111,7 +109,7 @@ def test_a_prediction_of_some_states(shown, index, rows):
 
 
 def test_batches_of_several_dimensions_and_single_states(shown, data):
-    posterior = shown["StructuredPosterior"]
+    posterior = shown["Posterior"]
     q, v, u = (x.reshape(4, 5, 3) for x in (data.q, data.v, data.u))
     whole = posterior.predict(q, v, u)
     assert torch.equal(whole[1, 2].mean, whole.mean[1, 2])
@@ -119,8 +117,6 @@ def test_batches_of_several_dimensions_and_single_states(shown, data):
     assert torch.equal(whole[..., 2].mean, whole.mean[:, 2])  # never an entry of the acceleration
     single = posterior.predict(data.q[0], data.v[0], data.u[0])
     assert torch.equal(single[...].mean, single.mean)
-    black_box = shown["IndependentPosterior"].predict(data.q, data.v, data.u)
-    assert black_box[2].unknown_force is None
 
 
 def test_states_that_are_not_there(shown):
@@ -128,15 +124,3 @@ def test_states_that_are_not_there(shown):
         with pytest.raises(ForceGPError, match="no states"):
             shown["Prediction"][index]
     assert len(list(shown["Prediction"])) == 20  # a loop ends
-
-
-def test_models_without_forces_state_that_they_have_no_components(shown, data):
-    state = (data.q, data.v, data.u)
-    for call in (
-        lambda model: model.components(*state),
-        lambda model: model.curve("friction"),
-        lambda model: model.with_contacts([]),
-        lambda model: model.with_robot(data.model.robot),
-    ):
-        with pytest.raises(ForceGPError, match=r"^a .*; (use|fit) "):
-            call(shown["IndependentPosterior"])

@@ -23,9 +23,10 @@ from benchmarks.force_priors.trials import (
 from benchmarks.paper import published
 from benchmarks.paper.experiment import medians
 from benchmarks.paper.figures import draw_range
-from forcegp.evaluation import friction_curves_figure, normal_force_figure
-from forcegp.evaluation.metrics import formatted, markdown_table
-from forcegp.evaluation.plots.style import (
+from forcegp.jobs import JobStore
+from forcegp.posterior import load_posterior
+from forcegp.scores import friction_curves_figure, normal_force_figure
+from forcegp.scores.figures.style import (
     MEASUREMENT,
     PREDICTION,
     QUIET,
@@ -35,8 +36,7 @@ from forcegp.evaluation.plots.style import (
     plain_ticks,
     quiet,
 )
-from forcegp.jobs import JobStore
-from forcegp.posterior import load_posterior
+from forcegp.scores.tables import formatted, markdown_table
 
 EFFICIENT = {
     "joint forces on (q, v, u), the paper's": "gp:joint",
@@ -321,7 +321,7 @@ class DeepKernel(ForceExperiment):
         parts = [
             "`friction-map`: viscous friction whose coefficient depends on the place, analytical mean, "
             f"{len(self.seeds)} seeds. Leave-one-out: log density of a training row given all others, in nats per row, "
-            "from the same fit; the higher, the better. `compare_priors` chooses by that of stretches of time."
+            "from the same fit; the higher, the better. `forcegp score --split leave-out` takes stretches of time."
         ]
         columns = ("mae_noise_free", "nlpd", "coverage_95")
         for scenario in STRIP:

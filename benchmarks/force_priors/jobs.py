@@ -9,15 +9,16 @@ import torch
 
 from benchmarks.paper.data import farthest, simulated
 from benchmarks.paper.fits import MODEL, search_report
+from benchmarks.scores import scores_of
 from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import curve_coverage, evaluate, force_scores
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit as fit_model
 from forcegp.forces import ContactFriction, Coulomb, JointFriction, Viscous, parse_forces
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.posterior import save_posterior
+from forcegp.posterior.components import Curve
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
@@ -79,6 +80,7 @@ def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
     return None
 
 
+ROUNDING = 1e-9  # relative
 FILE = "data.h5"
 BLACK_BOX, KNOWN_PHYSICS, LAWS = "independent-gp", "none", "joint-laws"
 """Models of the trials that are no prior expressions: a Gaussian process per joint, no unknown force at all, and
@@ -151,7 +153,7 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     assert test.model is not None, "simulated data carry their model"
     if posterior.predicts_forces:
         posterior = posterior.with_contacts(test.model.contacts)  # what was identified stays
-    out = evaluate(posterior, test).to_dict()
+    out = scores_of(posterior, test)
     names = ("mae", "mae_noise_free", "nlpd", "coverage_95", "coverage_95_noise_free", "known_physics_mae")
     kept = {name: out[name] for name in names}
     if "a" in test.truth:  # what nothing can be better than on these rows
@@ -160,25 +162,26 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
         open_contacts = (np.asarray(test.truth["in_contact"]) == 0.0).sum(axis=1)
         for name, where in (("touching", open_contacts == 0), ("in_the_air", open_contacts > 0)):
             chosen = np.flatnonzero(where)
-            kept[f"mae_{name}"] = evaluate(posterior, test.rows(chosen)).mae if chosen.size else None
-    return kept | _forces(posterior, test) if posterior.predicts_forces else kept
-
-
-def _forces(posterior: Any, test: Dataset) -> dict[str, Any]:
-    """Scores of lambda, how far the components are from their sum, and the error of every known joint force [Nm].
-
-    Without contacts there is nothing about lambda; its coverage is None where the model has no uncertainty of it.
-    """
-    known = force_scores(posterior, test)
-    out: dict[str, Any] = {}
-    if known.multiplier is not None:
-        out["normal_force_error"] = known.multiplier.relative_rmse
-        out["normal_force_coverage"] = known.multiplier.coverage_95
+            kept[f"mae_{name}"] = scores_of(posterior, test.rows(chosen))["mae"] if chosen.size else None
+    if not posterior.predicts_forces:
+        return kept
+    kept |= {name: value for name, value in out.items() if name.startswith(("force_mae.", "normal_force"))}
     found = posterior.components(test.q, test.v, test.u, covariance=False)
-    if found:
+    if found:  # how far they are from their sum
         total = sum(part.joint_force.mean for part in found.values())
-        out["component_sum_error"] = float((total - found.total.mean).abs().max())
-    return out | {f"force_mae.{name}": score.mae for name, score in known.joint_force.items()}
+        kept["component_sum_error"] = float((total - found.total.mean).abs().max())
+    return kept
+
+
+def curve_coverage(curve: Curve, law: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Share of the curve's points (n,) within the visited range whose 95 % interval contains the true `law`."""
+    at = curve.features[:, 0].cpu().numpy()
+    low, high = curve.visited[:, 0].cpu().numpy()
+    inside = (at >= low - ROUNDING * abs(low)) & (at <= high + ROUNDING * abs(high))
+    truth = law(at)
+    lower, upper = (end.cpu().numpy() for end in curve.interval())
+    slack = ROUNDING * float(np.abs(truth).max())  # friction at rest is exactly zero, and so is its interval's width
+    return float(((truth >= lower - slack) & (truth <= upper + slack))[inside].mean())
 
 
 def curve_scores(posterior: Any) -> dict[str, Any]:

@@ -13,9 +13,9 @@ from typing_extensions import override
 from benchmarks.paper.data import TEST_SEED
 from benchmarks.paper.experiment import Experiment, Row, in_columns, medians
 from benchmarks.paper.fits import FitSettings, fit_cost
-from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range
-from forcegp.evaluation.plots.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, plain_ticks, quiet
 from forcegp.jobs import Job, JobStore
+from forcegp.scores.figures.style import MEASUREMENT, PREDICTION, SMALL, TRUTH, new_figure, plain_ticks, quiet
+from forcegp.scores.tables import formatted, markdown_table, median_and_range
 
 _SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "viscous": ("viscous tool friction (the paper's)", {}),

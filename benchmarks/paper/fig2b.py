@@ -21,9 +21,8 @@ from benchmarks.paper.fits import (
     fit_series,
     fit_to_all,
 )
-from forcegp.evaluation.metrics import formatted
-from forcegp.evaluation.pages import rendered
 from forcegp.jobs import Job, JobStore
+from forcegp.scores.tables import formatted, rendered
 
 SCORES = {
     "mae": "MAE against noisy accelerations [rad/s²]",

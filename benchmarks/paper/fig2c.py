@@ -10,9 +10,8 @@ from typing_extensions import override
 from benchmarks.paper.experiment import Experiment, Row
 from benchmarks.paper.fig2c_jobs import CENTER_BOUND, CENTER_OFFSET, MASS_BOUND, MASS_OFFSET, MODELS, NAMES
 from benchmarks.paper.fits import fit_cost
-from forcegp.evaluation.metrics import formatted, median_and_range
-from forcegp.evaluation.pages import rendered
 from forcegp.jobs import Job, JobStore
+from forcegp.scores.tables import formatted, median_and_range, rendered
 
 _estimate_name = "fig2c/{}/seed{}".format  # model, seed
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.paper.data import scored_rows, training_rows
-from forcegp.evaluation import evaluate
+from forcegp import score
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit
 from forcegp.forces import Body, JointForces, RigidBodies, ToolForces
@@ -43,7 +43,7 @@ def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
         "decided_by": {name: found[name].decided_by for name in NAMES},
         "center_error": math.hypot(*(error[name] for name in NAMES[1:])),
         "inside": {name: found[name].interval[0] <= true[name] <= found[name].interval[1] for name in NAMES},
-        "mae": evaluate(posterior, scored_rows(results, spec["data"])).mae,
+        "mae": score(posterior, scored_rows(results, spec["data"])).value("mae"),
     }
 
 

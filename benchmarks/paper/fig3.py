@@ -14,9 +14,10 @@ from benchmarks.paper.experiment import Experiment, Row, stored_arrays
 from benchmarks.paper.figures import prediction_window_figure
 from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings, fit_name, fit_series
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.metrics import interval_coverage, markdown_table, number
 from forcegp.jobs import Job, JobStore
 from forcegp.posterior import load_posterior
+from forcegp.scores.metrics import interval_coverage
+from forcegp.scores.tables import markdown_table, number
 
 ARRAYS = "prediction.npz"
 

@@ -15,9 +15,8 @@ from benchmarks.paper.experiment import Experiment, Row, in_columns, stored_arra
 from benchmarks.paper.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from benchmarks.paper.figures import rollouts_figure
 from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series
-from forcegp.evaluation.metrics import median_and_range, number
-from forcegp.evaluation.pages import rendered
 from forcegp.jobs import Job, JobStore
+from forcegp.scores.tables import median_and_range, number, rendered
 
 TASKS = "benchmarks.paper.fig4_jobs"
 _name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed

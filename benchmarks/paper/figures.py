@@ -10,7 +10,7 @@ from matplotlib.ticker import NullLocator
 
 from benchmarks.paper import published
 from benchmarks.paper.fits import MODELS
-from forcegp.evaluation.plots.style import (
+from forcegp.scores.figures.style import (
     LARGE,
     QUANTILE,
     QUIET,

@@ -11,8 +11,8 @@ from typing import Any
 from torch import Tensor
 
 from benchmarks.paper.data import scored_rows, training_rows
+from benchmarks.scores import scores_of
 from forcegp.data import Dataset
-from forcegp.evaluation import evaluate
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit as fit_model
 from forcegp.forces import JointAccelerations, JointForces, ToolForces
@@ -103,7 +103,7 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
         start = load_posterior(results.place(spec["start"]) / MODEL).hyperparameters
     posterior = fitted(spec, train, start)
     save_posterior(posterior, folder / MODEL)
-    scores = evaluate(posterior, scored_rows(results, spec["data"])).to_dict()
+    scores = scores_of(posterior, scored_rows(results, spec["data"]))
     return {"evaluation": scores, "search": search_report(posterior)}
 
 

@@ -16,11 +16,10 @@ from benchmarks.paper.fits import FitSettings
 from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, require_known
-from forcegp.evaluation import save_figure
-from forcegp.evaluation.metrics import markdown_table
-from forcegp.evaluation.pages import alike
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Jobs
+from forcegp.scores import save_figure
+from forcegp.scores.tables import alike, markdown_table
 
 PAPER_DATA = DataSettings(train_seconds=200.0, rows=10_000, test_seconds=100.0, every=12)
 SMOKE_DATA = DataSettings(train_seconds=10.0, rows=400, test_seconds=12.0, every=12)

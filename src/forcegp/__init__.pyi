@@ -80,13 +80,8 @@ from .inference import Exact as Exact
 from .inference import Inducing as Inducing
 
 # how good it is
-from .evaluation import evaluate as evaluate
-from .evaluation import Evaluation as Evaluation
-from .evaluation import compare_priors as compare_priors
-from .evaluation import PriorComparison as PriorComparison
-from .validation import validate as validate
-from .validation import Comparison as Comparison
-from .validation import Validation as Validation
-from .validation import split_named as split_named
+from .scores import score as score
+from .scores import Scores as Scores
+from .scores import split_named as split_named
 
 __version__: str

@@ -110,10 +110,10 @@ class Model(Summary):
         return replace(self, forces=(*silent, *inertia, *self.unknown.terms))
 
     def black_box(self, noise: Any = None) -> "Model":
-        """One Gaussian process per joint acceleration, without physics; predictions are checked on the contacts."""
+        """One Gaussian process per joint acceleration, without physics and contacts: the baseline "GP" of the paper."""
         from forcegp.forces import IndependentAccelerations
 
-        bare = replace(self, forces=self.laws, noise=None).without_mean()
+        bare = replace(self, contacts=(), forces=self.laws, noise=None).without_mean()
         return bare.with_forces(IndependentAccelerations(), noise=noise)
 
     @cached_property

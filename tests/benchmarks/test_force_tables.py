@@ -17,8 +17,8 @@ from benchmarks.paper.experiment import DataSettings
 from benchmarks.paper.fits import FitSettings
 from tests.benchmarks.stored_jobs import keep
 
-from forcegp.evaluation.metrics import median_and_range
 from forcegp.jobs import JobStore
+from forcegp.scores.tables import median_and_range
 
 DATA = DataSettings(train_seconds=3.0, rows=50, test_seconds=2.0, every=5)
 SEARCH = FitSettings(restarts={"0": 2}, iterations=7, tolerance={"0": 1e-4})

@@ -22,6 +22,7 @@ def run(repository):
     return run
 
 
+@pytest.mark.nightly
 def test_the_script_works_on_the_cpu(run, repository):
     before = gpu.RESULTS.exists()
     done = run("--device", "cpu", "--small")

@@ -10,8 +10,8 @@ from benchmarks.paper.reproduction import PAPER_PAGE, PRESETS, as_csv, experimen
 
 from forcegp.cli.demo import PUBLISHED_MAE
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.metrics import formatted, markdown_table, median_and_range, number
 from forcegp.jobs import Job
+from forcegp.scores.tables import formatted, markdown_table, median_and_range, number
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "paper"
 

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointFriction, ToolForces
 from forcegp.inference import OptimizerOptions
+from forcegp.posterior.components import Curve
 from forcegp.simulation import KukaSurfaceConfig
 
 V = np.linspace(-1.5, 1.5, 40)  # rad/s, without 0
@@ -93,3 +95,19 @@ def test_models_without_forces_have_no_law(motion):
 
     data = motion.rows(slice(0, None, 60))
     assert true_curves(fit(data.model.black_box(), data, options=OptimizerOptions(iterations=0))) == {}
+
+
+def test_coverage_of_a_curve_counts_the_points_in_the_visited_range():
+    from benchmarks.force_priors.jobs import curve_coverage
+
+    def curve(mean, std, high):
+        at, column = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)[:, None], torch.tensor([[0.0], [high]])
+        return Curve(
+            "f", "N", ("v [m/s]",), at, *(torch.tensor(each).double() for each in (mean, std)), column.double()
+        )
+
+    given = curve([0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 0.1, 0.1, 0.1, 0.1], 1.0)
+    assert curve_coverage(given, lambda v: 4.0 * v) == 1.0  # exact at rest, where there is no width
+    assert curve_coverage(given, lambda v: 4.0 * v + 0.15) == pytest.approx(0.8)
+    assert curve_coverage(given, lambda v: 4.0 * v + 0.3) == 0.0
+    assert curve_coverage(curve([0.0, 1.0, 2.0, 9.0, 9.0], [0.1] * 5, 0.5), lambda v: 4.0 * v) == 1.0

@@ -1,11 +1,7 @@
-"""Logs of two-joint robots, and what goes wrong with such logs: each corruption is a function of a clean log.
-
-`python -m tests.checks.corruptions` prints which of them `check` and `fit` report, over robots and seeds.
-"""
+"""Logs of two-joint robots, and what goes wrong with such logs: each corruption is a function of a clean log."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -316,36 +312,3 @@ def said_by_fit(data: Dataset) -> str:
     except ForceGPError as error:
         return str(error)
     return findings_in_one_line(quick_check(data), Path("log.h5")) or ""
-
-
-def table(seeds: int, say: Callable[[Dataset], str], verbose: bool) -> None:
-    """Print how often each corruption is named, and what is said of the clean logs."""
-    counts: dict[str, list[int]] = {}
-    for seed in range(seeds):
-        logs = [(name, data, CORRUPTIONS) for name, data in cases(seed).items()]
-        logs += [("line", on_a_line(seed), CONTACT_CORRUPTIONS)]
-        for where, data, corruptions in logs:
-            free = {} if where == "line" else {"contact invented": (invented, "contact")}
-            before = say(data)
-            if before:
-                print(f"CLEAN {where} {seed}: {before}")
-            for name, (corrupt, words) in {**corruptions, **free}.items():
-                if name in UNSEEN.get(where.partition(",")[0], ()):
-                    continue
-                try:
-                    said = say(corrupt(data))
-                except Exception as error:  # a table of everything
-                    said = f"{type(error).__name__}: {error}"
-                new = "\n".join(line for line in said.splitlines() if line not in before)
-                hit = named(new, words)
-                counts.setdefault(name, []).append(hit)
-                if not hit and verbose:
-                    print(f"MISSED {name} | {where} {seed}: {new or '-'}")
-    for name, hits in counts.items():
-        print(f"{name:32s} {sum(hits):3d} of {len(hits)}")
-    shares = [np.mean(hits) for hits in counts.values()]
-    print(f"named in 9 of 10 logs or more: {sum(share >= 0.9 for share in shares)} of {len(shares)}")
-
-
-if __name__ == "__main__":
-    table(int(sys.argv[1]), said_by_fit if "fit" in sys.argv else said_by_check, "-v" in sys.argv)

@@ -24,7 +24,7 @@ def told(report: CheckReport) -> str:
 
 
 @pytest.mark.parametrize("model", SYSTEMS)
-@pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (1, 1.0), (2, 1.0), (3, 1.0)])
+@pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (1, 1.0)])
 def test_a_clean_log_raises_no_alarm(model, seed, noise):
     report = check(clean(seed, SYSTEMS[model](), noise=noise))
     assert report.severity == "ok", told(report)
@@ -35,38 +35,19 @@ def all_motion(data: Dataset, sign: list[float], names: str = "qva") -> Dataset:
     return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
 
 
-def held(start: int, stop: int) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda x: np.where((np.arange(len(x)) > start) & (np.arange(len(x)) < stop), x[start], x)
-
-
-def clipped(u: np.ndarray) -> np.ndarray:
-    return np.clip(u, *np.quantile(u, [0.1, 0.9]))
-
-
 ALL, LAST_TWO = ("pan", "lift", "bend"), ("lift", "bend")
 DEFECTS: dict[str, tuple[Callable[[Dataset], Dataset], str, str, tuple[str, ...]]] = {
-    "torque sign of one": (lambda d: column(d, "u", 1, np.negative), "wrong", "torque sign", ("lift",)),
     "torque sign of all": (lambda d: replace(d, u=-d.u), "wrong", "torque sign", ALL),
-    "torques exchanged": (lambda d: exchanged(d, "u", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
     "torques turned around": (lambda d: exchanged(d, "u", [1, 2, 0]), "wrong", "joints exchanged", ALL),
     "motions exchanged": (lambda d: exchanged(d, "qva", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
     "joints exchanged": (lambda d: exchanged(d, "qvau", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
     "motion sign": (lambda d: all_motion(d, [1, -1, 1]), "wrong", "motion sign", ("lift",)),
-    "degrees": (lambda d: all_motion(d, [DEGREES] * 3), "wrong", "degrees", ALL),
     "positions in degrees": (lambda d: all_motion(d, [DEGREES] * 3, "q"), "wrong", "velocity", ALL),
-    "velocities in degrees": (lambda d: all_motion(d, [DEGREES] * 3, "va"), "wrong", "velocity", ALL),
-    "velocity sign": (lambda d: column(d, "v", 0, np.negative), "wrong", "velocity", ("pan",)),
     "velocities late": (lambda d: replace(d, v=np.roll(d.v, 4, axis=0)), "look", "velocity", ALL),
-    "torques in mNm": (lambda d: replace(d, u=1000 * d.u), "wrong", "torque unit", ("lift",)),
     "torque before a gear": (lambda d: column(d, "u", 1, lambda x: x / 50), "wrong", "torque unit", ("lift",)),
     "torques 20 ms late": (lambda d: late(d, 0.02), "look", "delay", ALL),
     "one torque late": (lambda d: late(d, 0.02, slice(1, 2)), "look", "delay", ("lift",)),
-    "dead torque": (lambda d: column(d, "u", 1, lambda x: 0 * x), "wrong", "dead torque", ("lift",)),
     "dead position": (lambda d: column(d, "q", 1, lambda x: 0 * x + 0.3), "wrong", "constant channel", ("lift",)),
-    "frozen position": (lambda d: column(d, "q", 1, held(500, 560)), "wrong", "frozen channel", ("lift",)),
-    "frozen torque": (lambda d: column(d, "u", 2, held(500, 560)), "wrong", "frozen channel", ("bend",)),
-    "saturation": (lambda d: column(d, "u", 1, clipped), "wrong", "saturation", ("lift",)),
-    "coarse positions": (lambda d: column(d, "q", 0, lambda x: x.round(2)), "look", "resolution", ("pan",)),
     "beyond a limit": (lambda d: column(d, "q", 2, lambda x: x + 4.0), "look", "limits", ("bend",)),
     "a joint that stays": (lambda d: all_motion(d, [1e-3, 1, 1]), "look", "excitation", ("pan",)),
 }
@@ -143,15 +124,6 @@ def test_a_prepared_log_is_told_with_the_price_that_was_paid():
     assert "when this dataset was prepared" in report.of("noise")[0].seen
 
 
-def test_what_importing_mended_is_told():
-    log = {"repeated_stamps_dropped": 3, "gaps": [[1.0, 2.0]], "largest_deviation_of_a_step": 0.5}
-    imported = {"recordings": [log, {"largest_deviation_of_a_step": 0.0}], "resampled_to_step": 0.005}
-    (found,) = check(replace(clean(1), metadata={"import": imported})).of("import")
-    assert found.severity == "look"
-    for told in ("2 logs", "3 repeated time stamps", "1 gaps", "50 % off"):
-        assert told in found.seen
-
-
 def test_repeated_rows_are_told():
     data = clean(7)
     kept = np.arange(len(data)) // 4 * 4
@@ -206,13 +178,6 @@ def test_the_report_is_json_and_sorted_by_severity():
     assert content["severity"] == "wrong"
     assert content["findings"][0]["subject"] == "torque sign"
     assert sum(content["counts"].values()) == len(content["findings"])
-
-
-def test_a_check_changes_with_its_filter():
-    given = check(clean(1), preparation=Preparation(cutoff=9.0))
-    assert given.inputs.prepared is not None
-    assert given.inputs.prepared.preparation.cutoff == 9.0
-    assert "as asked for" in given.of("noise")[0].seen
 
 
 def test_what_cannot_be_checked_is_refused():

@@ -9,7 +9,6 @@ from tests.examples import run_example
 from forcegp.cli.check import Check
 from forcegp.cli.import_log import Import
 from forcegp.cli.main import parse_arguments
-from forcegp.cli.prepare import Prepare
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,7 @@ def test_the_example_finds_what_was_planted(page, tmp_path):
 def test_the_commands_are_commands(page):
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     parsed = [parse_arguments(shlex.split(line)[1:]) for line in commands.splitlines()]
-    assert [type(command) for command in parsed] == [Import, Check, Prepare]
+    assert [type(command) for command in parsed] == [Import, Check, Import]
 
 
 def test_its_links_lead_somewhere(page, repository):

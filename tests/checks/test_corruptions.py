@@ -1,5 +1,6 @@
 """Every corruption of a two-joint log is named by `check`, and said in one line before a fit; clean logs are not."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,6 +84,14 @@ def test_the_number_that_is_wrong_is_measured():
     (found,) = [each for each in check(data).findings if each.subject == "lengths"]
     assert found.numbers["value"] == pytest.approx(1 / 1.5, abs=0.03)
     assert "0.402 instead of 0.6 m" in found.seen
+
+
+def test_one_explanation_is_named_once():
+    """A mass with its inertia and one without read the same: a payload is both."""
+    data = scaled(clean(two_links(), 0, noise="qvu"), masses=(0.6, 1.0))
+    (said,) = [each.seen for each in check(data).findings if each.subject == "masses"]
+    stated = re.findall(r"a mass of (\S+) of [\d.]+ times", said)
+    assert len(stated) == len(set(stated)) >= 1, said
 
 
 def test_noise_of_the_acceleration_does_not_make_masses_smaller():

@@ -138,16 +138,14 @@ def test_velocities_of_the_joints_are_compared_beside_a_base(log, what, tmp_path
     np.savetxt(tmp_path / "log.csv", table, "%.12g", ",", header=",".join(columns), comments="")
     signals = {name: (f"{name}{{0..{getattr(log, name).shape[1] - 1}}}",) for name in "qvu"}
     mapping = ColumnMapping(time="t", **signals)
-    import_recordings([tmp_path / "log.csv"], tmp_path / "log.h5", mapping, model=log.model)
-    wrong = Dataset.load(tmp_path / "log.h5")
+    wrong = import_recordings([tmp_path / "log.csv"], mapping, model=log.model)
     (finding,) = quick_check(wrong)
     assert (finding.severity, finding.subject) == ("wrong", "velocity")
     assert [each.subject for each in check(wrong).findings if each.severity == "wrong"] == ["velocity"]
     units = ["m/s"] * 3 + ["rad/s"] * 3 + ["deg/s"] * 12
     assert (f"--unit v={','.join(units)};" if what == "deg/s" else "--sign v=1,1,1,1,1,1,1,1,-1,1,") in finding.remedy
     corrected = mapping.corrected_by(finding.correction, log.joint_names, {})
-    import_recordings([tmp_path / "log.csv"], tmp_path / "right.h5", corrected, model=log.model)
-    right = Dataset.load(tmp_path / "right.h5")
+    right = import_recordings([tmp_path / "log.csv"], corrected, model=log.model)
     np.testing.assert_allclose(right.v, log.v, atol=1e-9)
     assert not [each for each in quick_check(right) if each.severity == "wrong"]
 

@@ -85,29 +85,6 @@ def test_a_base_that_nobody_measured_is_named(log):
     assert "base='fixed'" in findings[0].remedy
 
 
-def test_two_feet_of_one_flag_of_which_one_stands_are_named(log):
-    """Whether the flag is 1 where both stand or where one does; feet that stand together may share it."""
-    first, second = log.model.inputs[12:14]
-    flags = log.u[:, 12:14]
-    assert (flags.min(axis=1) < flags.max(axis=1)).mean() > 0.05
-    contacts = [replace(each, switch=first) if each.switch == second else each for each in log.model.contacts]
-    model = log.model.with_contacts(contacts)
-    for one in (flags.min(axis=1), flags.max(axis=1)):
-        u = np.column_stack([log.u[:, :12], one, log.u[:, 14:]])
-        (finding,) = of(replace(log, model=model, u=u, truth={}))
-        assert finding.severity == "wrong"
-        assert f"{first!r} is the flag of 'front_left_foot' and 'front_right_foot'" in finding.seen
-        row = int(finding.seen.split("row ")[1].split(" ")[0])
-        standing = [
-            f"'{leg}_foot'" for leg, flag in zip(("front_left", "front_right"), flags[row], strict=True) if flag
-        ]
-        assert finding.seen.endswith(f"{' and '.join(standing)} alone.")
-        assert "--feet front_left_foot,front_right_foot" in finding.remedy
-    together = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=5, noise=0.05, lift=False))
-    u = np.delete(together.u, 13, axis=1)
-    assert not of(replace(together, model=model, u=u, truth={}))
-
-
 def rocking(lean: float):
     """A body of 2 kg on a flat foot, whose heel turns slowly by so many rad in the last 12 of 20 s, and back."""
     body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'

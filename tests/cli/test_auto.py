@@ -12,6 +12,7 @@ from forcegp import Dataset, Robot, load_posterior
 from forcegp.cli.auto_answer import best_sentence
 from forcegp.cli.main import parse_arguments
 from forcegp.evidence import motion_residuals
+from forcegp.scores import Scores
 from forcegp.simulation import FreeArmConfig
 from forcegp.simulation.free_arms import simulate_free_arm
 
@@ -46,7 +47,9 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def answered(folder, forcegp):
     """The command that the first one printed, and what it answered."""
-    refused = forcegp("auto", "log.csv", *COLUMNS, "--models", "given,identified", "--out", "answer", folder=folder)
+    refused = forcegp(
+        "auto", "log.csv", *COLUMNS, "--forces", "given", "--forces", "identified", "--out", "answer", folder=folder
+    )
     assert refused.returncode == 2
     assert refused.stderr.strip().splitlines()[-1].startswith("forcegp: 4 mistakes in the log")
     assert not (folder / "answer").exists()
@@ -57,7 +60,7 @@ def answered(folder, forcegp):
     done = forcegp(*shlex.split(command)[1:], "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     lines = done.stderr.splitlines()
-    stages = ["checking", "preparing", "identifying", "looking for a payload", "validating", "learning from all rows"]
+    stages = ["checking", "preparing", "identifying", "looking for a payload", "scoring", "learning from all rows"]
     assert [line.removesuffix(" ...") for line in lines if line.removesuffix(" ...") in stages] == stages
     return command, json.loads(done.stdout)
 
@@ -89,6 +92,7 @@ def test_the_answer_holds_what_was_simulated(answered):
     assert 8 <= len(content["answer"]) <= 11
 
 
+@pytest.mark.nightly
 def test_a_second_run_takes_what_is_finished(folder, answered, forcegp):
     command, content = answered
     jobs = folder / "answer" / "validation" / "jobs"
@@ -112,7 +116,8 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
 
 def test_the_printed_command_keeps_every_option():
     columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --delimiter ; --sign u=1,-1 --robot arm.urdf"
-    others = "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool --out here"
+    others = "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool"
+    others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
     mapping = command._flags()
@@ -151,13 +156,19 @@ def _stopped(*_):
 
 def test_a_model_that_is_worse_than_none_is_not_trusted():
     """Where all motions diverge and accelerations are wrong by more than they vary."""
-    dataset = SimpleNamespace(units={"q": "rad"}, joint_names=("hip", "knee", "wrist"))
-    scored = {"nrmse": {"median": 328.2}, "motions": {"rms": [None], "horizons": [1.0]}}
-    content = {"models": {"given": scored}, "recommended": "given"}
-    assert best_sentence(content, dataset).startswith("Trust none of these models: on unseen time, accelerations")
-    good = {"nrmse": {"median": 1.02}, "motions": {"rms": [{"median": 0.01}], "horizons": [1.0]}}  # noise of a alone
-    good["nrmse_per_joint"] = [{"median": error} for error in (0.1, 0.16, 2.8)]
-    told = best_sentence(content | {"models": {"given": good}}, dataset)
+    dataset = SimpleNamespace(units={"q": "rad"})
+
+    def scores(errors, moved, squared):
+        table = {"acceleration": {"nrmse": errors}, "position after 1 s": {"rmse": [moved] * 3}}
+        motions = {"horizons": [1.0], "squared": [[squared]]}
+        run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": {}}
+        names = ("hip", "knee", "wrist")
+        about = {"given": {"kind": "given", "summary": ""}}
+        return Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
+
+    lost = scores([328.2] * 3, None, 1.0)  # motions are there, and none of them lasted
+    assert best_sentence(lost, dataset).startswith("Trust none of these models: on unseen time, accelerations")
+    told = best_sentence(scores([0.1, 0.16, 2.8], 0.01, 1e-4), dataset)  # noise of a alone
     assert told.startswith("Trust the model “the URDF”: on unseen time, positions 1 s ahead are wrong by 0.01 rad")
     assert told.endswith(
         "But no acceleration at all has a lower error at wrist 2.8 (nRMSE; in the median 0.13 at the others)."

@@ -1,4 +1,4 @@
-"""`forcegp check` and `forcegp prepare` from end to end: what they write, what they print, and how they refuse."""
+"""`forcegp check`, and `forcegp import` of a dataset, from end to end: what they write, and how they refuse."""
 
 import json
 from dataclasses import replace
@@ -63,26 +63,24 @@ def test_strict_makes_what_is_wrong_an_error_of_one_line(forcegp, folder):
 
 def test_prepare_writes_what_it_says(forcegp, folder):
     done = forcegp(
-        *("prepare", "noisy.h5", "--cutoff", "auto", "--delay", "auto", "--every", 4, "--trim", 0.2),
+        *("import", "noisy.h5", "--cutoff", "auto", "--delay", "auto", "--every", 4, "--trim", 0.2),
         *("--out", "data.h5", "--plots", "spectra", "--json"),
         folder=folder,
     )
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
+    told = json.loads(done.stdout)["preparation"]
     data, raw = Dataset.load(folder / "data.h5"), Dataset.load(folder / "noisy.h5")
     assert told["rows"] == [len(raw), len(data)]
-    assert json.loads(json.dumps(data.metadata["preparation"])) == {
-        k: told[k] for k in told if k not in ("out", "data")
-    }
+    assert json.loads(json.dumps(data.metadata["preparation"])) == told
     np.testing.assert_allclose(np.diff(data.time), 4 * (raw.time[1] - raw.time[0]))
     assert 1.0 < told["cutoff"] < 20.0
     assert max(told["acceleration_noise"]["after"]) < 0.1 * min(told["acceleration_noise"]["before"])
     with Image.open(folder / "spectra" / "spectra.png") as picture:
         assert picture.width > 1000
-    again = forcegp("prepare", "noisy.h5", "--cutoff", 12, "--out", "data.h5", folder=folder)
+    again = forcegp("import", "noisy.h5", "--cutoff", 12, "--out", "data.h5", folder=folder)
     assert again.returncode == 2
     assert "data.h5 exists already; choose another name, or add --overwrite" in again.stderr
-    shown = forcegp("prepare", "noisy.h5", "--cutoff", 12, "--out", "data.h5", "--overwrite", folder=folder)
+    shown = forcegp("import", "noisy.h5", "--cutoff", 12, "--out", "data.h5", "--overwrite", folder=folder)
     assert shown.returncode == 0, shown.stderr
     assert "What it costs; noise in rad/s²" in shown.stdout
     assert Dataset.load(folder / "data.h5").metadata["preparation"]["cutoff"] == 12.0
@@ -90,24 +88,24 @@ def test_prepare_writes_what_it_says(forcegp, folder):
 
 REFUSALS = {
     (
-        "prepare",
+        "import",
         "noisy.h5",
         "--out",
         "x.h5",
     ): "nothing to do: give --cutoff, --delay, --lag, --stance",
-    ("prepare", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
-    ("prepare", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
-    ("prepare", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
-    ("prepare", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
-    ("prepare", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",
-    ("prepare", "noisy.h5", "--lag", "auto", "--delay", "each", "--out", "x.h5"): "give one of them in s",
-    ("prepare", "noisy.h5", "--every", "0", "--out", "x.h5"): "--every 0 must be an integer of at least 1",
-    ("prepare", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
-    ("prepare", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 is not a file",
+    ("import", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
+    ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
+    ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
+    ("import", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
+    ("import", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",
+    ("import", "noisy.h5", "--lag", "auto", "--delay", "auto", "--out", "x.h5"): "give one of them in s",
+    ("import", "noisy.h5", "--every", "0", "--out", "x.h5"): "--every 0 must be an integer of at least 1",
+    ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
+    ("import", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 does not exist",
     ("check", "clean.h5", "--plots", "mine"): "was not written by `forcegp check`, so it is not overwritten",
     ("check", "clean.h5", "--cutoff", "-3"): "cutoff is -3.0",
     ("check", "bare.h5", "--gravity", "0,0,9"): "--gravity needs --robot",  # not left out without a word
-    ("prepare", "bare.h5", "--cutoff", "9", "--lock", "pan=0", "--out", "x.h5"): "--lock needs --robot",
+    ("import", "bare.h5", "--cutoff", "9", "--lock", "pan=0", "--out", "x.h5"): "--lock needs --robot",
     ("check", "arm.urdf"): "is not an HDF5 file",
 }
 

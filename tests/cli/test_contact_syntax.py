@@ -72,12 +72,12 @@ def test_other_feet_and_wheels_are_refused(parse, text):
 def test_a_model_is_scored_under_other_contacts(forcegp, workshop):
     """Without its plane the tool falls, so the recorded motion on the plane is predicted worse."""
     held, free = (
-        forcegp("evaluate", "run", "test.h5", "--every", 20, "--json", *more, folder=workshop)
+        forcegp("score", "run", "test.h5", "--every", 20, "--json", *more, folder=workshop)
         for more in ((), ("--contact", "none"))
     )
     assert (held.returncode, free.returncode) == (0, 0), free.stderr
     assert json.loads(free.stdout)["contact"] == ["none"]
     assert json.loads(free.stdout)["mae"] > json.loads(held.stdout)["mae"]
-    wrong = forcegp("evaluate", "run", "test.h5", "--contact", "tool:plane", folder=workshop)
+    wrong = forcegp("score", "run", "test.h5", "--contact", "tool:plane", folder=workshop)
     assert wrong.returncode == 2
     assert len(wrong.stderr.strip().splitlines()) == 1

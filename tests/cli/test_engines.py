@@ -34,7 +34,7 @@ def test_the_engine_is_said_and_stored(forcegp, folder):
     summary = json.loads(told.stdout)
     assert (summary["points"], summary["learning_points"]) == (40, 20)
     assert summary["refined"].startswith("on all rows")
-    scored = forcegp("evaluate", "run", "arm.h5", folder=folder)
+    scored = forcegp("score", "run", "arm.h5", folder=folder)
     assert scored.returncode == 0, scored.stderr
 
 

@@ -68,10 +68,9 @@ WRONG = [
     ("fit arm.h5 --forces magic --out run", "no force 'magic'"),
     ("fit arm.h5 --forces gp:independent --noise loud --out run", "--noise is 'loud'"),
     ("fit arm.h5 --force-noise 0 --out run", "Noise force is 0.0; give a positive"),
-    ("evaluate missing arm.h5", "missing does not exist; give the folder that `forcegp fit --out` wrote"),
-    ("evaluate mine arm.h5", "mine holds no model.json"),
-    ("evaluate mine arm.h5 --every 0", "--every is 0"),
-    ("evaluate mine", "DATA"),
+    ("score missing arm.h5", "missing does not exist; give folders of forcegp fit"),
+    ("score mine arm.h5", "mine holds no model.json"),
+    ("score", "LOG"),
     ("simulate kuka-surface --out arm.h5", "arm.h5 exists already"),
     ("simulate kuka-surface --out mine", "mine is a folder"),
     ("simulate kuka-surface --out nowhere/a.h5", "folder nowhere does not exist"),
@@ -110,7 +109,7 @@ def test_a_damaged_model_is_refused(folder, capfd):
     tensors = folder / "run" / "tensors.safetensors"
     tensors.write_bytes(tensors.read_bytes()[:100])
     capfd.readouterr()
-    assert main(["evaluate", "run", "arm.h5"]) == 2
+    assert main(["score", "run", "arm.h5"]) == 2
     assert "damaged" in capfd.readouterr().err
 
 
@@ -119,7 +118,7 @@ def test_a_run_of_another_robot_is_refused(folder, capfd):
     names = ("pan", "lift", "wrist")
     dataclasses.replace(Dataset.load("no_robot.h5"), joint_names=names).save("other.h5")
     capfd.readouterr()
-    assert main(["evaluate", "run", "other.h5"]) == 2
+    assert main(["score", "run", "other.h5"]) == 2
     assert "other.h5 has joints pan, lift, wrist; the model was trained on pan, lift, bend" in capfd.readouterr().err
 
 
@@ -211,7 +210,7 @@ def test_noise_of_forces_beside_that_of_every_row(folder, capfd, noise):
     assert np.allclose(force, 0.03, rtol=1e-6) != learned
     if not learned:
         np.testing.assert_allclose(posterior.noise_std, 0.2 if noise == "0.2" else level)
-    assert main(["evaluate", "run", "uneven.h5"]) == 0
+    assert main(["score", "run", "uneven.h5"]) == 0
 
 
 def test_more_points_than_rows_means_all_rows(folder, capfd):

@@ -14,7 +14,7 @@ from tests.cli.test_import import FLAGS
 from tests.control import test_monitor as monitored
 from tests.posterior.arm import URDF, arm_data
 from tests.recordings.log_files import motion, table, write_text
-from tests.validation.moving_arm import moving_arm
+from tests.scores.moving_arm import moving_arm
 
 from forcegp.cli.main import COMMANDS
 
@@ -25,14 +25,13 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
     "robot": (("arm.urdf", "--out", "arm.png"), "arm.png"),
     "check": (("log.h5", "--plots", "look"), "look/check.png"),
-    "prepare": (("arm.h5", "--every", 2, "--out", "prepared.h5"), "prepared.h5"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
     "payload": (("log.h5", "--cutoff", "none", "--delay", 0, "--out", "held"), "held/payload.json"),
-    "evaluate": (("run", "test.h5", "--plots", "figures"), "figures/evaluation.json"),
-    "validate": (
+    "score": (
         (
+            "run",
             "log.h5",
-            "--models",
+            "--forces",
             "given",
             *QUICK,
             "--seeds",
@@ -47,7 +46,6 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
         "results/report.md",
     ),
     "view": (("run", "test.h5", "--seconds", 0.2, "--html", "seen.html"), "seen.html"),
-    "rollout": (("run", "test.h5", "--starts", 1, "--seconds", 0.05, "--out", "motion"), "motion/rollout.h5"),
     "monitor": (("free-run", "pushed.h5", "--free", "free.h5", "--out", "touched"), "touched/contacts.csv"),
     "excite": (
         ("run", "--seconds", 1, "--tries", 2, "--clearance", 0.001, "--avoid", "none", "--out", "next.csv"),
@@ -60,7 +58,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
 
 ELSEWHERE = {"auto": "test_auto", "demo": "test_commands"}
 """Those that take long, and where they are run."""
-IN_A_PROCESS = ("robot", "fit", "evaluate")
+IN_A_PROCESS = ("robot", "fit")
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +105,7 @@ def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(installed, folder):
 
 
 def test_people_read_the_result_on_stdout_and_warnings_on_stderr(installed, folder):
-    done = installed("evaluate", "run", "arm.h5", folder=folder)
+    done = installed("score", "run", "arm.h5", folder=folder)
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"^\s*(?:pan|lift|bend)\s", done.stdout, re.M)) == 3
     lines = done.stderr.splitlines()

@@ -74,7 +74,7 @@ def test_the_table_of_estimates_is_for_people(identified):
     assert any(value == pytest.approx(0.4, rel=0.2) for value in values), identified.stdout
     text = " ".join(identified.stdout.split())
     assert "base parameters, condition number" in text
-    assert "Next: forcegp evaluate found TEST.h5" in text
+    assert "Next: forcegp score found TEST.h5" in text
     assert re.search(r"residuals of \d+ rows", text)
 
 
@@ -121,7 +121,7 @@ def test_models_by_name(forcegp, folder, forces, description):
     done = forcegp("fit", "arm.h5", "--forces", forces, *QUICK, "--out", out, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     assert description in json.loads(done.stdout)["model"].lower()
-    scored = forcegp("evaluate", out, "arm.h5", "--every", 4, "--json", folder=folder)
+    scored = forcegp("score", out, "arm.h5", "--every", 4, "--json", folder=folder)
     assert scored.returncode == 0, scored.stderr
     black_box = forces == "gp:independent"
     assert (json.loads(scored.stdout)["constraint_error"] > 1e-6) == black_box
@@ -134,7 +134,7 @@ def test_a_raw_log_teaches_without_accelerations(forcegp, folder):
     assert "12 windows of 6 nodes" in " ".join(done.stdout.split())
     posterior = load_posterior(folder / "windows")
     assert posterior.settings["observe"]["seconds"] == 0.1
-    scored = forcegp("evaluate", "windows", "raw.h5", folder=folder)
+    scored = forcegp("score", "windows", "raw.h5", folder=folder)
     assert scored.returncode == 0, scored.stderr
 
 

@@ -24,9 +24,9 @@ def refused(words):
     ("words", "field", "entries"),
     [
         (
-            "validate x.h5 --out r --models a+gp:joint:inputs=q/v,kernel=k,identified@motions:1",
-            "models",
-            ("a+gp:joint:inputs=q/v,kernel=k", "identified@motions:1"),
+            "score x.h5 --out r --forces a,gp:joint:inputs=q/v,kernel=k --forces identified@motions:1",
+            "forces",
+            ("a,gp:joint:inputs=q/v,kernel=k", "identified@motions:1"),
         ),
         (f"{FIT} --forces viscous,gp:joint-friction", "forces", ("viscous", "gp:joint-friction")),
         (f"{FIT} --forces gp:tool:frame=tool,x=1,viscous", "forces", ("gp:tool:frame=tool,x=1", "viscous")),
@@ -40,8 +40,7 @@ def refused(words):
         ("excite run --out f --limits velocity=1,1,2,torque=5", "limits", ("velocity=1,1,2", "torque=5")),
         (f"{FIT} --lock a=1,b=-0.5", "lock", ("a=1", "b=-0.5")),
         ("reproduce fig3 --points 10,20 --seed-list 7", "points", (10, 20)),
-        ("rollout run x.h5 --out r --start-rows 0,240", "start_rows", (0, 240)),
-        ("validate x.h5 --out r --horizon 0.1,1", "horizon", (0.1, 1.0)),
+        ("score x.h5 --out r --horizon 0.1,1", "horizon", (0.1, 1.0)),
         ("import x.csv --out f.h5 --q 'Winkel_A{1..6}' --u 'a,b'", "u", "a,b"),
     ],
 )
@@ -73,15 +72,14 @@ def test_empty_entries_are_refused(text):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("validate x.h5 --out r --models a b c", "--models takes one list, written with commas: --models a,b,c"),
-        ("validate --models a b x.h5 --out r", "--models takes one list, written with commas: --models a,b"),
+        (f"{FIT} --forces a b c", "--forces takes one list, written with commas: --forces a,b,c"),
         ("reproduce fig3 --points 50 100", "--points takes one list, written with commas: --points 50,100"),
         (f"{FIT} --forces a --forces b", "--forces is given twice; write one list: --forces a,b"),
         (f"{FIT} --forces=a --seed 1 --forces 'b + c'", "--forces is given twice; write one list: --forces 'a,b + c'"),
         (f"{FIT} --force_noise 1 --force-noise 2", "--force-noise is given twice; give it once"),
         (f"{FIT} --seed 1 --seed 2", "--seed is given twice; give it once"),
         ("reproduce fig3 --points 10,x", "'10,x' is no list of whole numbers, as 1,2 is."),
-        ("validate x.h5 --out r --horizon 1,,2", "'1,,2' holds an empty entry"),
+        ("score x.h5 --out r --horizon 1,,2", "'1,,2' holds an empty entry"),
         (f"{FIT} --pionts 3", "forcegp fit has no option --pionts. Did you mean --points? See forcegp fit --help."),
         (f"{FIT} --seed a", "--seed is 'a'; give a whole number. See forcegp fit --help."),
         (f"{FIT} --force-noise 1,5", "--force-noise is '1,5'; give a number. See forcegp fit --help."),

@@ -59,12 +59,12 @@ def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
     assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)
 
 
-def test_a_missing_contact_is_said_once_by_fit_and_by_evaluate(forcegp, folder):
+def test_a_missing_contact_is_said_once_by_fit_and_by_score(forcegp, folder):
     done = forcegp("fit", "line.h5", *FIT, "--contact", "none", folder=folder)
     assert done.returncode == 0, done.stderr
     (line,) = looked(done.stderr)
     assert "no contact is stated, but link 'link2' stays on a plane" in line
-    scored = forcegp("evaluate", "run", "line.h5", "--every", 10, folder=folder)
+    scored = forcegp("score", "run", "line.h5", "--every", 10, folder=folder)
     assert scored.returncode == 0, scored.stderr
     assert "no contact is stated" in scored.stderr
 

@@ -73,7 +73,7 @@ def test_a_load_on_the_trunk(folder, forcegp):
 
 @pytest.mark.nightly
 def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
-    models = ("--models", "given", "--cutoff", "none")
+    models = ("--forces", "given", "--cutoff", "none")
     done = forcegp("auto", "flight.csv", *COLUMNS, "--identified", "drone.json", *models, "--out", "answer", "--json",
                    folder=folder)  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -86,7 +86,7 @@ def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
     assert "forcegp excite" not in answer
     masses = [each["value"] for name, each in content["identified"]["parameters"].items() if name.endswith(".mass")]
     assert sum(masses) == pytest.approx(1.2 * 1.02 / 1.1, rel=0.05)  # by thrust
-    assert content["models"]["given"]["motions"]["rms"][-1]["median"] > 0.0
+    assert content["models"]["given"]["scores"]["position after 1 s"]["rmse"]["all"]["median"] > 0.0
     page = (folder / "answer" / "report.html").read_text()
     assert "whole mass" in page
     flight = Dataset.load(folder / "answer" / "prepared.h5")

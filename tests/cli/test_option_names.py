@@ -52,7 +52,7 @@ def test_the_same_error_in_both_worlds(forcegp, tmp_path):
         done = forcegp(*words.split(), folder=tmp_path)
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr.startswith(message)
-    assert Dataset.load(tmp_path / "arm.h5")["q"].shape == (20, 3)
+    assert Dataset.load(tmp_path / "arm.h5").q.shape == (20, 3)
 
 
 def flags_without_a_command(path):

@@ -12,7 +12,7 @@ from tests.cli.one_line import assert_refused
 from tests.posterior.arm import URDF, arm_data
 
 import forcegp
-import forcegp.evaluation
+import forcegp.scores
 from forcegp import Dataset, load_posterior
 from forcegp.atomic_files import atomic_folder, write_digests
 from forcegp.cli.main import main
@@ -24,24 +24,22 @@ FILES = {
     "import": f"{IMPORT} --overwrite --out OUT",
     "mapping": f"{IMPORT} --overwrite --out x.h5 --write-mapping OUT",
     "excite": "excite run --overwrite --out OUT",
-    "prepare": "prepare arm.h5 --every 2 --overwrite --out OUT",
+    "prepare": "import arm.h5 --every 2 --overwrite --out OUT",
 }
 FOLDERS = {
-    "spectra": "prepare arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
+    "spectra": "import arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
     "fit": "fit arm.h5 --overwrite --out OUT",
     "payload": "payload arm.h5 --overwrite --out OUT",
-    "evaluate": "evaluate run arm.h5 --overwrite --plots OUT",
-    "rollout": "rollout run arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
     "check": "check arm.h5 --overwrite --plots OUT",
     "demo": "demo --out OUT",
 }
 STORES = {
-    "validate": "validate arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
+    "score": "score arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
     "reproduce": "reproduce fig2b --out OUT",
     "docs": "reproduce fig2b --out runs --docs OUT",
 }
-KINDS = {"spectra": "forcegp prepare"}
+KINDS = {"spectra": "forcegp import"}
 COMMANDS = FILES | FOLDERS | STORES
 
 
@@ -68,9 +66,9 @@ def no_work(monkeypatch) -> None:
     monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
     monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
     monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)
-    monkeypatch.setattr("forcegp.evaluation.learn", begun)
+    monkeypatch.setattr("forcegp.scores.learn", begun)
     own = Dataset.load
-    monkeypatch.setattr(Dataset, "load", lambda path: own(path) if "validate" in sys.argv else begun())
+    monkeypatch.setattr(Dataset, "load", lambda path: own(path) if "score" in sys.argv else begun())
 
 
 def filled(name: str, out: object) -> list[str]:
@@ -137,13 +135,13 @@ def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypa
 
 def test_a_file_that_appears_while_the_model_is_fitted_is_not_deleted(folder, capfd, monkeypatch):
     assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
-    own = forcegp.evaluation.learn
+    own = forcegp.scores.learn
 
     def fit(*given, **more):
         Path("out/notes.txt").write_text("mine")
         return own(*given, **more)
 
-    monkeypatch.setattr("forcegp.evaluation.learn", fit)
+    monkeypatch.setattr("forcegp.scores.learn", fit)
     assert "(notes.txt)" in refused(["fit", "arm.h5", *QUICK.split(), "--out", "out", "--overwrite"], capfd)
     assert Path("out/notes.txt").read_text() == "mine"
     load_posterior("out")
@@ -162,9 +160,9 @@ def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, 
         assert Path("out").read_text() == "theirs"
     else:
         change = meanwhile(
-            forcegp.evaluation.learn, lambda: (Path("out").mkdir(exist_ok=True), Path("out/a").write_text("theirs"))
+            forcegp.scores.learn, lambda: (Path("out").mkdir(exist_ok=True), Path("out/a").write_text("theirs"))
         )
-        monkeypatch.setattr("forcegp.evaluation.learn", change)
+        monkeypatch.setattr("forcegp.scores.learn", change)
         told = refused(["fit", "arm.h5", *QUICK.split(), "--out", "out"], capfd)
         assert Path("out/a").read_text() == "theirs"
     assert "out exists" in told
@@ -179,17 +177,16 @@ OVER_INPUTS = [
     "import log.csv --mapping log.yaml --out x.h5 --write-mapping log.yaml",
     "import log.csv --out x.h5 --write-mapping log.yaml",
     "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
-    "prepare arm.h5 --every 2 --out arm.h5",
+    "import arm.h5 --every 2 --out arm.h5",
     "fit arm.h5 --robot arm.urdf --out arm.urdf",
     "fit arm.h5 --identified run --out run",
     "fit run/inner.h5 --out run",
     "fit arm.h5 --robot run/inner.urdf --forces bodies --out run",
     "payload arm.h5 --baseline run/inner.h5 --out run",
-    "evaluate run arm.h5 --plots run",
-    "rollout run arm.h5 --out run",
-    "rollout run run/inner.h5 --out run",
+    "score run arm.h5 --out run",
+    "score run arm.h5 --report arm.h5",
     "check arm.h5 --plots arm.h5",
-    "validate arm.h5 --out arm.h5",
+    "score arm.h5 --out arm.h5",
 ]
 
 
@@ -201,7 +198,7 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     for name in ("inner.h5", "inner.urdf"):
         os.link("arm." + name.partition(".")[2], f"run/{name}")
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
-    overwrite = [] if words.startswith("validate") else ["--overwrite"]
+    overwrite = [] if words.startswith("score arm") else ["--overwrite"]
     told = refused([*words.split(), *overwrite], capfd)
     assert "this command" in told
     assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
@@ -212,8 +209,8 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     [
         f"{IMPORT} --out x.h5 --write-mapping x.h5",
         f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
-        "prepare arm.h5 --every 2 --out x.h5 --plots x.h5",
-        "prepare arm.h5 --every 2 --out new/x.h5 --plots new",
+        "import arm.h5 --every 2 --out x.h5 --plots x.h5",
+        "import arm.h5 --every 2 --out new/x.h5 --plots new",
         "reproduce fig2b --out x --docs x",
     ],
 )
@@ -290,5 +287,5 @@ def test_a_changed_model_of_an_identification_is_refused(folder, capfd):
 def test_names_that_are_no_text_are_refused(folder, capfd):
     name = os.fsdecode(b"arm\xff.h5")
     os.link("arm.h5", name)
-    for words in (["check", name], ["fit", "arm.h5", "--out", name], ["validate", name, "--out", "out"]):
+    for words in (["check", name], ["fit", "arm.h5", "--out", name], ["score", name, "--out", "out"]):
         assert "is not UTF-8, so it could not be reported; rename it" in refused(words, capfd)

@@ -57,13 +57,6 @@ def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
     assert "mean nothing" not in " ".join(held.stderr.split())
 
 
-def test_the_check_names_it(folder, forcegp):
-    found = json.loads(forcegp("check", "loaded.h5", "--cutoff", "none", "--json", folder=folder).stdout)["findings"]
-    (payload,) = [each for each in found if each["subject"] == "payload"]
-    assert payload["numbers"]["mass"] == pytest.approx(MASS, rel=0.02)
-    assert "forcegp payload" in payload["remedy"]
-
-
 def test_it_is_a_fit_with_a_payload(folder, forcegp):
     words = ("--forces", "payload:tool0,viscous,stribeck,offset,rotor", "--evidence", "torques:mean=.4", "--no-checks")
     done = forcegp("fit", "loaded.h5", *words, "--out", "run", "--json", folder=folder)

@@ -28,6 +28,7 @@ def test_it_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, capfd, words, 
     assert_refused(f"reproduce {words} --out new", message, tmp_path, capfd)
 
 
+@pytest.mark.nightly
 def test_a_package_without_its_repository_names_what_to_clone_and_takes_that_of_the_current_folder(
     tmp_path, repository
 ):

@@ -11,9 +11,9 @@ from tests.posterior.arm import URDF, arm_data, arm_model
 from forcegp import Contact, Dataset, Model, Plane, Robot, excitation, fit
 from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import excitation_figure
 from forcegp.forces import ContactFriction, JointFriction, UnknownForces
 from forcegp.inference import OptimizerOptions
+from forcegp.scores import excitation_figure
 
 FREE = arm_model(0)
 START = [0.3, 0.8, -0.6]

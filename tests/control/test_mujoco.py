@@ -188,7 +188,7 @@ def test_models_that_do_not_fit(predictor, urdf, change, message):
 def test_forces_that_mujoco_cannot_have(posterior, predictor):
     with pytest.raises(InvalidInput, match="made with compile=False"):
         MujocoForces(posterior.predictor(compile=False), model_of())
-    with pytest.raises(InvalidInput, match=r"predictor is a StructuredPosterior; .*posterior\.predictor\(\)"):
+    with pytest.raises(InvalidInput, match=r"predictor is a Posterior; .*posterior\.predictor\(\)"):
         MujocoForces(posterior, model_of())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of two iterations is not the subject

@@ -29,5 +29,4 @@ def test_two_samples_of_one_trajectory_are_found_though_no_row_repeats():
     with pytest.raises(DatasetError, match=r"same trajectory.*episodes \[0, 1\] in both"):
         require_disjoint(data.rows(slice(0, None, 2)), data.rows(slice(1, None, 2)))
     require_disjoint(data, dataset(seed=1, metadata={"scenario": "x", "seed": 4}))
-    train, test = data.split_by_episode([1])
-    require_disjoint(train, test)
+    require_disjoint(data.select_episodes([0]), data.select_episodes([1]))

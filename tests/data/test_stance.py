@@ -138,12 +138,6 @@ def test_forces_are_the_weight_where_nothing_moves():
     assert found.force.sum(axis=1).mean() == pytest.approx(weight, rel=0.1)  # sizes of forces that also lean
 
 
-def test_the_order_of_rows_does_not_matter():
-    log, _ = walk(7)
-    order = np.random.default_rng(0).permutation(len(log))
-    np.testing.assert_array_equal(estimate_stance(log.rows(order)).flags, estimate_stance(log).flags[order])
-
-
 def test_a_flat_foot_is_one_force():
     log, flags = walk(8)
     contacts = [c for name in log.model.inputs[SWITCHES] for c in fixed_frame(name.replace("stands", "foot"), name)]

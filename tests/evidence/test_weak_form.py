@@ -17,7 +17,6 @@ from forcegp import (
     Noise,
     RigidBodies,
     Windows,
-    evaluate,
     fit,
     load_posterior,
     save_posterior,
@@ -26,7 +25,7 @@ from forcegp.data import Dataset
 from forcegp.errors import FileFormatError, InvalidInput, NotEnoughMemory
 from forcegp.evidence import MarginalLikelihood, TrainingData
 from forcegp.inference import FunctionalPosterior, OptimizerOptions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.robots import Robot
 
 HOW = Windows(0.1, nodes=8)
@@ -38,7 +37,7 @@ def with_true_accelerations(dataset: Dataset) -> Dataset:
 
 
 @cache
-def fitted() -> StructuredPosterior:
+def fitted() -> Posterior:
     data = motion()
     return fit(data.model.with_forces(JointFriction()), data, HOW, **FIT)
 
@@ -48,7 +47,7 @@ def test_positions_alone_teach_as_much_as_exact_accelerations():
     test = with_true_accelerations(motion(seed=1))
     reference = fit(data.model.with_forces(JointFriction(), noise=Noise(0.01, learn=True)), data, **FIT)
     nothing = fit(data.model.with_forces(noise=Noise(1.0)), data, points=10)
-    ours, best, without = (evaluate(model, test).mae for model in (posterior, reference, nothing))
+    ours, best, without = (score(model, test, horizons=()).value("mae") for model in (posterior, reference, nothing))
     assert ours < 1.15 * best
     assert best < 0.2 * without
 
@@ -69,7 +68,7 @@ def test_velocities_serve_as_well():
     how = replace(HOW, signal="v", order=1)
     data, test = motion(), with_true_accelerations(motion(seed=1))
     posterior = fit(data.model.with_forces(JointFriction()), data, how, **FIT)
-    assert evaluate(posterior, test).mae < 1.3 * evaluate(fitted(), test).mae
+    assert score(posterior, test, horizons=()).value("mae") < 1.3 * score(fitted(), test, horizons=()).value("mae")
 
 
 def test_one_node_is_a_row_with_that_acceleration():

@@ -1,11 +1,11 @@
 """A latent whose variance has collapsed leaves nothing out at any point; its posterior must still be usable."""
 
 import torch
-from tests.validation.moving_arm import moving_arm
+from tests.scores.moving_arm import moving_arm
 
 from forcegp import JointFriction, Noise, fit
 from forcegp.inference import Inducing
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 
 def test_a_latent_without_variance_has_a_predictor():
@@ -16,7 +16,7 @@ def test_a_latent_without_variance_has_a_predictor():
     (name, *_) = (name for name in parameters if "outputscale" in name)
     parameters[name] = torch.full_like(parameters[name], -40.0)
     given = fitted.training, parameters, fitted.result, fitted.settings
-    flat = StructuredPosterior.conditioned(fitted.model, *given, Inducing())
+    flat = Posterior.conditioned(fitted.model, *given, Inducing())
     q, v, u = (torch.tensor(each[:5]) for each in (log.q, log.v, log.u))
     mean, covariance = flat.predictor()(q, v, u)[:2]
     expected = flat.predict(q, v, u)

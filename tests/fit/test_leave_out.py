@@ -8,12 +8,10 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.data import time_blocks
-from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import JointAccelerations, JointForces
 from forcegp.inference import OptimizerOptions, negative_log_likelihood
 from forcegp.noise import Noise
-from forcegp.posterior import IndependentPosterior, Posterior
 
 QUICK = OptimizerOptions(iterations=15)
 BLOCKS = [[0, 5, 7], [2], [11, 3]]
@@ -37,17 +35,8 @@ MODELS = {
 
 def log_likelihood_without(posterior, rows):
     """Of the other rows, from the marginal likelihood of the model itself at the same parameters and features."""
-    likelihood, total = posterior.likelihood, 0.0
+    likelihood = posterior.likelihood
     keep = [row for row in range(16) if row not in rows]
-    if isinstance(posterior, IndependentPosterior):
-        kernels = likelihood.kernels().at(posterior.hyperparameters)
-        z = likelihood.features(likelihood.training.q, likelihood.training.v, likelihood.training.u)
-        for joint, kernel in enumerate(kernels):
-            y = likelihood.training.a[keep][:, joint : joint + 1]
-            noise = likelihood.training.noise_std[keep][:, joint : joint + 1] ** 2
-            K = kernel(z[keep], z[keep]).to_dense()
-            total -= float(negative_log_likelihood(torch.ones_like(y)[..., None], y, noise, [K]))
-        return total
     features, W, residual, noise = likelihood.terms(posterior.hyperparameters)
     matrices = posterior.kernels.matrices(posterior.hyperparameters, [z[keep] for z in features])
     return -float(negative_log_likelihood(W[keep], residual[keep], noise[keep], matrices))
@@ -98,9 +87,3 @@ def test_rows_beside_each_other_in_time_flatter_a_model_that_only_remembers():
     blocks = time_blocks(slow.time, slow.episode, 0.2)
     assert len(blocks) == 2
     assert posterior.leave_out(blocks).total < posterior.leave_out().total
-
-
-def test_a_model_without_a_closed_form_says_so(train):
-    posterior = fit(train.model.black_box(), train, restarts=1, options=OptimizerOptions(iterations=1))
-    with pytest.raises(InvalidInput, match="would have to be trained again"):
-        Posterior.leave_out(posterior)

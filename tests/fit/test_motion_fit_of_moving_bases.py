@@ -73,6 +73,7 @@ def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
     assert masses[1] == pytest.approx(masses[0], rel=1e-4)
 
 
+@pytest.mark.nightly
 def test_functions_are_refined_too():
     """Friction that no law describes, from accelerations that are far off."""
     given = floating_arm.satellite()

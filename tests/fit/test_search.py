@@ -78,6 +78,7 @@ def test_who_is_compared_with_whom_does_not_depend_on_the_processes_or_the_numbe
     assert all(before == [] for _, before in run_restarts(seen, 5, 0, 1, None))
 
 
+@pytest.mark.nightly
 def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
     how = {"points": 15, "restarts": 4, "seed": 3, "options": OptimizerOptions(iterations=25, patience=2)}
     one, two = (fit(train.model.with_forces(JointForces()), train, jobs=jobs, **how) for jobs in (1, 2))

@@ -505,7 +505,10 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "seed": 0,
         },
     ),
-    "evaluate": (forcegp.evaluate, lambda: {"posterior": INPUTS.posterior, "dataset": INPUTS.data}),
+    "score": (
+        lambda **k: str(forcegp.score(**k)),
+        lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1, "margin": 0.02},
+    ),
     "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "model": None, "preparation": None}),
     "fit (laws)": (
         lambda **k: fit(INPUTS.free.model.with_forces(forcegp.Viscous()), **k),
@@ -529,7 +532,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ImportOptions": (
         forcegp.ImportOptions,
-        lambda: {"gap": None, "resample": "auto", "rate": None, "start": None, "end": None, "most_rows": 10},
+        lambda: {"gap": None, "rate": "auto", "start": None, "end": None, "most_rows": 10},
     ),
     "KukaSurfaceConfig": (
         forcegp.KukaSurfaceConfig,

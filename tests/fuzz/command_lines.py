@@ -71,15 +71,12 @@ VALID = {
     "payload": ("payload", "test.h5", "--forces", "none-such"),
     "robot": ("robot", "arm.urdf"),
     "check": ("check", "test.h5"),
-    "prepare": ("prepare", "test.h5", "--cutoff", "20", "--out", "out.h5"),
     "fit": ("fit", "train.h5", *SMALL, "--out", "out"),
-    "evaluate": ("evaluate", "carried", "train.h5"),
-    "rollout": ("rollout", "carried", "train.h5", "--starts", "1", "--seconds", "0.02", "--out", "out"),
+    "score": ("score", "carried", "train.h5", "--starts", "1", "--horizon", "0.02"),
     "monitor": ("monitor", "carried", "train.h5", "--free-seconds", "0.1", "--out", "out"),
     "export": ("export", "carried", "--to", "c", "--unchecked", "--out", "out"),
     "view": ("view", "train.h5", "--html", "nowhere/scene.html"),
     "excite": ("excite", "carried", "--tries", "2", "--seconds", "1", "--out", "out.csv"),
-    "validate": ("validate", "test.h5", "--models", "none-such", "--out", "out"),
     "simulate": ("simulate", "none-such", "--out", "out.h5"),
     "demo": ("demo", "--seconds", "0"),
     "reproduce": ("reproduce", "none-such", "--out", "out"),
@@ -89,8 +86,8 @@ MOVING = {
     "robot": ("robot", "drone.xml"),
     "robot ": ("robot", "arm.urdf", "--base", "floating"),
     "check": ("check", "moving.h5"),
-    "prepare": ("prepare", "moving.h5", "--cutoff", "20", "--out", "out.h5"),
-    "prepare ": ("prepare", "moving.h5", "--cutoff", "20", "--lag", "auto", "--out", "out.h5"),
+    "import": ("import", "moving.h5", "--cutoff", "20", "--out", "out.h5"),
+    "import ": ("import", "moving.h5", "--cutoff", "20", "--lag", "auto", "--out", "out.h5"),
     "fit": ("fit", "moving.h5", "--forces", "gp:aerodynamic:frame=body", *SMALL, "--no-checks", "--out", "out"),
     "fit ": ("fit", "moving.h5", "--forces", "gp:base-wrench", *SMALL, "--no-checks", "--out", "out"),
     "fit  ": ("fit", "test.h5", "--forces", "viscous", "--rows", "50", "--no-checks", "--out", "out"),
@@ -169,7 +166,7 @@ def check_words(case: Line, folder: Path) -> None:
 def check(case: Line, folder: Path) -> None:
     """The whole command."""
     words = words_of(case)
-    if words[0] in ("simulate", "demo", "reproduce", "validate") and words[0] == case.command:
+    if words[0] in ("simulate", "demo", "reproduce") and words[0] == case.command:
         words = [word for word in words if word not in LARGE] + ["--none-such", "1"]  # a run takes seconds to hours
     for name in (*FILES, "carried", "independent"):
         source = INPUTS.folder / name

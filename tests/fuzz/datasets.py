@@ -179,15 +179,15 @@ def check_commands(case: DataFile, folder: Path) -> None:
     """The same files under the commands that read datasets."""
     write(case, folder / "data.h5")
     number = sum(map(ord, repr(case)))
-    lag = "prepare data.h5 --cutoff 20 --lag auto --out o.h5"
+    lag = "import data.h5 --cutoff 20 --lag auto --out o.h5"
     words = (
         "check data.h5",
         lag,
-        "prepare data.h5 --cutoff 20 --out o.h5",
-        f"evaluate {INPUTS.folder / 'carried'} data.h5",
+        "import data.h5 --cutoff 20 --out o.h5",
+        f"score {INPUTS.folder / 'carried'} data.h5",
     )
     require_ended_well(words[number % 4].split(), folder)
 
 
-TARGET = Target(CASES, check, fast=100, nightly=3000)
+TARGET = Target(CASES, check, fast=50, nightly=3000)
 COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=1500)

@@ -153,8 +153,8 @@ def check_commands(case: Stored, folder: Path) -> None:
     """The same models under the commands that read models."""
     apply(case, folder)
     shutil.copyfile(INPUTS.folder / "train.h5", folder / "train.h5")
-    rolled = "rollout run train.h5 --starts 1 --seconds 0.02 --out o" if len(repr(case)) % 3 == 0 else ""
-    require_ended_well((rolled or "evaluate run train.h5").split(), folder)
+    rolled = "score run train.h5 --starts 1 --horizon 0.02" if len(repr(case)) % 3 == 0 else ""
+    require_ended_well((rolled or "score run train.h5").split(), folder)
 
 
 @dataclass(frozen=True)

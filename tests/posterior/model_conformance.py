@@ -10,12 +10,13 @@ import torch
 from tests.data import samples
 from tests.posterior.arm import arm_data
 
+from forcegp import score
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import evaluate, prediction_figure
 from forcegp.fit import fit
 from forcegp.model import Model
 from forcegp.posterior import load_posterior, save_posterior
 from forcegp.posterior.posterior import Posterior
+from forcegp.scores import prediction_figure
 
 BATCHES = [(), (1,), (4,), (2, 3), (2, 0, 3)]
 FORCES = ("multiplier", "contact_force", "unknown_force")
@@ -136,21 +137,20 @@ class ModelConformance:
             assert again.settings["points"] == self.points
 
     def test_it_can_be_scored_and_drawn(self, fitted, test):
-        evaluation = evaluate(fitted, test)
+        found = score(fitted, test, horizons=())
         errors = fitted.predict(test.q, test.v, test.u).mean.numpy() - test.a
-        np.testing.assert_allclose(evaluation.mae_per_joint, np.abs(errors).mean(0), rtol=1e-9)
-        assert np.isfinite(evaluation.nlpd)
-        assert not any("of the data" in warning or "training rows" in warning for warning in evaluation.warnings)
-        speaks = fitted.predict(test.q[:1], test.v[:1], test.u[:1]).unknown_force is not None
-        assert fitted.predicts_forces == speaks
-        assert (evaluation.unknown_force_mae is not None) == speaks
-        assert (evaluation.multiplier_mae is not None) == speaks
+        np.testing.assert_allclose(found.columns("mae"), np.abs(errors).mean(0), rtol=1e-9)
+        assert np.isfinite(found.value("nlpd", "all joints"))
+        assert not any("of the data" in warning or "training rows" in warning for warning in found.warnings)
+        speaks = not fitted.is_black_box
+        assert ("unknown force" in found.quantities()) == speaks
+        assert ("contact force" in found.quantities()) == speaks
         bare = dataclasses.replace(test, truth={}, noise_std=None, model=None)
-        assert evaluate(fitted, bare).mae == evaluation.mae
+        assert score(fitted, bare, horizons=()).value("mae") == found.value("mae")
         assert len(prediction_figure(fitted, test).axes) == 6
 
     def test_training_rows_among_the_test_rows_are_noticed(self, fitted, data):
-        assert any("training rows" in warning for warning in evaluate(fitted, data).warnings)
+        assert any("training rows" in warning for warning in score(fitted, data, horizons=()).warnings)
 
     def test_wrong_data_and_numbers_are_refused(self, fitted, data, test):
         model = self.make(data.model)

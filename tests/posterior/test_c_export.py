@@ -21,7 +21,7 @@ from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
-from forcegp.posterior import StructuredPosterior, c_files, casadi_function
+from forcegp.posterior import Posterior, c_files, casadi_function
 from forcegp.posterior.c_files import identifier
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
@@ -30,7 +30,7 @@ DT = 0.02
 pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 
 
-def fitted(*forces, **more) -> StructuredPosterior:
+def fitted(*forces, **more) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
@@ -57,12 +57,12 @@ def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def posterior() -> StructuredPosterior:
+def posterior() -> Posterior:
     return fitted(JointForces())
 
 
 @pytest.fixture(scope="module")
-def friction() -> StructuredPosterior:
+def friction() -> Posterior:
     return fitted(JointFriction(), ContactFriction(load=True, expected=0.2))
 
 
@@ -440,13 +440,7 @@ def test_steps_that_cannot_be_exported(posterior, tmp_path, options, message):
         export_c(posterior, tmp_path / "arm", **options)
 
 
-def test_other_models_are_refused(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
-        other = fit(arm_model().black_box(), arm_data(20, 0), **options)
-    with pytest.raises(InvalidInput, match="a IndependentPosterior cannot be exported as C"):
-        export_c(other, tmp_path / "arm")  # type: ignore[arg-type]  # refused
+def test_measured_torques_are_refused(tmp_path):
     measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
     with pytest.raises(InvalidInput, match="a predictor is for commanded torques"):
         export_c(measured, tmp_path / "arm")

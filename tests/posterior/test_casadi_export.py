@@ -16,7 +16,7 @@ from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior import StructuredPosterior, casadi_function, export_casadi
+from forcegp.posterior import Posterior, casadi_function, export_casadi
 
 casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
 
@@ -35,7 +35,7 @@ OFTEN = "friction under load", "matern", "none"  # the other one has no kernel t
     scope="module",
     params=[name if name in OFTEN else pytest.param(name, marks=pytest.mark.nightly) for name in PRIORS],
 )
-def posterior(request) -> StructuredPosterior:
+def posterior(request) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
@@ -43,7 +43,7 @@ def posterior(request) -> StructuredPosterior:
 
 
 @pytest.fixture(scope="module")
-def friction() -> StructuredPosterior:
+def friction() -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
@@ -149,13 +149,7 @@ def test_any_name_becomes_one_of_casadi(friction, given, made):
     assert casadi_function(friction, steps=0.1, name=given).name() == made
 
 
-def test_without_casadi_and_without_a_program(states, monkeypatch):
-    black_box = arm_model().black_box()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        other = fit(black_box, arm_data(20, 0), restarts=1, options=OptimizerOptions(iterations=2))
-    with pytest.raises(InvalidInput, match=r"no program can be written of a .*export a structured model"):
-        casadi_function(other)
+def test_without_casadi(friction, monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(MissingExtra, match=r"pip install 'forcegp\[casadi\]'"):
-        casadi_function(other)
+        casadi_function(friction)

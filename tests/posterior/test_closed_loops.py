@@ -20,9 +20,9 @@ from forcegp import (
 )
 from forcegp.data import contact_doubts, contact_rows
 from forcegp.errors import InvalidInput
-from forcegp.evaluation import usual_forces
 from forcegp.integration import ConstraintManifold
 from forcegp.mechanics import loop_frame
+from forcegp.scores import usual_forces
 
 FRICTION = torch.tensor([0.4, 0.3, 0.5], dtype=torch.float64)
 

@@ -10,20 +10,20 @@ from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior import Predictor, StructuredPosterior, rollout
+from forcegp.posterior import Posterior, Predictor, rollout
 
 DT, STEPS = 0.01, 12
 INTEGRATORS = ["symplectic-euler", "rk4", "implicit-midpoint"]
 
 
-def fitted(prior) -> StructuredPosterior:
+def fitted(prior) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         return fit(arm_model().with_forces(prior), arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3))
 
 
 @pytest.fixture(scope="module")
-def friction() -> StructuredPosterior:
+def friction() -> Posterior:
     return fitted(JointFriction())
 
 

@@ -12,7 +12,7 @@ from forcegp.codegen.library import default_folder
 from forcegp.errors import NumericalWarning
 from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.kept_code import KeptCode
 
 
@@ -21,7 +21,7 @@ def _own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
-def fitted(prior=None, model=None, rows: int = 20) -> StructuredPosterior:
+def fitted(prior=None, model=None, rows: int = 20) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         model = model or arm_model().with_forces(prior or JointForces())
@@ -29,7 +29,7 @@ def fitted(prior=None, model=None, rows: int = 20) -> StructuredPosterior:
 
 
 @pytest.fixture(scope="module")
-def posterior() -> StructuredPosterior:
+def posterior() -> Posterior:
     return fitted()
 
 

@@ -15,7 +15,7 @@ from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
-from forcegp.posterior import Predictor, StructuredPosterior
+from forcegp.posterior import Posterior, Predictor
 
 TIP = (0.0, 0.0, 0.2)
 CONTACTS = {
@@ -31,14 +31,14 @@ CONTACTS = {
 SHORT = OptimizerOptions(iterations=3)
 
 
-def fitted(model: Model, rows: int = 30) -> StructuredPosterior:
+def fitted(model: Model, rows: int = 30) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         return fit(model, arm_data(rows, 0), restarts=1, options=SHORT)
 
 
 @pytest.fixture(scope="module")
-def posterior() -> StructuredPosterior:
+def posterior() -> Posterior:
     return fitted(arm_model().with_forces(JointForces()))
 
 
@@ -63,7 +63,7 @@ def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float =
     assert float((found - expected).abs().max()) <= tolerance * (1e-300 + float(expected.abs().max()))
 
 
-def check(posterior: StructuredPosterior, states: tuple[torch.Tensor, ...]):
+def check(posterior: Posterior, states: tuple[torch.Tensor, ...]):
     """Mean, exact covariance and derivatives are those of `predict`, for one state and for several."""
     predictor = posterior.predictor(covariance="exact")
     expected = posterior.predict(*states)
@@ -314,11 +314,3 @@ def test_it_takes_what_another_engine_knows(states):
 
 def test_the_covariance_is_compressed_unless_another_is_asked_for(compressed, means):
     assert (compressed.kind, means.kind) == ("compressed", "none")
-
-
-def test_other_models_have_none():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        other = fit(arm_model().black_box(), arm_data(8, 0), restarts=1, options=SHORT)
-    with pytest.raises(InvalidInput, match="has no predictor for control rates; call predict"):
-        other.predictor()

@@ -10,7 +10,7 @@ from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, RigidBodies, ToolForces
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 DT = 0.02
 INTEGRATORS = ["symplectic-euler", "rk4", "implicit-midpoint"]
@@ -23,7 +23,7 @@ PRIORS = {
 }
 
 
-def fitted(*forces, model=None) -> StructuredPosterior:
+def fitted(*forces, model=None) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
@@ -37,12 +37,12 @@ OFTEN = "friction under load", "tool forces with load", "none"  # the others are
     scope="module",
     params=[name if name in OFTEN else pytest.param(name, marks=pytest.mark.nightly) for name in PRIORS],
 )
-def posterior(request) -> StructuredPosterior:
+def posterior(request) -> Posterior:
     return fitted(PRIORS[request.param])
 
 
 @pytest.fixture(scope="module")
-def smooth() -> StructuredPosterior:
+def smooth() -> Posterior:
     return fitted(JointForces())
 
 

@@ -23,9 +23,8 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, Sphere
 from forcegp.model import Model
 from forcegp.noise import Noise
-from forcegp.posterior import load_posterior, save_posterior
+from forcegp.posterior import Posterior, load_posterior, save_posterior
 from forcegp.posterior.components import Components, Curve
-from forcegp.posterior.posterior import AnyPosterior
 from forcegp.posterior.storage import FORMAT_VERSION
 from forcegp.robots import Robot
 
@@ -358,7 +357,7 @@ def test_a_model_of_accelerations_cannot_move(data):
 
 def test_editors_see_what_a_loaded_model_offers():
     loaded = get_type_hints(load_posterior)["return"]
-    offered = {"components": Components, "curve": Curve, "with_contacts": AnyPosterior, "with_robot": AnyPosterior}
+    offered = {"components": Components, "curve": Curve, "with_contacts": Posterior, "with_robot": Posterior}
     for name, kind in offered.items():
         assert get_type_hints(getattr(loaded, name))["return"] is kind
 

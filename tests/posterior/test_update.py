@@ -349,10 +349,3 @@ def test_posteriors_that_are_not_exact_say_what_to_do():
     posterior = fit(data.model.with_forces(JointForces()), data, restarts=1, options=QUICK, engine="inducing")
     with pytest.raises(InvalidInput, match="engine='exact'"):
         posterior.update(data)
-
-
-def test_models_that_would_have_to_be_trained_again_say_so():
-    data = arm_data(12, seed=19)
-    trained = fit(data.model.black_box(), data, restarts=1, options=QUICK)
-    with pytest.raises(InvalidInput, match="fit it again to all rows"):
-        trained.update(data)

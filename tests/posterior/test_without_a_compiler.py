@@ -12,13 +12,13 @@ from forcegp.errors import NumericalWarning
 from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 SLOWER = "predictions are computed by torch, some hundred times slower: "
 
 
 @pytest.fixture(scope="module")
-def posterior() -> StructuredPosterior:
+def posterior() -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject
         options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}

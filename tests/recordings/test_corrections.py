@@ -55,8 +55,6 @@ def test_a_mapping_with_joints_of_its_own_order_keeps_it():
             joints=JOINTS,
             unit={"q": ("deg", "deg", "rad"), "time": ("ms",)},
             sign={"u": (1.0, -1.0, 1.0), "q": (-1.0,)},
-            scale={"u": (0.5,)},
-            offset={"q": (0.0, 1.5, 0.0)},
         ),
         ColumnMapping(time="file:c1", q=("a",), u=("b",), headerless=(1, 7), side_by_side=True, episode="number"),
     ],

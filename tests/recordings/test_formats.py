@@ -46,11 +46,6 @@ class TestCompressedCsv(Tables):
         return write_text(folder / "log.csv.gz", table(motion()))
 
 
-class TestTabs(TestCsv):
-    def write(self, folder):
-        return write_text(folder / "log.tsv", table(motion()), delimiter="\t")
-
-
 class TestBlanksAndComments(TestCsv):
     def write(self, folder):
         return write_text(folder / "log.txt", table(motion()), delimiter="   ", before="# a robot\n\n# 2 joints\n")
@@ -190,32 +185,9 @@ class TestBareMcap(Bags):
         return next(write_bag2(folder / "log", motion()).glob("*.mcap"))
 
 
-class TestBareSqlite(Bags):
-    def write(self, folder):
-        return next(write_bag2(folder / "log", motion(), "sqlite3").glob("*.db3"))
-
-
 class TestCompressedMcap(TestRos2Folder):
     def write(self, folder):
         return write_bag2(folder / "log", motion(), compressed="STORAGE")
-
-
-class TestCompressedMessages(TestRos2Folder):
-    def write(self, folder):
-        return write_bag2(folder / "log", motion(), compressed="MESSAGE")
-
-
-class TestCompressedSqlite(TestRos2Folder):
-    def write(self, folder):
-        return write_bag2(folder / "log", motion(), "sqlite3", compressed="FILE")
-
-    def truncated(self, path):
-        return next(path.glob("*.zstd"))
-
-
-class TestCompressedRos1Bag(Bags):
-    def write(self, folder):
-        return write_bag1(folder / "log.bag", motion(), "LZ4")
 
 
 class TestTopicWithTwoPublishers(TestRos2Folder):
@@ -223,7 +195,7 @@ class TestTopicWithTwoPublishers(TestRos2Folder):
         return write_bag2(folder / "log", motion(), gripper=True)
 
     def test_messages_of_the_other_are_counted(self, source):
-        list(source.chunks(["/joint_states:position.elbow"], 64))
+        source.read(["/joint_states:position.elbow"])
         assert source.notes()[0].endswith(": 67")
 
 
@@ -265,15 +237,15 @@ def test_columns_of_several_topics_are_refused(tmp_path):
     pytest.importorskip("rosbags")
     source = open_source(write_bag2(tmp_path / "log", motion(10)))
     with pytest.raises(InvalidInput, match="topics /joint_states, /wrench"):
-        list(source.chunks(["/joint_states:log_time", "/wrench:log_time"], 10))
+        source.read(["/joint_states:log_time", "/wrench:log_time"])
 
 
 def test_a_header_may_be_long(tmp_path):
     columns = {f"a_long_name_of_column_{index}": np.arange(3.0) + index for index in range(3000)}
     source = open_source(write_text(tmp_path / "log.csv", columns))
     assert source.columns() == tuple(columns)
-    (piece,) = source.chunks(["a_long_name_of_column_2999"], 10)
-    np.testing.assert_array_equal(piece["a_long_name_of_column_2999"], [2999, 3000, 3001])
+    found = source.read(["a_long_name_of_column_2999"])
+    np.testing.assert_array_equal(found["a_long_name_of_column_2999"], [2999, 3000, 3001])
 
 
 def test_a_name_of_a_column_that_is_too_long_is_refused(tmp_path):

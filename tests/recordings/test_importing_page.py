@@ -37,7 +37,7 @@ def test_the_mapping_is_one(page, tmp_path):
     (tmp_path / "columns.yaml").write_text(text)
     mapping = read_mapping(tmp_path / "columns.yaml")
     assert mapping.q == ("theta1", "theta2 - theta1")
-    assert mapping.scale["u"] == (0.083, 0.041)
+    assert mapping.u == ("0.083*current1", "0.041*current2")
 
 
 def test_every_unit_is_on_the_page(page):

@@ -99,9 +99,8 @@ POSE = ColumnMapping(q=("/odom:pose",), v=("/odom:twist",), u=("/rotors:data",),
 
 
 def imported(path, flight, mapping=POSE, **options):
-    out = path.parent / "out.h5"
-    done = import_recordings([path], out, mapping, model=flight.model, options=ImportOptions(**options))
-    return Dataset.load(out), done
+    found = import_recordings([path], mapping, model=flight.model, options=ImportOptions(**options))
+    return found, found.metadata["import"]
 
 
 def test_poses_and_twists_are_named_by_their_topic(tmp_path, flight):
@@ -115,27 +114,7 @@ def test_poses_and_twists_are_named_by_their_topic(tmp_path, flight):
     assert source.vectors["/imu:linear_acceleration"] == tuple(f"/imu:linear_acceleration.{axis}" for axis in "xyz")
 
 
-def test_stamped_poses_and_transforms_are_named_by_their_field(tmp_path):
-    turn, stamped = vector([0, 0, 0, 1], "Quaternion"), header(EPOCH)
-    pose = message("geometry_msgs/msg/Pose", position=vector([1, 2, 3], "Point"), orientation=turn)
-    transform = message("geometry_msgs/msg/Transform", translation=vector([1, 2, 3]), rotation=turn)
-    own = {"header": stamped, "child_frame_id": "body", "transform": transform}
-    messages = [
-        ("/mocap", EPOCH, message("geometry_msgs/msg/PoseStamped", header=stamped, pose=pose)),
-        ("/vicon", EPOCH, message("geometry_msgs/msg/TransformStamped", **own)),
-    ]
-    vectors = open_source(written(tmp_path, messages)).vectors
-    parts = {"/mocap:pose": ("position", "orientation"), "/vicon:transform": ("translation", "rotation")}
-    for name, (place, turned) in parts.items():
-        expected = [f"{name}.{place}.{axis}" for axis in "xyz"] + [f"{name}.{turned}.{axis}" for axis in "xyzw"]
-        assert list(vectors[name]) == expected
-
-
-@pytest.mark.parametrize("piece", [7, 16384])
-def test_commands_hold_and_forces_are_interpolated(tmp_path, flight, monkeypatch, piece):
-    import forcegp.recordings.reading as reading
-
-    monkeypatch.setattr(reading, "ROWS_AT_A_TIME", piece)
+def test_commands_hold_and_forces_are_interpolated(tmp_path, flight):
     at = np.arange(0.011, 1.2, 0.0097)
     path = bag_of(tmp_path, flight, at, np.arange(-0.003, 0.9, 0.0013))
     mapping = ColumnMapping(
@@ -157,7 +136,6 @@ def test_commands_hold_and_forces_are_interpolated(tmp_path, flight, monkeypatch
     assert "/rotors held (by log_time)" in note
     assert "/imu interpolated" in note
     assert f"; {len(flight) - len(rows)} rows before" in note
-    assert found.metadata["import"]["recordings"][0]["notes"][-1] == note
 
 
 HOPPER = """<robot name="hopper"><link name="trunk"><inertial><mass value="5"/>
@@ -183,13 +161,13 @@ def test_joints_of_another_topic_are_interpolated_and_their_torques_held(tmp_pat
         u=("/joints:effort.{joints}",),
     )
     model = Model(Robot.from_urdf_text(HOPPER, base="floating"))
-    done = import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, model=model)
-    found = Dataset.load(tmp_path / "out.h5")
+    found = import_recordings([written(tmp_path, messages)], mapping, model=model)
     np.testing.assert_allclose(found.time, base, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.q[:, 7], 0.3 * base, rtol=0, atol=1e-8)
     last = joint[np.searchsorted(joint, base + 1e-9, side="right") - 1]
     np.testing.assert_allclose(found.u[:, 0], 5.0 + last, rtol=0, atol=1e-12)
-    assert done["guessed"] == ["time = /odom:header.stamp"]
+    done = found.metadata["import"]
+    assert done["guessed"] == ("time = /odom:header.stamp",)
     assert "/joints interpolated, u held" in done["recordings"][0]["notes"][-1]
 
 
@@ -205,9 +183,9 @@ def test_angles_that_wrap_are_not_interpolated_across(tmp_path):
     mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), unit={"q": ("deg",)})
     model = Model(Robot.from_urdf_text(HOPPER.replace("revolute", "continuous"), base="floating"))
     with pytest.raises(DatasetError, match="jumps by more than half a turn"):
-        import_recordings([path], tmp_path / "out.h5", mapping, model=model)
-    import_recordings([path], tmp_path / "out.h5", mapping, model=model, options=ImportOptions(unwrap=True))
-    off = np.abs(Dataset.load(tmp_path / "out.h5").q[:, 7] - 3.0 * base)
+        import_recordings([path], mapping, model=model)
+    found = import_recordings([path], mapping, model=model, options=ImportOptions(unwrap=True))
+    off = np.abs(found.q[:, 7] - 3.0 * base)
     assert np.sort(off)[-4] < 1e-6
     assert off.max() < 3.0 / 70
 
@@ -255,8 +233,7 @@ def test_rows_at_the_clock_of_another_topic_have_turns_in_between(tmp_path):
     messages += [("/joints", s, joint_state(s, 0.1)) for s in nanoseconds(rows).tolist()]
     mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), time="/joints:header.stamp")
     model = Model(Robot.from_urdf_text(HOPPER, base="floating"))
-    import_recordings([written(tmp_path, messages)], tmp_path / "out.h5", mapping, model=model)
-    found = Dataset.load(tmp_path / "out.h5")
+    found = import_recordings([written(tmp_path, messages)], mapping, model=model)
     assert len(found) == len(rows)
     error = Rotation.from_quat(found.q[:, 3:7]).inv() * Rotation.from_rotvec(np.outer(rows, rate))
     assert error.magnitude().max() < 1e-7

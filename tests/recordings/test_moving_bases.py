@@ -115,8 +115,7 @@ CONVENTIONS = (
 def imported(folder, flight, changes=None, mapping=PLAIN, model=None, **options) -> Dataset:
     path = write_text(folder / "log.csv", columns(flight, **(changes or {})))
     model = model or flight.model
-    import_recordings([path], folder / "out.h5", mapping, model=model, options=ImportOptions(**options))
-    return Dataset.load(folder / "out.h5")
+    return import_recordings([path], mapping, model=model, options=ImportOptions(**options))
 
 
 @pytest.mark.parametrize("convention", [lambda _: ({}, {}), *CONVENTIONS])
@@ -162,8 +161,7 @@ def test_a_spline_passes_signs_that_flip(tmp_path):
     q[:, 3:] *= random.choice([-1.0, 1.0], rows)[:, None]
     table = {"time": time} | {f"q{k}": q[:, k] for k in range(7)}
     path = write_text(tmp_path / "log.csv", table)
-    import_recordings([path], tmp_path / "out.h5", ColumnMapping(time="time", q=("q{0..6}",)), model=model)
-    found = Dataset.load(tmp_path / "out.h5")
+    found = import_recordings([path], ColumnMapping(time="time", q=("q{0..6}",)), model=model)
     assert found.u.shape == (len(found), 0)
     expected = motion(found.time + time[0])
     same = np.sign((found.q[:, 3:] * expected[:, 3:]).sum(axis=1))
@@ -194,8 +192,7 @@ def test_other_bases(tmp_path, base, q, stated, ned):
     path = write_text(tmp_path / "log.csv", table)
     mapping = ColumnMapping(time="time", q=(f"q{{0..{len(table) - 2}}}",), ned=ned, **stated)
     model = Model(Robot.from_urdf_text(BODY, base=base))
-    import_recordings([path], tmp_path / "out.h5", mapping, model=model)
-    found = Dataset.load(tmp_path / "out.h5")
+    found = import_recordings([path], mapping, model=model)
     side = -1.0 if ned else 1.0
     np.testing.assert_allclose(found.v[:, -1], 0.4 * side, rtol=1e-9)
     if base == "planar":
@@ -261,7 +258,7 @@ def test_motors_of_an_mjcf_file_are_the_inputs(tmp_path, flight):
 def test_without_a_base_that_moves_nothing_of_it_can_be_stated(tmp_path, flight, mapping):
     path = write_text(tmp_path / "log.csv", columns(flight))
     with pytest.raises(InvalidInput, match="about a base that moves"):
-        import_recordings([path], tmp_path / "out.h5", mapping)
+        import_recordings([path], mapping)
 
 
 def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
@@ -283,8 +280,7 @@ def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
     (tmp_path / "box.xml").write_text(text)
     model = Model.from_file(tmp_path / "box.xml", base="floating")
     axes = {"v": ("world", "body"), "a": ("world", "body")}
-    import_recordings([path], tmp_path / "out.h5", replace(PLAIN, u=None, orientation="wxyz", axes=axes), model=model)
-    found = Dataset.load(tmp_path / "out.h5")
+    found = import_recordings([path], replace(PLAIN, u=None, orientation="wxyz", axes=axes), model=model)
     moved = differentiate(found.q, found.time, model.robot.space)
     np.testing.assert_allclose(found.v[1:-1], moved[1:-1], rtol=0, atol=1e-4)
     q, v, u = (torch.tensor(x) for x in (found.q, found.v, found.u))
@@ -321,9 +317,9 @@ def test_turning_joints_stand_where_the_robot_has_them(tmp_path, orientation):
         time="time", q=(f"q{{0..{len(table) - 2}}}",), u=("0",), joints=("turn", "slide"), orientation=orientation
     )
     mapping = replace(mapping, ned=True)  # no base: nothing to turn
-    import_recordings([write_text(tmp_path / "log.csv", table)], tmp_path / "out.h5", mapping, model=model)
+    found = import_recordings([write_text(tmp_path / "log.csv", table)], mapping, model=model)
     expected = np.column_stack([slide, quaternion, turned])
-    np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q, expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found.q, expected, rtol=0, atol=1e-14)
 
 
 def walking_log(tmp_path, u: np.ndarray):
@@ -337,13 +333,14 @@ def walking_log(tmp_path, u: np.ndarray):
 def test_flags_that_a_log_lacks_are_open(tmp_path):
     walk, mapping = walking_log(tmp_path, lambda walk: 1e3 * walk.u[:, :12])
     mapping = replace(mapping, unit={"u": ("mNm",)}, sign={"u": (-1.0,)})
-    given = {"paths": [tmp_path / "walk.csv"], "out": tmp_path / "walk.h5", "model": walk.model}
+    given = {"paths": [tmp_path / "walk.csv"], "model": walk.model}
     with pytest.raises(InvalidInput, match=r"u has 12 columns for 16 inputs .* 0 for a joint that nothing drives"):
         import_recordings(mapping=mapping, **given)
-    done = import_recordings(mapping=mapping, options=ImportOptions(stance="auto"), **given)
-    assert done["open_switches"] == list(walk.model.inputs[12:])
-    assert done["columns"]["u"] == [f"u{k}" for k in range(12)]
-    u = Dataset.load(tmp_path / "walk.h5").u
+    found = import_recordings(mapping=mapping, options=ImportOptions(stance="auto"), **given)
+    done = found.metadata["import"]
+    assert done["open_switches"] == walk.model.inputs[12:]
+    assert done["columns"]["u"] == tuple(f"u{k}" for k in range(12))
+    u = found.u
     np.testing.assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
     assert (u[:, 12:] == 0.0).all()
 
@@ -351,12 +348,12 @@ def test_flags_that_a_log_lacks_are_open(tmp_path):
 def test_signs_and_scales_of_the_actuators_leave_flags_alone(tmp_path):
     walk, mapping = walking_log(tmp_path, lambda walk: walk.u)
     signs = (-1.0, *[1.0] * 11)
-    for change in ({"sign": {"u": (-1.0,)}}, {"sign": {"u": signs}}, {"scale": {"u": (0.5,)}}):
+    for change in ({"sign": {"u": (-1.0,)}}, {"sign": {"u": signs}}):
         options = ImportOptions(stance="auto")
-        done = import_recordings([tmp_path / "walk.csv"], tmp_path / "walk.h5", replace(mapping, **change),
-                                 model=walk.model, options=options)  # fmt: skip
-        u = Dataset.load(tmp_path / "walk.h5").u
-        assert done["open_switches"] == []
+        found = import_recordings([tmp_path / "walk.csv"], replace(mapping, **change),
+                                  model=walk.model, options=options)  # fmt: skip
+        u = found.u
+        assert found.metadata["import"]["open_switches"] == ()
         np.testing.assert_array_equal(u[:, 12:], walk.u[:, 12:])
         [values] = [x["u"] for x in change.values()]
         np.testing.assert_allclose(u[:, :12], walk.u[:, :12] * np.array(values), rtol=1e-6)
@@ -380,7 +377,7 @@ def test_a_wheel_may_turn_often(tmp_path):
     }
     path = write_text(tmp_path / "log.csv", table)
     mapping = ColumnMapping(time="time", q=("x", "y", "c", "s", "axle"), u=("0",))
-    import_recordings([path], tmp_path / "out.h5", mapping, model=cart.with_contacts(rolling("wheel", 0.1)))
-    np.testing.assert_allclose(Dataset.load(tmp_path / "out.h5").q[:, -1], turn)
+    found = import_recordings([path], mapping, model=cart.with_contacts(rolling("wheel", 0.1)))
+    np.testing.assert_allclose(found.q[:, -1], turn)
     with pytest.raises(DatasetError, match="more than two turns"):
-        import_recordings([path], tmp_path / "no.h5", mapping, model=cart)
+        import_recordings([path], mapping, model=cart)

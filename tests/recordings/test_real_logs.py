@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp.data import Dataset, Preparation
+from forcegp.data import Preparation
 from forcegp.model import Model
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 from forcegp.robots import Robot
@@ -15,11 +15,10 @@ def test_eight_runs_of_a_double_pendulum(shared, tmp_path):
     mapping = ColumnMapping(time="time", q=("pos_meas{1..2}",), v=("vel_meas{1..2}",), u=("tau_meas{1..2}",))
     model = Model(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
     runs = sorted((folder / "raw").glob("*.csv.gz"))
-    done = import_recordings(runs, tmp_path / "log.h5", mapping, model=model)
-    data = Dataset.load(tmp_path / "log.h5")
+    data = import_recordings(runs, mapping, model=model)
     assert data.episodes == tuple(range(8))
     assert data.joint_names == ("joint1", "joint2")
-    assert done["resampled_to_step"] == pytest.approx(1 / 500)
+    assert data.metadata["import"]["resampled_to_step"] == pytest.approx(1 / 500)
     raw = np.loadtxt(runs[2], delimiter=",", skiprows=1)
     own = data.select_episodes([2])
     for signal, columns in (("q", [1, 2]), ("v", [3, 4]), ("u", [13, 14])):
@@ -44,8 +43,7 @@ def test_a_panda_whose_signals_lie_in_four_files(shared, tmp_path):
     )
     robot = Robot.from_urdf(folder / "model" / "panda_gaz2019_nomesh.urdf")
     paths = [folder / "raw" / f"{prefix}{name}.txt.gz" for name in names]
-    import_recordings(paths, tmp_path / "log.h5", mapping, model=Model(robot))
-    raw = Dataset.load(tmp_path / "log.h5")
+    raw = import_recordings(paths, mapping, model=Model(robot))
     assert raw.episodes == (0,)
     data = Preparation(cutoff=5.0, every=20, trim=0.25).apply(raw).dataset
     q, v, a = (torch.tensor(values) for values in (data.q, data.v, data.a))
@@ -64,8 +62,7 @@ def test_a_passive_pendulum_with_absolute_angles(shared, tmp_path):
         joints=("shoulder", "elbow"),
         unit={"q": ("rad",)},
     )
-    import_recordings([path], tmp_path / "log.h5", mapping, options=ImportOptions(end=0.5))
-    data = Dataset.load(tmp_path / "log.h5")
+    data = import_recordings([path], mapping, options=ImportOptions(end=0.5))
     pieces = np.load(path)
     assert data.episodes == tuple(range(26))
     last = data.select_episodes([25])

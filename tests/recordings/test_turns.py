@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from tests.recordings.log_files import JOINTS, motion, table, write_text
 
-from forcegp.data import Dataset
 from forcegp.errors import DatasetError
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
-from forcegp.recordings.turns import TURN, turns_to_add
+from forcegp.recordings.reading import TURN, turns_to_add
 
 STEP, ROWS = 0.01, 400
 TIME = STEP * np.arange(ROWS)
@@ -100,13 +99,12 @@ def test_import_continues_what_wraps_and_leaves_what_counts(tmp_path):
     path = write_text(tmp_path / "log.csv", {name: x for name, x in table(data).items() if not name.startswith("v_")})
     columns = {"q": ("q_{joints}",), "v": ("derive{1..2}",), "u": ("u_{joints}",)}
     mapping = ColumnMapping(time="time", joints=JOINTS, unit={"q": ("rad",)}, **columns)
-    done = import_recordings([path], tmp_path / "out.h5", mapping, options=ImportOptions(unwrap=True))
-    found = Dataset.load(tmp_path / "out.h5")
+    found = import_recordings([path], mapping, options=ImportOptions(unwrap=True))
     np.testing.assert_allclose(found.q[:, 0], 9.0 * time / time[-1], atol=1e-12)
     np.testing.assert_array_equal(found.q[:, 1], data["q"][:, 1])
-    [note] = done["recordings"][0]["notes"]
+    [note] = found.metadata["import"]["recordings"][0]["notes"]
     assert "counts turns" in note
     data["q"][100, 1] += 20.0
     path = write_text(tmp_path / "odd.csv", {name: x for name, x in table(data).items() if not name.startswith("v_")})
     with pytest.raises(DatasetError, match=r"nothing shows whether it wraps.*`v`"):
-        import_recordings([path], tmp_path / "odd.h5", mapping, options=ImportOptions(unwrap=True))
+        import_recordings([path], mapping, options=ImportOptions(unwrap=True))

@@ -3,9 +3,9 @@
 import pytest
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import JointForces, JointFriction, Viscous, evaluate, fit
+from forcegp import JointForces, JointFriction, Viscous, fit, score
 from forcegp.inference import OptimizerOptions
-from forcegp.report import evaluation_sentence, evaluation_table, model_page
+from forcegp.report import model_page, scores_sentence, scores_table
 from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
@@ -32,6 +32,6 @@ def on_plane():
 @pytest.fixture(scope="session")
 def page(swinging, friction):
     """A page about the pendulum."""
-    evaluation = evaluate(friction, swinging)
-    best = evaluation_sentence(evaluation, "rad/s²")
-    return model_page(friction, swinging, title="pendulum", best=best, tables=[evaluation_table(evaluation)])
+    scores = score(friction, swinging)
+    best = scores_sentence(scores, "rad/s²")
+    return model_page(friction, swinging, title="pendulum", best=best, tables=[scores_table(scores)])

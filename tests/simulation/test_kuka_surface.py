@@ -142,7 +142,7 @@ def test_the_noise_leaves_the_motion_as_it_is(short):
 
 def test_other_seeds_and_episodes_are_other_trajectories(short):
     two = simulate_kuka_surface(dataclasses.replace(SHORT, episodes=2))
-    first, second = two.split_by_episode([1])
+    first, second = two.select_episodes([0]), two.select_episodes([1])
     assert_equal(dataclasses.replace(first, metadata={}), dataclasses.replace(short, metadata={}))
     other = simulate_kuka_surface(dataclasses.replace(SHORT, seed=6))
     for one, another in ((first, second), (short, other), (second, other)):

@@ -11,11 +11,11 @@ from forcegp import AerodynamicForce, Dataset, Model, Robot, calibrated, fit
 from forcegp.data import estimate_thruster_lag, recorded_motions
 from forcegp.data.delay import lagged
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.predicted_rows import predict_rows
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
 from forcegp.posterior.observed_wrench import _lasting
 from forcegp.report.motion import recorded_scene
+from forcegp.scores.predicted_rows import predict_rows
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 

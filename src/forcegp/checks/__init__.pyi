@@ -1,4 +1,4 @@
-from .check_input import (
-    import_flags as import_flags, SEVERITIES as SEVERITIES, Finding as Finding, Severity as Severity,
+from .report import (
+    CheckReport as CheckReport, Finding as Finding, check as check, import_flags as import_flags,
+    quick_check as quick_check,
 )
-from .report import CheckReport as CheckReport, check as check, quick_check as quick_check

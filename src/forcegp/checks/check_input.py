@@ -3,13 +3,16 @@
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from forcegp.checks.successive_rows import (
+from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
+from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.row_selection import consecutive, move_on
+from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
+from forcegp.data.successive_rows import (
     FEW_JOINTS,
     drop_outs,
     few_stretches,
@@ -18,74 +21,14 @@ from forcegp.checks.successive_rows import (
     smoothed,
     white_noise,
 )
-from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
-from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.row_selection import consecutive, move_on
-from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.model import Model
 from forcegp.robots import Robot
-
-Severity = Literal["ok", "look", "wrong"]
-SEVERITIES: tuple[Severity, ...] = ("ok", "look", "wrong")
-"""From harmless to spoiling every result."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """One result of a check.
-
-    severity: ok, nothing to do; look, a person should judge; wrong, results would be wrong.
-    subject: what was checked, in a few words, the same for all logs.
-    seen: what was seen, with joint, row, time and numbers.
-    remedy: what to do about it; empty if nothing.
-    joints: names of the joints concerned; numbers: the numbers of `seen`, for programs.
-    correction: what an import has to state about the columns, for `ColumnMapping.corrected_by`: unit, sign and order by
-    signal, for all joints or one each, in the order of the joints; orientation of q and axes of v and a.
-    """
-
-    severity: Severity
-    subject: str
-    seen: str
-    remedy: str = ""
-    joints: tuple[str, ...] = ()
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-    correction: Mapping[str, Mapping[str, tuple[Any, ...]]] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON."""
-        correction = {what: {name: list(x) for name, x in each.items()} for what, each in self.correction.items()}
-        return {**vars(self), "joints": list(self.joints), "numbers": dict(self.numbers), "correction": correction}
-
-
-wrong, look, ok = partial(Finding, severity="wrong"), partial(Finding, severity="look"), partial(Finding, severity="ok")
-
-
-def import_flags(correction: Mapping[str, Mapping[str, tuple[Any, ...]]]) -> str:
-    """The options of `forcegp import` that state these units and signs, orders of quaternions and axes."""
-    texts = [f"--{what} {own[0]}" for what in ("orientation",) for own in correction.get(what, {}).values()]
-    for what in ("axes", "unit", "sign"):
-        stated = correction.get(what, {})
-        each = (
-            f"{name}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for name, own in stated.items()
-        )
-        texts += [f"--{what} {','.join(each)}"] if stated else []
-    return " ".join(texts)
-
-
-def worst(findings: Sequence[Finding]) -> Severity:
-    """The severity of the worst of them; ok if there are none."""
-    return SEVERITIES[max((SEVERITIES.index(finding.severity) for finding in findings), default=0)]
 
 
 def numbers_of(values: Sequence[float | None]) -> np.ndarray:
     """Numbers from a report, NaN where it has none."""
     return np.array([np.nan if value is None else value for value in values], dtype=float)
-
-
-def listed(names: Sequence[str]) -> str:
-    """`a, b and c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 GAP = 5.0  # median steps without a row at which a motion is taken for two
@@ -111,27 +54,26 @@ class CheckInput:
     """
 
     log: Dataset
-    robot: Robot | None
-    contacts: int
     even: Dataset
-    prepared: Prepared | None
-    compared: Dataset | None
-    automatic: bool
+    mended: Dataset
     wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
-    dropped: Mapping[str, Bool[np.ndarray, "rows nv"]]
-    mended: Dataset
-    compared_noise: Float[np.ndarray, " nv"] | None
+    robot: Robot | None = None
+    contacts: int = 0
+    prepared: Prepared | None = None
+    compared: Dataset | None = None
+    automatic: bool = False
+    dropped: Mapping[str, Bool[np.ndarray, "rows nv"]] = field(default_factory=dict)
+    compared_noise: Float[np.ndarray, " nv"] | None = None
     most_rows: int = MOST_ROWS
 
     @classmethod
-    def as_recorded(cls, dataset: Dataset, model: Model) -> "CheckInput":
-        """A log of which nothing is filtered, compared or mended."""
-        nowhere = np.zeros(dataset.v.shape, dtype=bool)
-        return cls(
-            log=dataset, robot=model.robot, contacts=len(model.contacts), even=dataset, prepared=None, compared=None,
-            automatic=False, wraps=nowhere, jumps=nowhere, dropped={}, mended=dataset, compared_noise=None,
-        )  # fmt: skip
+    def as_recorded(cls, dataset: Dataset, model: Model | None, **more: Any) -> "CheckInput":
+        """A log of which nothing is filtered, compared or mended, but for `more`."""
+        model, nowhere = dataset.model if model is None else model, np.zeros(dataset.v.shape, dtype=bool)
+        known = {} if model is None else {"robot": model.robot, "contacts": len(model.contacts)}
+        same = {"log": dataset, "even": dataset, "mended": dataset, "wraps": nowhere, "jumps": nowhere}
+        return cls(**same | known | more)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -165,60 +107,49 @@ class CheckInput:
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
-        mended, found = _mended(dataset)
-        jumps = found["jumps"]
-        even = _even(_unwrapped(mended, found["wraps"]), jumps)
-        prepared = compared = None
+        found = _mended(dataset)
+        mended, jumps = found["mended"], found["jumps"]
+        found["even"] = even = _even(_unwrapped(mended, found["wraps"]), jumps)
+        found["automatic"] = preparation.cutoff == "auto"
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
             chosen = replace(preparation, every=1, delay=0.0).resolved(even)
             trim = 0.0 if chosen.cutoff is None else min(1.0 / float(chosen.cutoff), LONGEST_TRIM * shortest)
-            prepared = replace(chosen, trim=float(trim)).apply(even)
-            compared = prepared.dataset
+            found["prepared"] = prepared = replace(chosen, trim=float(trim)).apply(even)
+            found["compared"] = prepared.dataset
             applied = chosen.cutoff or _earlier(dataset).get("cutoff")
             first = even.time[even.episode == even.episode[0]]
             if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
                 lower = COMPARED * float(applied)
-                compared = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest)).rows(even)
-        noise = None
-        if prepared is not None:  # white noise as logged, or what the filter left
+                lowest = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest))
+                found["compared"] = lowest.rows(even)
+            # white noise as logged, or what the filter left
             left = prepared.report.get("acceleration_noise", {}).get("after")
             seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF
-            noise = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
-        results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
-        return cls(**_known(dataset, model), **found, **results, mended=mended, automatic=preparation.cutoff == "auto")
+            found["compared_noise"] = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
+        return cls.as_recorded(dataset, model, **found)
 
     @classmethod
     def quick(cls, dataset: Dataset, model: Model | None) -> "CheckInput":
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
+        found: dict[str, Any] = {"compared": dataset, "compared_noise": dataset.noise_level, "most_rows": QUICK_ROWS}
         if dataset.time_ordered and not move_on(dataset):
             dataset = replace(dataset, time_ordered=False)
-        even, prepared, mended = dataset, None, dataset
-        nowhere = np.zeros(dataset.q.shape, dtype=bool)
-        found: dict[str, Any] = {"dropped": {}, "wraps": nowhere, "jumps": nowhere}
-        compared: Dataset | None = dataset
-        noise = dataset.noise_level
         if dataset.time_ordered:
-            mended, found = _mended(dataset)
-            jumps = found["jumps"]
-            compared = None if jumps.any() else smoothed(_unwrapped(mended, found["wraps"]))
+            found |= _mended(dataset)
+            mended, jump = found["mended"], found["jumps"].any()
+            rows = mended if jump else smoothed(_unwrapped(mended, found["wraps"]))
+            found["compared"] = None if jump else rows
+            if not jump:
+                seen = white_noise(mended, running_width(mended))
+                found["compared_noise"] = found["compared_noise"] if seen is None else np.nan_to_num(seen)
             with contextlib.suppress(InvalidInput):
-                even = _even(few_stretches(mended if compared is None else compared), jumps)
-                prepared = None if compared is None else Preparation().apply(even)
-            seen = None if compared is None else white_noise(mended, running_width(mended))
-            noise = noise if seen is None else np.nan_to_num(seen)
-        results = {"even": even, "prepared": prepared, "compared": compared, "compared_noise": noise}
-        how = {"automatic": False, "most_rows": QUICK_ROWS}
-        return cls(**_known(dataset, model), **found, **results, **how, mended=mended)
+                found["even"] = _even(few_stretches(rows), found["jumps"])
+                found["prepared"] = None if jump else Preparation().apply(found["even"])
+        return cls.as_recorded(dataset, model, **found)
 
 
-def _known(dataset: Dataset, model: Model | None) -> dict[str, Any]:
-    model = dataset.model if model is None else model
-    robot, contacts = (None, 0) if model is None else (model.robot, len(model.contacts))
-    return {"log": dataset, "robot": robot, "contacts": contacts}
-
-
-def _mended(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
+def _mended(dataset: Dataset) -> dict[str, Any]:
     """The log with its drop-outs interpolated, and where they are; rows after which an angle wraps, or jumps by pi."""
     dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
     mended = mended_rows(dataset, dropped)
@@ -226,7 +157,8 @@ def _mended(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:
     change[~consecutive(mended)] = 0.0
     angular = _angular(mended)
     wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & angular
-    return mended, {"dropped": dropped, "wraps": wraps, "jumps": (change > np.pi) & angular & ~wraps}
+    jumps = (change > np.pi) & angular & ~wraps
+    return {"mended": mended, "dropped": dropped, "wraps": wraps, "jumps": jumps}
 
 
 def _angular(dataset: Dataset) -> np.ndarray:

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from forcegp.checks.check_input import CheckInput, Finding, listed, look, numbers_of, ok
-from forcegp.checks.successive_rows import white_noise
+from forcegp.checks.check_input import CheckInput, numbers_of
+from forcegp.data.findings import Finding, listed, look, ok
+from forcegp.data.successive_rows import white_noise
 from forcegp.errors import InvalidInput
 from forcegp.evidence.identifiability import base_parameters, excitation
 from forcegp.summary import plain
@@ -79,7 +80,7 @@ def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
             subject="noise",
             seen=f"the acceleration in this dataset is not filtered: its noise is up to "
             f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
-            remedy=f"forcegp prepare DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
+            remedy=f"forcegp import DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
             joints=inputs.named(loud),
         )
     yield from _in_torques(inputs, after)

@@ -4,7 +4,7 @@ Each hypothesis corrects one error. The hypothesis under which inverse dynamics 
 leaves far less unexplained than the log as it is; then the next is sought, on top of it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import Any
@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.check_input import DEGREE, CheckInput, Finding, import_flags, listed, wrong
+from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.torques import (
-    Correction,
     TorqueFit,
     estimated_gravity,
     fit_torques,
@@ -25,6 +24,7 @@ from forcegp.checks.torques import (
 )
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.findings import Finding, import_flags, listed, wrong
 from forcegp.robots import Robot
 
 SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
@@ -39,22 +39,59 @@ NEARLY = 3.0  # factor either way that wrong masses explain
 TILTED = np.deg2rad(15.0)  # angle from which a direction of gravity is reported
 
 
+Change = Callable[[Dataset], Dataset]
+
+
+def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
+    """Every joint's signals from another column, times a factor.
+
+    Without robot, truth and metadata, which belong to the log as it was.
+    """
+
+    def change(dataset: Dataset) -> Dataset:
+        places = np.arange(dataset.nv) if order is None else order
+        columns = {name: getattr(dataset, name)[:, places] * factor for name in signals}
+        return replace(dataset, **columns, model=None, noise_std=None, truth={}, metadata={})
+
+    return change
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A log with one error corrected: robot, correction, rows compared, their inverse dynamics and the fit.
+    """A log with errors corrected: the robot, what was changed, rows compared, their inverse dynamics and the fit.
 
     `cost` is subtracted from what it explains: of two explanations the simpler one is reported. `concerns` are the
     joints that it must explain.
     """
 
     robot: Robot
-    correction: Correction
+    changes: tuple[Change, ...]
     rows: Dataset
     tau: Float[np.ndarray, "rows nv"]
     fit: TorqueFit
     finding: Finding | None = None
     cost: float = 0.0
     concerns: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, robot: Robot, rows: Dataset, changes: tuple[Change, ...], **more: Any) -> "Hypothesis":
+        """The hypothesis whose last change is yet to be made in `rows`."""
+        rows = changes[-1](rows)
+        tau = inverse_dynamics(robot, rows)
+        return cls(robot=robot, changes=changes, rows=rows, tau=tau, fit=fit_torques(robot, tau, rows), **more)
+
+    def tried(
+        self, change: Change, robot: Robot | None = None, cost: float = 0.0, concerns: tuple[int, ...] = (), **said: Any
+    ) -> "Hypothesis":
+        """With one more change, or under another robot, and the finding that says so."""
+        more = {"cost": cost, "concerns": concerns, "finding": wrong(**said)}
+        return Hypothesis.of(robot or self.robot, self.rows, (*self.changes, change), **more)
+
+    def applied(self, dataset: Dataset) -> Dataset:
+        """The same changes of another dataset."""
+        for change in self.changes:
+            dataset = change(dataset)
+        return dataset
 
     @property
     def score(self) -> float:
@@ -66,14 +103,13 @@ class Hypothesis:
 def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Finding]]:
     """The corrected log and one finding for each correction, chosen greedily. Needs a robot, without contacts."""
     assert inputs.robot is not None
-    given = inputs.rows()
-    now = _hypothesis(inputs.robot, Correction.none(given.nv), given)
+    now = Hypothesis.of(inputs.robot, inputs.rows(), (changed(),))
     found: list[Finding] = []
     for _ in range(MAX_CORRECTIONS):
         if not np.nanmax(now.fit.unexplained, initial=0.0) > EXPLAINED:
             break
         tried = (_torque_signs, _torque_places, _motion_units, _motion_signs, _motion_places, _gravity)
-        candidates = chain.from_iterable(candidates(now, given, inputs) for candidates in tried)
+        candidates = chain.from_iterable(candidates(now, inputs) for candidates in tried)
         best = max(candidates, key=lambda other: now.score - other.score - other.cost, default=None)
         if best is None or now.score - best.score - best.cost < GAIN or not _explains(now, best):
             break
@@ -92,13 +128,7 @@ def _explains(now: Hypothesis, best: Hypothesis) -> bool:
     return better and bool((after[known] < np.maximum(2.0 * before[known], 0.1)).all())
 
 
-def _hypothesis(robot: Robot, correction: Correction, given: Dataset, **more: Any) -> Hypothesis:
-    rows = correction.applied(given)
-    tau = inverse_dynamics(robot, rows)
-    return Hypothesis(robot=robot, correction=correction, rows=rows, tau=tau, fit=fit_torques(robot, tau, rows), **more)
-
-
-def _torque_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+def _torque_signs(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     """All joints whose torque fits with the other sign, together."""
     other = fit_torques(now.robot, now.tau, now.rows, -now.rows.u)
     with np.errstate(invalid="ignore"):
@@ -106,9 +136,11 @@ def _torque_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
         turned &= now.fit.unexplained > SMALLEST
     if not turned.any():
         return
-    joints = inputs.named(_places(turned))
-    signs = {"sign": {"u": tuple(np.where(turned, -1.0, 1.0))}}
-    finding = wrong(
+    joints, factor = inputs.named(_places(turned)), np.where(turned, -1.0, 1.0)
+    signs = {"sign": {"u": tuple(factor)}}
+    yield now.tried(
+        changed("u", factor=factor),
+        concerns=_places(turned),
         subject="torque sign",
         seen=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
         f"motion needs ({_remains(now.fit, other, turned)}).",
@@ -117,35 +149,35 @@ def _torque_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
         joints=joints,
         correction=signs,
     )
-    correction = now.correction.torque(np.arange(given.nv), np.where(turned, -1.0, 1.0))
-    yield _hypothesis(now.robot, correction, given, finding=finding, concerns=_places(turned))
 
 
-def _torque_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+def _torque_places(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     """Torques in the places of other joints: the assignment that leaves least unexplained."""
-    names, nv = inputs.names, given.nv
-
     left = unexplained_shares(now.robot, now.tau, now.rows)
     table = np.where(np.isfinite(left), np.log(np.clip(left, SMALLEST, 1.0)), 0.0)
     _, order = linear_sum_assignment(table)
-    moved = order != np.arange(nv)
+    moved = order != np.arange(len(order))
     if not moved.any():
         return
-    correction = now.correction.torque(order, np.ones(nv))
-    better = _hypothesis(now.robot, correction, given, cost=0.5, concerns=_places(moved))
-    text = ", ".join(f"that of {names[joint]} stands under {names[int(order[joint])]}" for joint in _places(moved))
-    finding = wrong(
+    joints, owners = inputs.named(_places(moved)), inputs.named(order[moved])
+    better = now.tried(
+        changed("u", order),
+        cost=0.5,
+        concerns=_places(moved),
         subject="joints exchanged",
-        seen=f"torques stand under wrong joints: {text} ({_remains(now.fit, better.fit, moved)}).",
+        seen="torques stand under wrong joints: "
+        + ", ".join(f"that of {joint} stands under {owner}" for joint, owner in zip(joints, owners, strict=True)),
         remedy="Correct the order of the torque columns.",
-        joints=inputs.named(_places(moved)),
+        joints=joints,
         numbers={"order": list(inputs.named(order))},
         correction={"order": {"u": tuple(int(place) for place in order)}},
     )
-    yield replace(better, finding=finding)
+    assert better.finding is not None
+    seen = f"{better.finding.seen} ({_remains(now.fit, better.fit, moved)})."
+    yield replace(better, finding=replace(better.finding, seen=seen))
 
 
-def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+def _motion_units(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     """Angles in degrees, or positions of one joint before its gear."""
     largest = np.abs(now.rows.q * inputs.rotates).max()
     places = np.arange(len(inputs.names))
@@ -154,8 +186,10 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
             alone = turned is not inputs.rotates
             if not turned.any() or (alone and (inputs.rotates.sum() == 1 or len(places) > ALL_TRIED)):
                 continue
-            units = {"unit": {"q": _degrees(given, "q", turned), "v": _degrees(given, "v", turned)}}
-            finding = wrong(
+            units = {"unit": {name: _degrees(inputs.log, name, turned) for name in "qv"}}
+            yield now.tried(
+                changed("qva", factor=np.where(turned, DEGREE, 1.0)),
+                cost=0.0 if turned.all() else 0.5,
                 subject="degrees",
                 seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
                 "for radians.",
@@ -163,71 +197,66 @@ def _motion_units(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterat
                 joints=inputs.named(_places(turned)),
                 correction=units,
             )
-            correction = now.correction.motion(places, np.where(turned, DEGREE, 1.0))
-            yield _hypothesis(now.robot, correction, given, finding=finding, cost=0.0 if turned.all() else 0.5)
     for joint, name in enumerate(inputs.names):
         if not now.fit.unexplained[joint] > STILL_UNEXPLAINED / 2:
             continue
         for ratio in GEARS:
-            finding = wrong(
+            slower = now.tried(
+                changed("qva", factor=np.where(places == joint, 1.0 / ratio, 1.0)),
+                cost=0.7,
+                concerns=(joint,),
                 subject="motion unit",
                 seen=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
                 "look like those of a motor before its gear.",
-                remedy="Divide the motion of this joint by its gear ratio (forcegp import --unit, or a factor).",
+                remedy=f"Divide the motion of this joint by its gear ratio (forcegp import --q '{name}/{ratio:g}').",
                 joints=(name,),
                 numbers={"factor": ratio},
             )
-            correction = now.correction.motion(places, np.where(places == joint, 1.0 / ratio, 1.0))
-            slower = _hypothesis(now.robot, correction, given, finding=finding, cost=0.7, concerns=(joint,))
             if 1.0 / NEARLY < slower.fit.factor[joint] < NEARLY:  # else any small motion with a large factor would do
                 yield slower
 
 
-def _motion_signs(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+def _motion_signs(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     """The motion of one joint, or all of that joint, in the other direction."""
-    places = np.arange(given.nv)
     for joint, name in enumerate(inputs.names):
         if not _worth(now, joint):
             continue
-        turned = np.where(places == joint, -1.0, 1.0)
-        motion = now.correction.motion(places, turned)
-        for seen, correction, signals in (
-            (f"positions and velocities of {name} have", motion, "qv"),
-            (f"the whole joint {name} (motion and torque) has", motion.torque(places, turned), "qvu"),
+        turned = np.where(np.arange(len(inputs.names)) == joint, -1.0, 1.0)
+        for what, signals in (
+            (f"positions and velocities of {name} have", "qv"),
+            (f"the whole joint {name} (motion and torque) has", "qvu"),
         ):
             signs = {"sign": dict.fromkeys(signals, tuple(turned))}
-            finding = wrong(
+            yield now.tried(
+                changed(f"{signals}a", factor=turned),
+                cost=1.0,
                 subject="motion sign",
-                seen=f"{seen} the opposite sign of the URDF's.",
+                seen=f"{what} the opposite sign of the URDF's.",
                 remedy=f"forcegp import {import_flags(signs)}, or turn the joint's axis in the URDF.",
                 joints=(name,),
                 correction=signs,
             )
-            yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
 
 
-def _motion_places(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+def _motion_places(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     """Two joints in each other's place: their motion, or all of them."""
-    ones = np.ones(given.nv)
-    for one, other in combinations([joint for joint in range(given.nv) if _worth(now, joint)], 2):
-        order = np.arange(given.nv)
+    nv = len(inputs.names)
+    for one, other in combinations([joint for joint in range(nv) if _worth(now, joint)], 2):
+        order = np.arange(nv)
         order[[one, other]] = order[[other, one]]
-        motion = now.correction.motion(order, ones)
-        for what, correction, signals in (
-            ("positions and velocities", motion, "qv"),
-            ("all signals", motion.torque(order, ones), "qvu"),
-        ):
-            finding = wrong(
+        for what, signals in (("positions and velocities", "qv"), ("all signals", "qvu")):
+            yield now.tried(
+                changed(f"{signals}a", order),
+                cost=1.0,
                 subject="joints exchanged",
                 seen=f"{what} of {listed(inputs.named((one, other)))} stand in each other's place.",
                 remedy="Correct the order of the columns, or the joint names of the log.",
                 joints=inputs.named((one, other)),
                 correction={"order": dict.fromkeys(signals, tuple(int(place) for place in order))},
             )
-            yield _hypothesis(now.robot, correction, given, finding=finding, cost=1.0)
 
 
-def _gravity(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hypothesis]:
+def _gravity(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     """The direction of gravity that the torques show: along an axis of the base, or as estimated."""
     nominal = now.robot.gravity.cpu().numpy()
     size = float(np.linalg.norm(nominal))
@@ -242,14 +271,16 @@ def _gravity(now: Hypothesis, given: Dataset, inputs: CheckInput) -> Iterator[Hy
             continue
         gravity = size * direction
         text = ", ".join(f"{value + 0.0:.3g}" for value in gravity)
-        finding = wrong(
+        yield now.tried(
+            changed(),
+            with_gravity(now.robot, gravity),
+            cost=cost,
             subject="gravity",
             seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
             f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",
             remedy=f"Give `gravity`={text.replace(' ', '')}.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
-        yield _hypothesis(with_gravity(now.robot, gravity), now.correction, given, finding=finding, cost=cost)
 
 
 def _degrees(given: Dataset, signal: str, turned: np.ndarray) -> tuple[str, ...]:

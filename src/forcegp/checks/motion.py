@@ -1,29 +1,26 @@
 """Are the rows even in time, and do q, v and a belong to each other."""
 
-import contextlib
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, GAP, CheckInput, Finding, import_flags, listed, look, ok
+from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.filtering import JITTER
+from forcegp.data.findings import Finding, Severity, import_flags, listed, look, ok
 from forcegp.data.row_selection import consecutive
 
 LOST = 1.8  # median steps at which at least one sample is missing
 MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
 LITTLE_LOST = 1e-4  # share that every logger loses
-VERY_UNEVEN = 2.0  # deviation of a step from the median, relative to it: samples were lost
 OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
 
 
 def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:
-    """Rate and duration; jitter; lost samples and gaps; repeated rows; what importing had to mend."""
+    """Rate and duration; jitter; lost samples and gaps; repeated rows."""
     log = inputs.log
     steps = np.diff(log.time)[consecutive(log)[:-1]]
     if not len(steps):
@@ -50,8 +47,6 @@ def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:
             numbers={"relative_deviation": spread},
         )
     yield from _repeated(inputs)
-    with contextlib.suppress(AttributeError, TypeError, ValueError):  # somebody else's metadata
-        yield from _imported(log.metadata)
 
 
 def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Finding]:
@@ -98,31 +93,6 @@ def _repeated(inputs: CheckInput) -> Iterator[Finding]:
     )
 
 
-def _imported(metadata: Mapping[str, Any]) -> Iterator[Finding]:
-    """What `forcegp import` found in the log files and repaired, from `metadata["import"]`."""
-    report = metadata.get("import")
-    if not isinstance(report, Mapping) or not report.get("recordings"):
-        return
-    logs = report["recordings"]
-    repeated = sum(item.get("repeated_stamps_dropped", 0) for item in logs)
-    gaps = sum(len(item.get("gaps", ())) for item in logs)
-    uneven = max(float(item.get("largest_deviation_of_a_step", 0.0)) for item in logs)
-    met = [f"{repeated} repeated time stamps (dropped)"] if repeated else []
-    met += [f"{gaps} gaps (split there)"] if gaps else []
-    if report.get("resampled_to_step") is not None and uneven > JITTER:
-        met.append(f"time steps up to {100.0 * uneven:.0f} % off their median (resampled)")
-    if not met:
-        return
-    often = gaps > 0 or repeated > 0 or uneven > VERY_UNEVEN
-    yield Finding(
-        severity="look" if often else "ok",
-        subject="import",
-        seen=f"importing {'the log' if len(logs) == 1 else f'{len(logs)} logs'} met {', '.join(met)}.",
-        remedy="Nothing is left to do in this dataset; look at the logger." if often else "",
-        numbers={"repeated_stamps": repeated, "gaps": gaps, "largest_deviation_of_a_step": uneven},
-    )
-
-
 RPM = np.pi / 30.0
 FACTORS = {
     1.0 / DEGREE: "deg/s where q is in rad, or q in rad where v is in deg/s",
@@ -154,14 +124,13 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
     if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
     pieces = [even.select_episodes([number]) for number in even.episodes]
-    found = []
-    for name, source, what, derivative in (("v", "q", "velocity", "dq/dt"), ("a", "v", "acceleration", "dv/dt")):
+    found: list[Finding] = []
+    for name, source in (("v", "q"), ("a", "v")):
         if name == "a" and any(finding.severity != "ok" for finding in found):
             break  # of wrong velocities nothing better can come
         compared = ((joint, _compared(pieces, name, source, joint)) for joint in range(even.nv))
         fits = {joint: fit for joint, fit in compared if fit is not None}
-        findings = [_finding(inputs, fit, joint, name, what, derivative) for joint, fit in fits.items()]
-        found += _merged([item for item in findings if item is not None], inputs.names)
+        found += _differences(inputs, name, source, fits)
         if not found and fits and name == "v":
             error = max(unexplained for _, _, unexplained in fits.values())
             seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
@@ -192,77 +161,63 @@ def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tupl
     return float(factor[best]), lowest(unexplained, SHIFTS), float(max(0.0, unexplained[best]))
 
 
-def _finding(
-    inputs: CheckInput, fit: tuple[float, float, float], joint: int, name: str, what: str, derivative: str
-) -> Finding | None:
-    factor, shift, unexplained = fit
-    label, source = inputs.names[joint], "q" if name == "v" else "v"
-    numbers = {"quantity": name, "factor": factor, "delay": shift if np.isfinite(shift) else None}
-    about = partial(Finding, subject=what, joints=(label,), numbers={**numbers, "unexplained": unexplained})
-    if unexplained > UNEXPLAINED:
-        return about(
-            severity="wrong" if name == "v" else "look",
-            seen=f"the {what} of {label} is not {derivative}: {100.0 * unexplained:.0f} % of its power is something "
-            "else.",
-            remedy=f"Check which column {name} was read from; or leave it out, so that it is computed from {source}.",
-        )
-    if unexplained < FEW and factor < 0.0:
-        return about(
-            severity="wrong",
-            seen=f"the {what} of {label} has the opposite sign of {derivative} (factor {factor:.3g}).",
-            remedy=f"Turn the sign of {name} or of {source} for this joint, whichever is wrong.",
-        )
-    if unexplained < FEW and abs(factor - 1.0) > CLOSE:
-        unit = next((unit for known, unit in FACTORS.items() if abs(factor / known - 1.0) < CLOSE), None)
-        guess = f": {name} looks like {unit}" if unit and name == "v" else ""
-        return about(
-            severity="wrong" if abs(factor - 1.0) > 4 * CLOSE else "look",
-            seen=f"the {what} of {label} is {factor:.4g} times {derivative}{guess}.",
-            remedy=f"Convert {name} or {source} to SI units, or remove the gear ratio.",
-        )
+def _differences(
+    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]]
+) -> Iterator[Finding]:
+    """One finding for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
-    if unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
-        return about(
-            severity="look",
-            seen=f"the {what} of {label} is logged {1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'} "
-            f"than {derivative}: {abs(shift) / step:.1f} time steps.",
-            remedy=f"It was filtered by the robot: compute {name} from positions (forcegp prepare --cutoff auto "
-            "--differentiate q).",
-        )
-    return None
-
-
-def _merged(findings: list[Finding], names: tuple[str, ...]) -> list[Finding]:
-    """One finding for all joints where they are the same."""
-    kinds: dict[tuple, list[Finding]] = {}
-    for item in findings:
-        factor = item.numbers["factor"]
-        kind = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), None) or np.sign(factor)
-        kinds.setdefault((item.severity, item.subject, item.remedy, kind), []).append(item)
-    merged = []
-    for group in kinds.values():
-        first = group[0]
-        joints = tuple(name for item in group for name in item.joints)
-        every = joints == names and len(names) > 2
-        seen = first.seen.replace(first.joints[0], "all joints" if every else listed(joints))
-        factors = [item.numbers["factor"] for item in group]
-        alike = max(factors) - min(factors) < CLOSE * abs(factors[0])
-        each = "" if alike else f" Factors: {', '.join(f'{factor:.3g}' for factor in factors)}."
-        numbers = {"each": [dict(item.numbers) for item in group]} if group[1:] else first.numbers
-        correction = _correction(first, joints, names)
-        flags = import_flags(correction)
-        remedy = f"forcegp import {flags}; or {first.remedy[0].lower()}{first.remedy[1:]}" if flags else first.remedy
-        more = {"seen": f"{seen}{each}" if group[1:] else first.seen, "remedy": remedy, "correction": correction}
-        merged.append(replace(first, joints=joints, numbers=numbers, **more))
-    return merged
-
-
-def _correction(first: Finding, joints: tuple[str, ...], names: tuple[str, ...]) -> dict[str, Any]:
-    """The unit or sign of v of these joints that would make it dq/dt; nothing where that is not the mistake."""
-    factor = first.numbers["factor"]
-    if first.severity != "wrong" or first.subject != "velocity" or first.numbers["unexplained"] > FEW:
-        return {}
-    if abs(factor + 1.0) < CLOSE:
-        return {"sign": {"v": tuple(-1.0 if name in joints else 1.0 for name in names)}}
-    unit = next((unit for known, unit in UNITS.items() if abs(factor / known - 1.0) < CLOSE), None)
-    return {"unit": {"v": (unit,)}} if unit is not None and joints == names else {}
+    groups: dict[tuple[str, float], list[int]] = {}
+    for joint, (factor, shift, unexplained) in fits.items():
+        known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
+        if unexplained > UNEXPLAINED:
+            groups.setdefault(("other", 0.0), []).append(joint)
+        elif unexplained < FEW and factor < 0.0:
+            groups.setdefault(("sign", 0.0), []).append(joint)
+        elif unexplained < FEW and abs(factor - 1.0) > CLOSE:
+            groups.setdefault(("factor", known), []).append(joint)
+        elif unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
+            groups.setdefault(("late", 0.0), []).append(joint)
+    what = "velocity" if name == "v" else "acceleration"
+    for (kind, known), joints in groups.items():
+        factor, shift, unexplained = fits[joints[0]]
+        named, every = inputs.named(joints), len(joints) == len(inputs.names) > 2
+        one = f"the {what} of {'all joints' if every else listed(named)} is"
+        severity: Severity = "wrong"
+        seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
+        remedy = f"Check which column {name} was read from; or leave it out, so that it is computed from {source}."
+        if kind == "other" and name == "a":
+            severity = "look"
+        elif kind == "sign":
+            seen = f"{one} of the opposite sign of d{source}/dt (factor {factor:.3g})."
+            remedy = f"Turn the sign of {name} or of {source} for this joint, whichever is wrong."
+        elif kind == "factor":
+            severity = "wrong" if abs(factor - 1.0) > 4 * CLOSE else "look"
+            guess = f": {name} looks like {FACTORS[known]}" if known and name == "v" else ""
+            seen = f"{one} {factor:.4g} times d{source}/dt{guess}."
+            remedy = f"Convert {name} or {source} to SI units, or remove the gear ratio."
+        elif kind == "late":
+            severity, late = "look", "later" if shift > 0 else "earlier"
+            seen = (
+                f"{one} logged {1e3 * abs(shift):.1f} ms {late} than d{source}/dt: {abs(shift) / step:.1f} time steps."
+            )
+            remedy = (
+                f"It was filtered by the robot: compute {name} from positions (forcegp import --cutoff auto "
+                "--differentiate q)."
+            )
+        factors = [fits[joint][0] for joint in joints]
+        if max(factors) - min(factors) >= CLOSE * abs(factor):
+            seen += f" Factors: {', '.join(f'{each:.3g}' for each in factors)}."
+        correction: dict[str, Any] = {}
+        if name == "v" and severity == "wrong" and kind == "sign" and abs(factor + 1.0) < CLOSE:
+            correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
+        elif name == "v" and severity == "wrong" and known in UNITS and named == inputs.names:
+            correction = {"unit": {"v": (UNITS[known],)}}
+        if correction:
+            remedy = f"forcegp import {import_flags(correction)}; or {remedy[0].lower()}{remedy[1:]}"
+        each = [
+            {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
+            for f, s, left in (fits[joint] for joint in joints)
+        ]
+        numbers = each[0] if len(each) == 1 else {"each": each}
+        yield Finding(severity=severity, subject=what, seen=seen, remedy=remedy, joints=named, numbers=numbers,
+                      correction=correction)  # fmt: skip

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.checks.check_input import Finding, import_flags, look, ok, wrong
-from forcegp.checks.successive_rows import whole_windows
 from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
+from forcegp.data.findings import Finding, import_flags, look, ok, wrong
 from forcegp.data.row_selection import consecutive
+from forcegp.data.successive_rows import whole_windows
 from forcegp.model import Model
 from forcegp.robots.manifold import Group, difference, pose
 
@@ -161,26 +161,21 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     if found <= CARRIED * weight:
         return
     numbers, weighs = {"force": found, "weight": weight}, f"(the robot weighs {weight:.3g} N)"
-    if not thrusters and found > THOUSANDS * weight:
-        yield wrong(
-            subject="base force",
-            seen=f"{group.name!r} moves under {found:.3g} N that nothing in the model explains {weighs}.",
-            remedy="Are positions of the base in mm? Then give their unit, as in forcegp import --unit q=mm,v=mm/s.",
-            numbers=numbers,
-        )
-        return
     if not thrusters:
-        yield wrong(
-            subject="base force",
-            seen=f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, "
-            f"no foot that stands and no thruster {weighs}.",
-            remedy="Let forcegp import --feet name what stands, and compare "
-            f"{', '.join(sorted(map(str, feet)))} with heights."
-            if feet
-            else "Describe them in Python (docs/how-to/moving-bases.md), write model.to_json() into a file, and "
-            "take it in the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto.",
-            numbers=numbers,
+        remedy = (
+            "Describe them in Python (docs/how-to/moving-bases.md), write model.to_json() into a file, and take it in "
+            "the place of the robot: forcegp import LOG --identified FILE, and so with forcegp auto."
         )
+        if found > THOUSANDS * weight:
+            remedy = "Are positions of the base in mm? Then give their unit, as in forcegp import --unit q=mm,v=mm/s."
+        elif feet:
+            named = ", ".join(sorted(map(str, feet)))
+            remedy = f"Let forcegp import --feet name what stands, and compare {named} with heights."
+        seen = (
+            f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, no foot "
+            f"that stands and no thruster {weighs}."
+        )
+        yield wrong(subject="base force", seen=seen, remedy=remedy, numbers=numbers)
         return
     seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
     still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
@@ -193,25 +188,15 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         "a quaternion w, x, y, z": (turned, u, order),
         "a quaternion w, x, y, z and rotor speeds in rpm": (turned, slower, order | unit),
     }
-    for what, (rotation, speeds, correction) in readings.items():
+    kind, correction = look, dict[str, dict[str, tuple[str, ...]]]()
+    remedy = "Check the unit of u, the mass, coefficients of thrust and the axes of a; leave out rows on the ground."
+    for what, (rotation, speeds, stated) in readings.items():
         left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
         if left < CLEARLY * min(found, weight):
-            remedy = f"forcegp import {import_flags(correction)}."
-            numbers[what] = left
-            yield wrong(
-                subject="base force",
-                seen=f"{seen}; with {what} {left:.3g} N.",
-                remedy=remedy,
-                correction=correction,
-                numbers=numbers,
-            )
-            return
-    yield look(
-        subject="base force",
-        seen=f"{seen}.",
-        remedy="Check the unit of u, the mass, coefficients of thrust and the axes of a; leave out rows on the ground.",
-        numbers=numbers,
-    )
+            kind, correction, remedy = wrong, stated, f"forcegp import {import_flags(stated)}."
+            numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
+            break
+    yield kind(subject="base force", seen=f"{seen}.", remedy=remedy, correction=correction, numbers=numbers)
 
 
 def _stated_axes(dataset: Dataset) -> tuple[str, str]:

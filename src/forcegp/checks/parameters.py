@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.checks.check_input import Finding, look
 from forcegp.checks.torques import SLOW, columns_of, inverse_dynamics, with_gravity
 from forcegp.data import Dataset
+from forcegp.data.findings import Finding, look
 from forcegp.robots import Robot
 
 GAIN = np.log(2.5)  # by which the product over the joints of what remains unexplained must fall
@@ -157,37 +157,31 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
             inertias[body, :, :, 0] -= part
             text = f"the torques fit a mass of {link} of {{:.3g}} times that of the URDF"
             yield factor("masses", text.format, with_tree(inertias=inertias), joints=(name,))
-    # lengths: of the joint's own origin, or of the whole link
     powers = np.array([0.5, 1.0, 2.0])
     quadratic = np.stack([FACTORS**0, FACTORS, FACTORS**2], axis=1) @ np.linalg.inv(
         np.stack([powers**0, powers, powers**2], axis=1)
     )
-    for body, (name, link) in enumerate(bodies):
+    for body, (name, _) in enumerate(bodies):
         length = float(torch.linalg.vector_norm(tree.rest[body, :3, 3, 0]))
-        for whole in (False, True):
-            if not whole and (length == 0.0 or layout.parents[body] < 0):
-                continue  # where the whole robot stands changes nothing
-            taus = []
-            for x in powers:
-                rest, inertias = tree.rest.clone(), tree.inertias.clone()
-                if whole:  # the link of this joint with everything on it
-                    stretch = torch.diag(torch.tensor([x, x, x, 1.0], dtype=rest.dtype, device=rest.device))
-                    inertias[body, :, :, 0] = stretch @ inertias[body, :, :, 0] @ stretch
-                    for child, parent in enumerate(layout.parents):
-                        if parent == body:
-                            rest[child, :3, 3] *= x
-                else:
-                    rest[body, :3, 3] *= x
-                taus.append(with_tree(rest=rest, inertias=inertias))
-
-            def seen(x: float, name: str = name, link: str = link, whole: bool = whole, length: float = length) -> str:
-                if whole:
-                    return f"the torques fit {x:.3g} times the length of {link}"
-                what = f"the length from {name} to the joint before ({x * length:.3g} instead of {length:.3g} m)"
-                return f"the torques fit {x:.3g} times {what}"
-
-            lengths = {"values": FACTORS, "weights": quadratic, "taus": np.stack(taus)}
-            yield Variation(subject="lengths", seen=seen, **lengths, cost=0.2, joints=(name,))
+        if length == 0.0 or layout.parents[body] < 0:
+            continue  # where the whole robot stands changes nothing
+        taus = []
+        for x in powers:
+            rest = tree.rest.clone()
+            rest[body, :3, 3] *= x
+            taus.append(with_tree(rest=rest))
+        yield Variation(
+            subject="lengths",
+            seen=lambda x, name=name, length=length: (
+                f"the torques fit {x:.3g} times the length from {name} to the joint before ({x * length:.3g} instead "
+                f"of {length:.3g} m)"
+            ),
+            values=FACTORS,
+            weights=quadratic,
+            taus=np.stack(taus),
+            cost=0.2,
+            joints=(name,),
+        )
     yield from _zeros(robot, rows)
     yield from _gravity(robot, rows, tau)
 

@@ -7,18 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import (
-    SEVERITIES,
-    CheckInput,
-    Finding,
-    Severity,
-    import_flags,
-    listed,
-    look,
-    numbers_of,
-    worst,
-)
-from forcegp.checks.dynamics import dynamics_findings
+from forcegp.checks.check_input import CheckInput, numbers_of
 from forcegp.checks.excitation import excitation_findings, noise_findings, stated_noise_findings, torque_noise
 from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
 from forcegp.checks.motion import motion_findings, sampling_findings
@@ -28,8 +17,9 @@ from forcegp.checks.signals import signal_findings
 from forcegp.checks.stance import gravity_findings, stance_findings, unmeasured_base_findings
 from forcegp.checks.torque_findings import not_compared, torque_findings
 from forcegp.data import Dataset, Preparation, contact_doubts
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.findings import SEVERITIES, Finding, Severity, import_flags, listed, look, worst
 from forcegp.errors import InvalidInput, require_type
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -71,20 +61,6 @@ def robot_findings(robot: Robot) -> Iterator[Finding]:
                 remedy="Check the units of this link (kg, m, kg m²).",
                 numbers={"gyration": gyration, "center": center, "reach": reach},
             )
-
-
-def contact_findings(inputs: CheckInput, model: Model | None) -> list[Finding]:
-    """Contacts beside which the motion runs, whose force acts elsewhere or not at all, or that are missing."""
-    return [
-        Finding(
-            severity="wrong" if doubt.kind == "off" else "look",
-            subject="contact",
-            seen=doubt.seen,
-            remedy=doubt.remedy,
-            numbers={"kind": doubt.kind, **doubt.numbers},
-        )
-        for doubt in contact_doubts(inputs.mended, model)
-    ]
 
 
 BEFORE_A_FIT = frozenset(
@@ -176,11 +152,6 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
             return CheckReport(findings=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
     inputs = CheckInput.of(dataset, model, preparation)
     findings, comparison = _findings(inputs, model)
-    if comparison is not None and "torque unit" not in {each.subject for each in findings if each.severity == "wrong"}:
-        shown = list(dynamics_findings(inputs, comparison))
-        if "payload" in {each.subject for each in shown}:  # which explains a heavy last link better than a factor
-            findings = [each for each in findings if each.subject != "masses" or each.joints != inputs.names[-1:]]
-        findings += shown
     if inputs.robot is not None:
         findings += robot_findings(inputs.robot)
     if inputs.prepared is not None:
@@ -211,7 +182,7 @@ def _findings(inputs: CheckInput, model: Model | None) -> tuple[list[Finding], H
     findings = [*signal_findings(inputs), *stated_noise_findings(inputs)]
     if inputs.log.time_ordered:
         findings = [*sampling_findings(inputs), *findings, *motion_findings(inputs)]
-    contacts = contact_findings(inputs, model)
+    contacts = contact_doubts(inputs.mended, model)
     findings += [*contacts, *(stance_findings(inputs.log, model) if model is not None else ())]
     comparison = None
     if inputs.compared is None:

@@ -5,11 +5,12 @@ from itertools import chain
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput, Finding, listed, look, wrong
-from forcegp.checks.successive_rows import runs
+from forcegp.checks.check_input import CheckInput
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.findings import Finding, listed, look, wrong
 from forcegp.data.row_selection import consecutive
+from forcegp.data.successive_rows import runs
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}

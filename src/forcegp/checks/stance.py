@@ -1,15 +1,13 @@
 """Contacts that act in some rows only: does the motion support what their flags say?"""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
 
-from forcegp.checks.check_input import Finding, listed, look, ok, wrong
 from forcegp.data import Dataset, estimate_stance
-from forcegp.data.gravity import missing_gravity
-from forcegp.data.stance import TILTS, tilting
+from forcegp.data.findings import Finding, look, ok, wrong
+from forcegp.data.stance import TILTS, missing_gravity, tilting
 from forcegp.errors import ContactError
 from forcegp.model import Model
 
@@ -36,11 +34,7 @@ def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         return
     found = estimate_stance(dataset, model)
     leans = tilting(dataset, model, found.names, dataset.u[:, [model.inputs.index(name) for name in found.names]])
-    shared = {name: finding for name in found.names for finding in _shared_flag(dataset, model, name, every)}
-    yield from shared.values()
     for k, name in enumerate(found.names):
-        if name in shared:
-            continue
         logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
         frame = next(contact.frame for contact in model.contacts if contact.switch == name)
         stands = logged > 0.5
@@ -51,7 +45,7 @@ def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
                 seen=f"{frame!r}, which is held flat, leans by more than {TILTS:g} rad in {leaning:.0%} of the rows in "
                 f"which {name!r} is 1, row {every * int(np.flatnonzero(leans[:, k])[0])} for example: its heel or "
                 "toe turns.",
-                remedy="forcegp prepare log.h5 --stance auto --out data.h5 leaves these rows out; for a foot that is "
+                remedy="forcegp import log.h5 --stance auto --out data.h5 leaves these rows out; for a foot that is "
                 "never flat give the point that it stands on, --feet FRAME@x,y,z.",
                 numbers={"leaning": leaning},
             )
@@ -67,52 +61,24 @@ def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         sliding, rests = (float(x.sum() / max(y.sum(), 1)) for x, y in ((lifted, stands), (resting, ~stands)))
         numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "resting while free": rests}
         numbers |= {"limit": float(found.slow[k]), "open": float(np.isnan(shown).mean())}
+        kind, seen, remedy = ok, f"{name!r} agrees with motion and forces.", ""
         if sliding > RARE:
-            worst = int(np.flatnonzero(lifted)[speed[lifted].argmax()])
-            yield (wrong if sliding > FEW else look)(
-                subject="contact flag",
-                seen=f"{name!r} holds {frame!r} in rows in which it moves or bears nothing: {sliding:.1%} of them, row "
-                f"{every * worst} with {speed[worst]:.2g} m/s and {found.force[worst, k]:.2g} N.",
-                remedy="Set the flag to 0 where the foot slides or is lifted (forcegp prepare --stance auto finds such "
-                "rows), and compare its time with that of the joints; a wrong foot point or joint offset shows the "
-                "same.",
-                numbers=numbers,
+            row = int(np.flatnonzero(lifted)[speed[lifted].argmax()])
+            kind = wrong if sliding > FEW else look
+            seen = (
+                f"{name!r} holds {frame!r} in rows in which it moves or bears nothing: {sliding:.1%} of them, row "
+                f"{every * row} with {speed[row]:.2g} m/s and {found.force[row, k]:.2g} N."
+            )
+            remedy = (
+                "Set the flag to 0 where the foot slides or is lifted (forcegp import --stance auto finds such rows), "
+                "and compare its time with that of the joints; a wrong foot point or joint offset shows the same."
             )
         elif rests > RESTING:
             row = every * int(np.flatnonzero(resting)[0])
-            yield look(
-                subject="contact flag",
-                seen=f"{name!r} is 0 in rows of which {rests:.0%} show {frame!r} at rest, row {row} for example.",
-                remedy="A foot at rest may stand: compare the flag with contact forces or heights.",
-                numbers=numbers,
-            )
-        elif not odd:
-            yield ok(subject="contact flag", seen=f"{name!r} agrees with motion and forces.", numbers=numbers)
-
-
-def _shared_flag(dataset: Dataset, model: Model, name: str, every: int) -> Iterator[Finding]:
-    """Feet of this flag of which only some stand, by flags of their own."""
-    frames = list(dict.fromkeys(contact.frame for contact in model.contacts if contact.switch == name))
-    if len(frames) < 2:
-        return
-    own = {frame: f"{name} {frame}" for frame in frames}
-    contacts = [replace(each, switch=own[each.frame]) if each.switch == name else each for each in model.contacts]
-    apart = model.with_contacts(contacts)
-    places = [model.inputs.index(x if x in model.inputs else name) for x in apart.inputs]
-    found = estimate_stance(replace(dataset, model=apart, u=dataset.u[:, places], truth={}))
-    flags = found.flags[:, [found.names.index(switch) for switch in own.values()]]
-    some = (flags == 1.0).any(axis=1) & (flags == 0.0).any(axis=1)
-    if some.mean() > FEW:
-        row = int(np.flatnonzero(some)[0])
-        standing = listed([repr(frame) for frame, flag in zip(frames, flags[row], strict=True) if flag == 1.0])
-        yield wrong(
-            subject="contact flag",
-            seen=f"{name!r} is the flag of {listed(list(map(repr, frames)))}, of which only some stand in "
-            f"{some.mean():.0%} of the rows, row {every * row} for example: {standing} alone.",
-            remedy=f"Give each foot a flag of its own, as forcegp import --feet {','.join(frames)} does (FRAME:flat "
-            "for flat feet): without columns for them, it finds the flags.",
-            numbers={"apart": float(some.mean())},
-        )
+            kind, remedy = look, "A foot at rest may stand: compare the flag with contact forces or heights."
+            seen = f"{name!r} is 0 in rows of which {rests:.0%} show {frame!r} at rest, row {row} for example."
+        if kind is not ok or not odd:
+            yield kind(subject="contact flag", seen=seen, remedy=remedy, numbers=numbers)
 
 
 def gravity_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:

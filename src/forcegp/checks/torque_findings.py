@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput, Finding, listed, look, ok, wrong
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT
+from forcegp.data.findings import Finding, listed, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.summary import plain
 
@@ -115,7 +116,7 @@ def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
     assert inputs.compared is not None
     if inputs.prepared is None:
         return  # without an order
-    data = log.correction.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared.dataset)
+    data = log.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared.dataset)
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:
@@ -144,7 +145,7 @@ def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, rem
         f"remains.{friction}",
         remedy="If the other joints show none, leave it: shifting one joint can hide friction."
         if one
-        else "forcegp prepare --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
+        else "forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
         joints=names,
         numbers={"delay": seconds, "std": std, "remains": remains, "per_joint": plain(delay.seconds)},
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
 from forcegp.data import Dataset
@@ -21,36 +21,6 @@ CONSTANT = 1e-24  # variance relative to the square below which a torque is cons
 RESTS_ON_ROBOT = 0.5
 POOR = 0.2
 SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Correction:
-    """Which column, by which factor, each joint's motion (q, v, a) and torque is to be taken from: (nv,) each."""
-
-    motion_from: Int[np.ndarray, " nv"]
-    motion_factor: Float[np.ndarray, " nv"]
-    torque_from: Int[np.ndarray, " nv"]
-    torque_factor: Float[np.ndarray, " nv"]
-
-    @classmethod
-    def none(cls, nv: int) -> "Correction":
-        """Everything stays."""
-        order, ones = np.arange(nv), np.ones(nv)
-        return cls(motion_from=order, motion_factor=ones, torque_from=order, torque_factor=ones)
-
-    def motion(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> "Correction":
-        """Then motions in another order, by further factors."""
-        return replace(self, motion_from=self.motion_from[order], motion_factor=self.motion_factor[order] * factor)
-
-    def torque(self, order: Int[np.ndarray, " nv"], factor: Float[np.ndarray, " nv"]) -> "Correction":
-        """Then torques in another order, by further factors."""
-        return replace(self, torque_from=self.torque_from[order], torque_factor=self.torque_factor[order] * factor)
-
-    def applied(self, dataset: Dataset) -> Dataset:
-        """The corrected log, without robot, truth and metadata, which belong to it as it was."""
-        moved = {name: getattr(dataset, name)[:, self.motion_from] * self.motion_factor for name in ("q", "v", "a")}
-        u = dataset.u[:, self.torque_from] * self.torque_factor
-        return replace(dataset, **moved, u=u, model=None, noise_std=None, truth={}, metadata={})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

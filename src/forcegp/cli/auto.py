@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import time
 from collections.abc import Mapping
@@ -16,10 +15,9 @@ from tyro.conf import arg
 import forcegp
 import forcegp.checks
 import forcegp.data
-import forcegp.evaluation
 import forcegp.evidence
 import forcegp.report
-import forcegp.validation
+import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.auto_answer import (
     answer_lines,
@@ -29,25 +27,26 @@ from forcegp.cli.auto_answer import (
     payload_text,
     short_name,
 )
-from forcegp.cli.command import CONFIG, FIELDS, URDF, Resuming, listed, unless_given
+from forcegp.cli.command import CONFIG, URDF, Resuming, unless_given
 from forcegp.cli.fit import write_estimates
-from forcegp.cli.import_log import Import
-from forcegp.cli.input_options import forces_of
+from forcegp.cli.import_log import LogOptions
+from forcegp.cli.input_options import CandidateOptions, forces_of
 from forcegp.cli.payload import payload_dict, with_payload
 from forcegp.cli.terminal import Terminal, facts, findings_table
-from forcegp.errors import CompilerError, DatasetError, FitError, InvalidInput, MistakenUnit, NumericalError
+from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 
 MOST_CORRECTIONS = 8
-MODELS = "the URDF, identified, with friction or air forces learned"
+SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "against_rival", "failures")
+"""What the answer holds of the scores."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Auto(Resuming, Import):
-    """From logs and a robot to a validated model: import, check, prepare, identify, learn, validate, report.
+class Auto(CandidateOptions, Resuming, LogOptions):
+    """From logs and a robot to a validated model: import, check, prepare, identify, learn, score, report.
 
     Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
     corrects them at once. The folder gets the model of the recommended kind, learned from all rows: model, for
-    forcegp evaluate, rollout and monitor, and c with its C code. Beside them are report.html, identified.urdf,
+    forcegp score and monitor, and c with its C code. Beside them are report.html, identified.urdf,
     payload.json, the comparison (validation/report.md) and the dataset. A run that was interrupted resumes.
 
     For example:
@@ -65,16 +64,14 @@ class Auto(Resuming, Import):
     """Correct mistakes in units, signs and the order of joints, and continue."""
     accept: bool = False
     """Continue although the log contains mistakes."""
-    models: Annotated[tuple[str, ...], listed("NAME,...", MODELS, goes_on=FIELDS)] = ()
-    """What is compared, as for forcegp validate."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """Where a payload may be."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
     """Delay of u in the log, in s. auto: estimated where u are the torques of all joints and nothing is touched, else
     0."""
-    lag: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    lag: Annotated[str, arg(metavar="S|auto")] = "auto"
     """Time constant in s with which actuators follow u. auto: estimated for thrusters, 0 for joints."""
     every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
@@ -95,29 +92,27 @@ class Auto(Resuming, Import):
         assert model is not None
         for note in forces_of(model):
             terminal.note(note)
-        path = self.out.parent / f".{self.out.name}.log.h5"
-        with contextlib.ExitStack() as cleanup:
-            cleanup.callback(path.unlink, missing_ok=True)  # where the log is refused
-            dataset, done, mapping, mistakes = self._imported(terminal, model, mapping, path)
-            corrected = self._command(mapping)
-            if mistakes and not self.correct:
-                terminal.show(findings_table(mistakes, terminal.worded), "Run:")
-                terminal.command(corrected)
-                raise DatasetError(
-                    f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
-                )
-            terminal.names_stages = True  # of minutes, most of which have nothing to count
-            with terminal.progress("checking"):
-                report = forcegp.check(dataset)
-            wrong = [finding for finding in report.findings if finding.severity == "wrong"]
-            if wrong and not self.accept:
-                terminal.show(findings_table(wrong, terminal.worded))
-                raise DatasetError(
-                    f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
-                    "add --accept to continue."
-                )
-            self.out.mkdir(parents=True, exist_ok=True)
-            path.replace(self.out / "log.h5")
+        dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
+        corrected = self._command(mapping)
+        if mistakes and not self.correct:
+            terminal.show(findings_table(mistakes, terminal.worded), "Run:")
+            terminal.command(corrected)
+            raise DatasetError(
+                f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
+            )
+        terminal.names_stages = True  # of minutes, most of which have nothing to count
+        with terminal.progress("checking"):
+            report = forcegp.check(dataset)
+        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
+        if wrong and not self.accept:
+            terminal.show(findings_table(wrong, terminal.worded))
+            raise DatasetError(
+                f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
+                "add --accept to continue."
+            )
+        self.out.mkdir(parents=True, exist_ok=True)
+        with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
+            dataset.save(temporary)
         with terminal.progress("preparing"):
             if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
                 timed = self.with_delay_that_shows(terminal, preparation, dataset)
@@ -125,20 +120,20 @@ class Auto(Resuming, Import):
                 timed = replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
-        named = forcegp.evaluation.named_model
+        named = forcegp.scores.named_model
         assert recording.model is not None, "it has one"
         expression, _, evidence = identification(model).partition("@")
-        laws = forcegp.evaluation.summands(expression)
+        laws = forcegp.scores.summands(expression)
         with terminal.progress("identifying", may_end_early=True) as progress:
             how: dict[str, Any] = {"evidence": forcegp.evidence.parse_evidence(evidence), "report": progress}
-            identified: Any = forcegp.evaluation.learn(named(recording.model, laws), recording, **how)[0]
+            identified: Any = forcegp.scores.learn(named(recording.model, laws), recording, **how)[0]
         with terminal.progress("looking for a payload", may_end_early=True) as progress:
             try:
                 payload = with_payload(named(recording.model, laws[1:]), recording, self.link, report=progress)
                 held = payload_text(payload)
             except DatasetError as error:
                 payload, held = None, f"not estimated: {error}"
-        document, posterior = self._validated(terminal, rows, recording, model)
+        scores, posterior = self._scored(terminal, rows, recording, model)
         content: dict[str, Any] = {
             "out": str(self.out),
             "seconds": sum(each["seconds"] for each in done["recordings"]),
@@ -148,14 +143,13 @@ class Auto(Resuming, Import):
             "preparation": settings,
             "payload": None if payload is None else payload_dict(payload, False),
             "identified": identified.estimates.to_dict(),
-            **{name: document[name] for name in ("models", "joint_names", "units")},
-            "recommended": forcegp.validation.recommended(document),
+            **{name: value for name, value in scores.to_dict().items() if name in SCORES},
             "code": self._code(terminal, posterior),
         }
-        answer = answer_lines(content, dataset, identified, held)
-        best = best_sentence(content, dataset)
+        answer = answer_lines(content, dataset, identified, held, scores)
+        best = best_sentence(scores, dataset)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
-        self._write_report(terminal, posterior, recording, content, answer)
+        self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
         write_json(self.out / "payload.json", content["payload"] or {})
         write_estimates(self.out, identified)
@@ -164,16 +158,15 @@ class Auto(Resuming, Import):
         return content
 
     def _imported(
-        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping, path: Path
+        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
         mistakes: list[forcegp.checks.Finding] = []
         for _ in range(MOST_CORRECTIONS):
             try:
-                with terminal.progress("importing") as progress, atomic_file(path, overwrite=True) as temporary:
-                    done = forcegp.import_recordings(
-                        self.logs, temporary, mapping, model=model, options=self._options(), report=progress
-                    )
+                with terminal.progress("importing") as progress:
+                    how: dict[str, Any] = {"model": model, "options": self._options(), "report": progress}
+                    dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
                 mistakes.append(
@@ -187,11 +180,10 @@ class Auto(Resuming, Import):
                 )
                 mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
                 continue
-            dataset, undecided = forcegp.Dataset.load(path), None
+            done = dict(dataset.metadata["import"])
             if done["open_switches"]:
                 try:
                     dataset = forcegp.data.estimate_stance(dataset).filled(dataset)
-                    dataset.save(path)
                 except DatasetError as error:  # of a mistake, perhaps
                     undecided = error
             found = [finding for finding in forcegp.checks.quick_check(dataset) if finding.correction]
@@ -237,38 +229,28 @@ class Auto(Resuming, Import):
             rows.dataset.save(temporary)
         return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
 
-    def _validated(
+    def _scored(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model
-    ) -> tuple[Mapping[str, Any], forcegp.posterior.Posterior]:
-        """The comparison of the models, and the recommended one, learned from all rows and stored."""
-        comparison = forcegp.Comparison(
-            rows,
-            recording,
-            model,
-            forcegp.split_named(rows, "auto"),
-            points=min(100, len(rows) // 4),
-            identification=identification(model),
-            restarts=1,
-        )
-        models = self.models or default_models(model)
-        with terminal.progress("validating") as report:
-            found = forcegp.validate(
-                comparison, self.out / "validation", models=models, seeds=1, overwrite=self.overwrite, progress=report
-            )
-        for name, told in found.document["models"].items():
-            for failure in told["failures"]:
-                terminal.warn(f"{name} was not fitted: {failure['error']}")
+    ) -> tuple[forcegp.Scores, forcegp.posterior.Posterior]:
+        """The scores of the models, and the recommended one, learned from all rows and stored."""
+        how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
+        how |= {"points": min(100, len(rows) // 4), "restarts": 1}
+        models = self.candidates() or default_models(model)
+        with terminal.progress("scoring") as report:
+            scores = forcegp.score(
+                models, rows, split="auto", seeds=1, folder=self.out / "validation", overwrite=self.overwrite,
+                progress=report, **how,
+            )  # fmt: skip
+        for failure in scores.failures:
+            terminal.warn(failure)
         with terminal.progress("learning from all rows"):
-            best = forcegp.validation.recommended(found.document)
-            if best is None:
-                raise FitError(f"no model was fitted; {self.out / 'validation' / 'report.md'} has the reasons.")
-            posterior = forcegp.validation.fitted_on_all_rows(comparison, best)
+            posterior = scores.fitted_on_all_rows()
         with terminal.progress("intervals of motions") as report:
-            posterior, why_not = forcegp.evaluation.with_intervals_of_motions(posterior, recording, report)
+            posterior, why_not = forcegp.scores.with_intervals_of_motions(posterior, recording, report)
         if why_not is not None:
             terminal.note(why_not)
         forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
-        return found.document, posterior
+        return scores, posterior
 
     def _write_report(
         self,
@@ -277,11 +259,12 @@ class Auto(Resuming, Import):
         recording: forcegp.Dataset,
         content: Mapping[str, Any],
         answer: list[tuple[str, str]],
+        scores: forcegp.Scores,
     ) -> None:
         """The page to send around."""
         posterior, recording = forcegp.posterior.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
-        names = {name: short_name(name) for name in content["models"]}
+        names = {name: short_name(name) for name in scores.models}
         following = [forcegp.report.Finding("Record the most informative motion:", command)]
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
@@ -290,8 +273,8 @@ class Auto(Resuming, Import):
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
                 findings=[forcegp.report.Finding(*line) for line in answer],
-                pictures=forcegp.report.validation_pictures(content),
-                tables=[forcegp.report.validation_table(content, names)],
+                pictures=forcegp.report.scores_pictures(scores),
+                tables=[forcegp.report.scores_table(scores, names)],
                 next_steps=following if command.startswith("forcegp") else [],
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
@@ -305,7 +288,7 @@ class Auto(Resuming, Import):
         """The folder of the model's C program; None where there is no compiler, or none of this model."""
         try:
             with terminal.progress("writing C"), atomic_folder(self.out / "c", overwrite=True) as folder:
-                forcegp.export_c(cast(forcegp.posterior.StructuredPosterior, posterior), folder)
+                forcegp.export_c(cast(forcegp.posterior.Posterior, posterior), folder)
         except (CompilerError, InvalidInput, NumericalError) as error:
             terminal.note(f"no C program: {error}")
             return None

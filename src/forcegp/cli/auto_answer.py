@@ -26,7 +26,7 @@ def short_name(name: str) -> str:
 
 
 def identification(model: forcegp.Model) -> str:
-    """What is found of the robot by itself, as `forcegp validate --identification` takes it."""
+    """What is found of the robot by itself, as `forcegp score --identification` takes it."""
     laws = f"+{'+'.join(LAWS)}" if model.robot.single_joint_names else ""
     return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
 
@@ -40,7 +40,7 @@ def default_models(model: forcegp.Model) -> tuple[str, ...]:
 
 
 def answer_lines(
-    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str
+    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str, scores: forcegp.Scores
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
     names, values, robot = dataset.joint_names, identified.estimates, identified.model.robot
@@ -75,14 +75,14 @@ def answer_lines(
     mass, error = values.total_mass
     by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
     q = "rad or m" if moving else q
-    models = content["models"]
-    scores = "; ".join(
-        f"{short_name(name)} {number(_motion(model))} / {number(_acceleration(model))}"
-        for name, model in models.items()
+    errors = "; ".join(
+        f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
+        for name in scores.models
     )
-    best = content["recommended"]
-    covered = models[best]["coverage_95"]
-    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered['median']:.0f} % of unseen rows"
+    best = scores.recommended
+    assert best is not None, "a model was scored"
+    covered = scores.value("coverage_95", model=best)
+    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
     weak = ", ".join(list(values.by_body or {})[:3])
     out = content["out"]
     command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
@@ -95,43 +95,43 @@ def answer_lines(
         *(of_joints if joints else []),
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
-        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {scores}"),
+        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {errors}"),
         ("trust", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]
 
 
-def best_sentence(content: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
+def best_sentence(scores: forcegp.Scores, dataset: forcegp.Dataset) -> str:
     """Which model to trust, and how much better than the URDF it is on unseen time."""
-    models, best = content["models"], content["recommended"]
+    best = scores.recommended
+    assert best is not None, "a model was scored"
     unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
-    motions = models[best].get("motions")
-    horizon = f"{motions['horizons'][-1]:g} s" if motions and motions["horizons"] else ""
-    scores = {
+    horizon = f"{scores.horizons[-1]:g} s" if scores.horizons else ""
+    patterns = {
         f"positions {horizon} ahead are wrong by {{:.2g}} {unit}": _motion,
         "accelerations are wrong by {:.2g} of their standard deviation": _acceleration,
     }
-    name, error = short_name(best), _acceleration(models[best])
-    if _motion(models[best]) is None and error is not None and error >= 1.0:  # no better than a = 0
+    name, error = short_name(best), _acceleration(scores, best)
+    if _motion(scores, best) is None and error is not None and error >= 1.0:  # no better than a = 0
         return (
             f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are wrong by "
             f"{error:.2g} of their standard deviation. Forces, flags of stance, units or the robot's file are wrong."
         )
-    for pattern, score in scores.items():
-        own, urdf = score(models[best]), score(models.get("given"))
+    for pattern, score in patterns.items():
+        own, urdf = score(scores, best), score(scores, "given")
         if own is not None:
             against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
-            if urdf is None and score is _motion and "given" in models:
+            if urdf is None and score is _motion and "given" in scores.models:
                 against = "; with the URDF alone they diverge"
-            doubt = _no_better_than_rest(models[best], dataset) if error is not None and error >= 1.0 else ""
+            doubt = _no_better_than_rest(scores, best) if error is not None and error >= 1.0 else ""
             return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}.{doubt}"
     return f"Trust the model “{name}”."
 
 
-def _no_better_than_rest(model: Mapping[str, Any], dataset: forcegp.Dataset) -> str:
+def _no_better_than_rest(scores: forcegp.Scores, model: str) -> str:
     """Which joints make the mean error of the acceleration larger than that of no acceleration at all."""
-    each = zip(dataset.joint_names, (error["median"] for error in model["nrmse_per_joint"]), strict=True)
+    each = zip(scores.joint_names, scores.columns("nrmse", model=model), strict=True)
     errors = {name: error for name, error in each if error is not None}
     above = [f"{name} {error:.3g}" for name, error in errors.items() if error >= 1.0]
     others = [error for error in errors.values() if error < 1.0]
@@ -139,15 +139,17 @@ def _no_better_than_rest(model: Mapping[str, Any], dataset: forcegp.Dataset) -> 
     return f" But no acceleration at all has a lower error at {listed(above)} (nRMSE{rest})."
 
 
-def _motion(model: Mapping[str, Any] | None) -> float | None:
-    motions = None if model is None else model.get("motions")
-    last = motions["rms"][-1] if motions and motions["rms"] else None
-    return None if last is None else last["median"]
+def _motion(scores: forcegp.Scores, model: str) -> float | None:
+    """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
+    if model not in scores.models or not scores.finished(model) or not scores.horizons:
+        return None
+    return scores.value("rmse", f"position after {scores.horizons[-1]:g} s", model)
 
 
-def _acceleration(model: Mapping[str, Any] | None) -> float | None:
-    error = None if model is None else model.get("nrmse")
-    return None if error is None else error["median"]
+def _acceleration(scores: forcegp.Scores, model: str) -> float | None:
+    if model not in scores.models or not scores.finished(model):
+        return None
+    return scores.value("nrmse", model=model)
 
 
 def payload_text(found: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.evaluation
+import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
@@ -50,7 +50,7 @@ class Check(CutoffOptions, RobotOptions, Overwriting):
         content = {"data": str(self.data), **report.to_dict()}
         if self.plots is not None:
             with self.folder(self.plots, {"data": str(self.data)}) as folder:
-                forcegp.evaluation.save_figure(forcegp.evaluation.check_figure(report), folder / "check.png")
+                forcegp.scores.save_figure(forcegp.scores.check_figure(report), folder / "check.png")
                 write_json(folder / "check.json", content)
             terminal.note(f"plots: {self.plots}")
         terminal.show(*_shown(terminal, self.data, report))

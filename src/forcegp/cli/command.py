@@ -11,9 +11,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, get_args, get_type_hints
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 import forcegp.data
@@ -74,6 +74,11 @@ def listed(
         str_from_instance=lambda given: [",".join(map(str, given))],
         help_behavior_hint=None if default is None else f"(default: {default})",
     )
+
+
+def repeats(hint: Any) -> bool:
+    """Whether an option may be given several times, each with a value of its own."""
+    return get_args(UseAppendAction[int])[1] in get_args(hint)
 
 
 NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
@@ -160,12 +165,16 @@ class Command(ABC):
     def words(self, *names: str) -> list[str]:
         """The options of these names that are not left at their defaults, as words of a command."""
         words: list[str] = []
+        hints = get_type_hints(type(self), include_extras=True)
         for name in names:
             given, flag = getattr(self, name), f"--{name.replace('_', '-')}"
             if given is False and getattr(type(self), name):
                 words.append(f"--no-{flag[2:]}")
             elif given is True and not getattr(type(self), name):
                 words.append(flag)
+            elif repeats(hints[name]):
+                repeated: Any = given
+                words += [word for each in repeated for word in (flag, each)]
             elif given != getattr(type(self), name):
                 each = given if isinstance(given, tuple) else (given,)
                 text = ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in each)

@@ -1,4 +1,4 @@
-"""`forcegp demo`: simulate, learn, evaluate and draw, in one go."""
+"""`forcegp demo`: simulate, learn, score and draw, in one go."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 import forcegp
-import forcegp.evaluation
 import forcegp.posterior
 import forcegp.report
+import forcegp.scores
 import forcegp.simulation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import Command
-from forcegp.cli.evaluate import draw, evaluate_with_progress
 from forcegp.cli.fit import fit_summary
+from forcegp.cli.score import NORMAL_FORCES, comparison, draw
 from forcegp.cli.simulate import simulate_with_progress
-from forcegp.cli.terminal import NONE, NORMAL_FORCES, Terminal, columns, multiplier_scores, nats, number, percent
+from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
 NOISE = 0.1  # rad/s^2, as in the paper
@@ -30,12 +30,6 @@ SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so 
 
 MODELS = {"S-GP": ("s-gp", False), "S-GP + analytical mean": ("s-gp-analytical-mean", True)}
 """Name in the paper -> (folder, whether known forces are the mean)."""
-
-PUBLISHED_MAE = {
-    "S-GP": {100: 0.5856, 200: 0.2092, 400: 0.1193, 600: 0.1049, 800: 0.1006, 1000: 0.0977},
-    "S-GP + analytical mean": {100: 0.1051, 200: 0.0936, 400: 0.0868, 600: 0.0855, 800: 0.0847, 1000: 0.0844},
-}
-"""Mean absolute error against noisy accelerations by number of points [rad/s^2], as in `benchmarks.paper.published`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,46 +73,48 @@ class Demo(Command):
                 seconds = time.monotonic() - begin
                 terminal.note(f"simulated {name}: {len(data[name])} rows, seed {seed} ({seconds:.1f} s)")
             train, test = data.values()
-            models, evaluations, fits = {}, {}, {}
+            models, fits = {}, {}
             for name, (place, mean) in MODELS.items():
                 models[name], fits[name] = self._fitted(terminal, folder / place, train, name, mean)
-                evaluations[name] = evaluate_with_progress(terminal, models[name], test, f"predicting with {name}")
-            pictures = draw(terminal, folder, models["S-GP + analytical mean"], test)
-            terminal.note(f"drew {', '.join(pictures)}")
-            wall_seconds = time.monotonic() - start
-            results = {
+            with terminal.progress("scoring") as report:
+                scores = forcegp.score(models, test, horizons=(), progress=report)
+            for warning in scores.warnings:
+                terminal.warn(warning)
+            best = models["S-GP + analytical mean"]
+            terminal.note(f"drew {', '.join(draw(terminal, folder, best, test))}")
+            results: dict[str, Any] = {
                 "out": str(self.out),
                 "seeds": seeds,
-                **{name: options[name] for name in ("seconds", "points")},
-                "models": {
-                    name: {
-                        "run": str(self.out / place),
-                        "fit": fits[name],
-                        "evaluation": evaluations[name].to_dict(),
-                        "published_mae": PUBLISHED_MAE[name].get(self.points),
-                    }
-                    for name, (place, _) in MODELS.items()
-                },
-                "wall_seconds": wall_seconds,
-                "machine": machine,
+                "points": self.points,
+                "seconds": self.seconds,
             }
+            results["models"] = {
+                name: {"run": str(self.out / place), "fit": fits[name]} for name, (place, _) in MODELS.items()
+            }
+            results |= {"scores": scores.to_dict(), "wall_seconds": time.monotonic() - start, "machine": machine}
             write_json(folder / "results.json", results)
-            best = self._write_report(terminal, folder, models["S-GP + analytical mean"], test, evaluations, results)
-        self._show(terminal, evaluations, wall_seconds, best)
+            sentence = self._write_report(terminal, folder, best, test, results)
+        title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
+        terminal.show(
+            *comparison(scores, title),
+            f"Contact force: {NORMAL_FORCES}.",
+            f"Models, data, pictures and results.json are in {self.out}. Open the report:",
+            f"  {self.out}/report.html",
+            sentence,
+        )
         return results
 
     def _write_report(
         self,
         terminal: Terminal,
         folder: Path,
-        posterior: forcegp.posterior.StructuredPosterior,
+        posterior: forcegp.posterior.Posterior,
         test: forcegp.Dataset,
-        evaluations: Mapping[str, forcegp.Evaluation],
         results: Mapping[str, Any],
     ) -> str:
         """The page with everything, whose best sentence is returned."""
-        name, evaluation = list(evaluations.items())[-1]
-        best = forcegp.report.evaluation_sentence(evaluation, "rad/s²")
+        scores = forcegp.score(posterior, test)
+        best = forcegp.report.scores_sentence(scores, "rad/s²")
         with terminal.progress("writing the report") as progress:
             page = forcegp.report.model_page(
                 posterior,
@@ -127,10 +123,10 @@ class Demo(Command):
                 best=best,
                 findings=[
                     forcegp.report.Finding("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
-                    forcegp.report.Finding("model", f"{name} of Rath, Geist and Trimpe (CoRL 2021)"),
-                    forcegp.report.Finding("tested on", f"{evaluation.rows} rows of a trajectory with another seed"),
+                    forcegp.report.Finding("model", "S-GP with analytical mean of Rath, Geist and Trimpe (CoRL 2021)"),
+                    forcegp.report.Finding("tested on", f"{len(test)} rows of a trajectory with another seed"),
                 ],
-                tables=[forcegp.report.evaluation_table(evaluation)],
+                tables=[forcegp.report.scores_table(scores)],
                 next_steps=[
                     forcegp.report.Finding(
                         "The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"
@@ -148,7 +144,7 @@ class Demo(Command):
 
     def _fitted(
         self, terminal: Terminal, run: Path, train: forcegp.Dataset, name: str, mean: bool
-    ) -> tuple[forcegp.posterior.StructuredPosterior, dict[str, Any]]:
+    ) -> tuple[forcegp.posterior.Posterior, dict[str, Any]]:
         """The fitted model, and what the fit came to."""
         assert train.model is not None
         start = time.monotonic()
@@ -156,34 +152,9 @@ class Demo(Command):
         model = model if mean else model.without_mean()
         how: dict[str, Any] = {"points": self.points, "iterations": self.iterations, "jobs": self.jobs}
         with terminal.progress(f"fitting {name}", may_end_early=True) as report:
-            posterior: Any = forcegp.evaluation.learn(model, train, report=report, **how)[0]
+            posterior: Any = forcegp.scores.learn(model, train, report=report, **how)[0]
         seconds = time.monotonic() - start
         forcegp.save_posterior(posterior, run)
         iterations = len(posterior.result.history) - 1
         terminal.note(f"fitted {name}: {iterations} iterations ({seconds:.1f} s)")
         return posterior, fit_summary(posterior, seconds)
-
-    def _show(
-        self, terminal: Terminal, evaluations: Mapping[str, forcegp.Evaluation], wall_seconds: float, best: str
-    ) -> None:
-        header = ["model", "MAE", "in the\npaper", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "|Aa-b|"]
-        rows = []
-        for name, evaluation in evaluations.items():
-            published = number(PUBLISHED_MAE[name].get(self.points))
-            errors = [number(evaluation.mae), published, number(evaluation.mae_noise_free), number(evaluation.rmse)]
-            calibration = [nats(evaluation.nlpd), percent(evaluation.coverage_95)]
-            rows.append([name, *errors, *calibration, number(evaluation.constraint_error)])
-        first = next(iter(evaluations.values()))
-        known = [number(first.known_physics_mae), NONE, number(first.known_physics_mae_noise_free)]
-        rows.insert(0, ["known physics alone", *known, *[NONE] * 4])
-        rows.append(["noise floor", number(first.noise_floor), NONE, number(0.0), *[NONE] * 4])
-        title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
-        scores = "; ".join(f"{name} {multiplier_scores(evaluation)}" for name, evaluation in evaluations.items())
-        multipliers = f"Contact force (multiplier): {scores}. {NORMAL_FORCES[0].upper()}{NORMAL_FORCES[1:]}."
-        terminal.show(
-            columns(title, header, rows),
-            *([multipliers] if first.multiplier_mae is not None else []),
-            f"Models, data, pictures and results.json are in {self.out} ({wall_seconds:.0f} s). Open the report:",
-            f"  {self.out}/report.html",
-            best,
-        )

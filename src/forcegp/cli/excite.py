@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.evaluation
+import forcegp.scores
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, URDF, Overwriting, begins, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.input_options import RobotOptions
@@ -80,7 +80,7 @@ class Excite(RobotOptions, Overwriting):
                 progress=report,
             )
         chosen.save_csv(self.out)
-        forcegp.evaluation.save_figure(forcegp.evaluation.excitation_figure(chosen), picture)
+        forcegp.scores.save_figure(forcegp.scores.excitation_figure(chosen), picture)
         terminal.note(f"figure: {picture}")
         usage = {name: values.tolist() for name, values in chosen.usage.items()}
         table = {f"{name}\nover limit": values for name, values in usage.items()}

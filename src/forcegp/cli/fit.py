@@ -15,11 +15,11 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.checks
 import forcegp.data
-import forcegp.evaluation
 import forcegp.evidence
 import forcegp.parallel
 import forcegp.posterior
 import forcegp.robots
+import forcegp.scores
 from forcegp.atomic_files import file_digest, write_json, write_text
 from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
@@ -128,9 +128,9 @@ class Fit(RobotOptions, Overwriting):
             notes.append(note)
         if windows and noise is None:  # no dataset states the noise of windows
             noise = forcegp.Noise(None, learn=True)
-        model = forcegp.evaluation.named_model(given, words, noise).to(self.device)
+        model = forcegp.scores.named_model(given, words, noise).to(self.device)
         with terminal.progress("fitting", may_end_early=True) as report:
-            posterior, found = forcegp.evaluation.learn(
+            posterior, found = forcegp.scores.learn(
                 model,
                 dataset,
                 evidence,
@@ -148,7 +148,7 @@ class Fit(RobotOptions, Overwriting):
         self._write(posterior)
         for note in [*forces_of(given), *notes, *found]:
             terminal.note(note)
-        for doubt in forcegp.evaluation.unfinished_search(posterior):
+        for doubt in forcegp.scores.unfinished_search(posterior):
             terminal.warn(doubt)
         terminal.show(*tables)
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
@@ -174,10 +174,10 @@ class Fit(RobotOptions, Overwriting):
     def _chosen(self, dataset: forcegp.Dataset, model: forcegp.Model, windows: bool) -> tuple[tuple[str, ...], str]:
         """The unknown forces that a look at some rows prefers, and the reason."""
         if windows:
-            name = forcegp.evaluation.usual_forces(model)
-            return forcegp.evaluation.summands(name), f"forces: {name}, the usual ones; windows are not looked at"
-        name, why = forcegp.evaluation.choose_forces(dataset, model, seed=self.seed, iterations=self.iterations)
-        return forcegp.evaluation.summands(name), f"learned: {why}"
+            name = forcegp.scores.usual_forces(model)
+            return forcegp.scores.summands(name), f"forces: {name}, the usual ones; windows are not looked at"
+        name, why = forcegp.scores.choose_forces(dataset, model, seed=self.seed, iterations=self.iterations)
+        return forcegp.scores.summands(name), f"learned: {why}"
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model, accelerations: bool) -> None:
         """One line on what would spoil the model; contacts are not warned of again by the fit.
@@ -236,7 +236,7 @@ class Fit(RobotOptions, Overwriting):
 
 
 SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed", "jobs", "hyperprior")
-"""Options that `forcegp.evaluation.learn` takes by the same names."""
+"""Options that `forcegp.scores.learn` takes by the same names."""
 
 
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
@@ -339,7 +339,7 @@ def fit_report(run: Path, posterior: Any, summary: Mapping[str, Any]) -> list[An
             f"{motions['windows']} windows of {motions['seconds']:g} s, whose initial states are estimated, too; "
             f"rms of q by joint: {error}."
         )
-    return [*shown, f"Next: forcegp evaluate {run} TEST.h5"]
+    return [*shown, f"Next: forcegp score {run} TEST.h5"]
 
 
 def _residuals(given: forcegp.Model, posterior: Any, dataset: forcegp.Dataset) -> dict[str, Any]:

@@ -21,16 +21,16 @@ from forcegp.cli.command import Command
 
 GROUPS: Mapping[str, str] = {
     "Input": "baseline task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
-    "Columns": "time q v u a step joints orientation axes ned unit sign scale offset episode unwrap",
-    "Timing": "start end gap resample rate",
+    "Columns": "time q v u a step joints orientation axes ned unit sign episode unwrap",
+    "Timing": "start end gap rate",
     "Preparation": "cutoff differentiate delay lag stance every trim",
     "Robot": "robot shapes inertias base root identified "
     "lock armature gravity beyond_limits link system contact feet wheels",
     "Scene": "surface contact_model tool_friction friction_coefficient joint_friction patch wind",
-    "Motion": "seconds trajectories start_rows starts integrator baumgarte samples posture limits limit_share avoid "
+    "Motion": "seconds trajectories starts integrator posture limits limit_share avoid "
     "clearance tries bandwidth false_alarms",
     "Noise": "noise force_noise measured_torque",
-    "Model": "forces evidence models identification",
+    "Model": "forces evidence identification",
     "Fit": "points learning_points rows engine restarts iterations hyperprior checks correct accept",
     "Score": "split guard seeds seed_list horizon margin strict",
     "Program": "to steps covariance jacobian unchecked",

@@ -7,20 +7,21 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from typing_extensions import override
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.inference
+import forcegp.data
 import forcegp.recordings
+import forcegp.scores
 from forcegp.atomic_files import atomic_file, write_text
-from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, unless_given
+from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.terminal import Terminal, columns, facts, shown
 from forcegp.errors import ForceGPError, InvalidInput
 
-COPIES = 10
-"""Times the size of its file that a dataset is taken to need while it is prepared: numbers hardly shrink in it."""
+NOT_ABOUT_LOGS = {"logs", "out", "plots", "stance", "json", "debug"}
 
 Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
@@ -28,21 +29,8 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(PreparationOptions, RobotOptions, Overwriting):
-    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
-
-    State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
-    their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
-    are names, patterns such as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi". Without
-    a --cutoff, --delay, --lag, --every or --trim, rows stay as they were logged.
-
-    For example:
-      forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
-      forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
-      forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
-      forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
-      forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
-    """
+class LogOptions(PreparationOptions, RobotOptions, Overwriting):
+    """What every command asks that begins with logs: which columns are what, and how rows come of them."""
 
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "none", Path)] = None
     """The robot that was recorded: joints are found by its names and put into its order; the dataset carries it."""
@@ -54,14 +42,10 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
     """Wheels that roll about the y axes of these frames without slipping, on level ground; radius in m."""
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
     """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
-    out: Annotated[Path, arg(metavar="FILE.h5")]
-    """The dataset to write (HDF5)."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
         None
     )
     """What the columns mean; flags replace its entries."""
-    write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "not written", Path)] = None
-    """Write the mapping that results from flags and --mapping."""
     time: Columns = None
     """Time stamps; of a bag with several topics, those of the messages that become rows."""
     step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
@@ -89,10 +73,6 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
     With a moving base, each is for the columns of its kind."""
     sign: Text = None
     """1 or -1 per joint, for all signals (--sign=1,-1) or for one (u=-1)."""
-    scale: Text = None
-    """A factor, for instance u=0.1 for all joints or u=0.1,0.2."""
-    offset: Text = None
-    """Added last, in SI units: q=0,1.5708."""
     episode: Text = None
     """A column that numbers the episodes."""
     episodes: Text = None
@@ -105,10 +85,9 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
     """The files are one recording, with a signal in each; columns are called FILE:column."""
     gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
     """A longer pause starts a new episode."""
-    resample: Literal["auto", "no"] = "auto"
-    """auto: rows at uneven times are given even ones by a cubic spline. no: every stamp is kept."""
-    rate: Annotated[float | None, unless_given("HZ", "the median", float)] = None
-    """Rows per second of the even times."""
+    rate: Annotated[str, arg(metavar="HZ|auto|log")] = "auto"
+    """Rows per second. auto: rows at uneven times are given even ones at the median rate, by a cubic spline. log: every
+    stamp is kept."""
     start: Seconds = None
     """Leave out what comes earlier, in seconds from the first row of each episode."""
     end: Seconds = None
@@ -119,30 +98,19 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
     """Accept positions beyond the limits of the URDF."""
     max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
     """Refuse a log with more rows."""
+    stance: Literal["log", "auto"] = "log"
+    """auto: set the switches of contacts to what motion and forces show, and leave out rows that leave one open."""
 
-    def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Read, check and write."""
-        if not self.logs:
-            raise InvalidInput("give at least one log.")
-        self.require_free_file(self.out)
-        self.require_free_file(self.write_mapping, _is_mapping, "a mapping")
-        mapping = self._mapping(terminal)
-        options = self._options()
-        model, preparation = self._model(), self._preparation()
-        with atomic_file(self.out, overwrite=self.overwrite) as temporary, terminal.progress("importing") as report:
-            done = forcegp.import_recordings(self.logs, temporary, mapping, model=model, options=options, report=report)
-            if done["open_switches"]:
-                preparation = replace(preparation, stance="auto")
-            if not preparation.changes_nothing:
-                done |= _prepared(temporary, preparation, done["rows"])
-            if self.write_mapping is not None:  # a mapping that fails leaves no dataset behind
-                write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
-        _report(terminal, self.out, done)
-        return {"out": str(self.out), **done}
+    @override
+    def _preparation(self) -> forcegp.Preparation:
+        return replace(super()._preparation(), stance=self.stance)
 
     def _options(self) -> forcegp.ImportOptions:
-        same = ("gap", "resample", "rate", "start", "end", "unwrap", "beyond_limits")
-        given = {name: getattr(self, name) for name in same}
+        same = ("gap", "start", "end", "unwrap", "beyond_limits")
+        given: dict[str, Any] = {name: getattr(self, name) for name in same} | {"rate": self.rate}
+        if self.rate not in ("auto", "log"):
+            complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."
+            [given["rate"]] = numbers_of(self.rate, complaint, one=True)
         return forcegp.ImportOptions(most_rows=self.max_rows, stance="auto", **given)
 
     def _model(self) -> forcegp.Model | None:
@@ -158,8 +126,8 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
             raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
         return model.with_contacts((*touching, *model.loops))
 
-    def _mapping(self, terminal: Terminal) -> forcegp.ColumnMapping:
-        """That of the file, changed by the flags."""
+    def _mapping(self, terminal: Terminal, written: Path | None = None) -> forcegp.ColumnMapping:
+        """That of the file, changed by the flags. Raises InvalidInput for one that is to be `written`, too."""
         path = self.mapping
         if path is None:
             found = {forcegp.recordings.beside(log) for log in self.logs} - {None}
@@ -168,7 +136,7 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
                 raise InvalidInput(f"the logs have different mappings beside them ({listed}); give --mapping.")
             path = next(iter(found), None)
             if path is not None:
-                if self.write_mapping is not None and path.resolve() == self.write_mapping.resolve():
+                if written is not None and path.resolve() == written.resolve():
                     raise InvalidInput(f"{path} is read by this command; give --write-mapping another name.")
                 terminal.note(f"the columns are mapped by {path}")
         stored = forcegp.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
@@ -183,22 +151,94 @@ class Import(PreparationOptions, RobotOptions, Overwriting):
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
             given["headerless"] = [int(word) for word in words]
-        readers = dict.fromkeys(("unit", "axes"), forcegp.recordings.by_quantity)
-        readers |= dict.fromkeys(("sign", "scale", "offset"), forcegp.recordings.factors_of)
+        readers = dict.fromkeys(("unit", "axes", "sign"), forcegp.recordings.by_quantity)
+        if self.sign is not None and "=" not in self.sign:
+            given["sign"] = self.sign.split(",")
+            del readers["sign"]
         given |= {name: read(name, given[name]) for name, read in readers.items() if given[name] is not None}
         return forcegp.recordings.mapping_of(given)
 
 
-def _prepared(path: Path, preparation: forcegp.Preparation, rows: int) -> dict[str, Any]:
-    """Prepare the dataset in a file, in its place. Raises NotEnoughMemory where it does not fit into memory whole."""
-    import torch  # 2 s that only a preparation costs
+@dataclass(frozen=True, kw_only=True)
+class Import(LogOptions):
+    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
 
-    required = COPIES * path.stat().st_size
-    remedy = "import without --cutoff, --delay, --lag, --every and --trim, or fewer logs at once."
-    forcegp.inference.require_memory(required, f"preparing {rows} rows", remedy, torch.device("cpu"))
-    prepared = preparation.apply(forcegp.Dataset.load(path))
-    prepared.dataset.save(path)
-    return {"rows": len(prepared.dataset), "preparation": prepared.report}
+    State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
+    their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
+    are names, patterns such as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi".
+
+    With a --cutoff, --delay, --lag, --stance, --every or --trim, rows are filtered, aligned and thinned out, and what
+    that costs is reported; LOG may then be a dataset, too. The low-pass filter runs forwards and backwards, so that
+    nothing is delayed; v and a are computed anew.
+
+    For example:
+      forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
+      forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
+      forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
+      forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
+      forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
+      forcegp import log.h5 --cutoff auto --delay auto --every 10 --out data.h5 --plots spectra
+    """
+
+    out: Annotated[Path, arg(metavar="FILE.h5")]
+    """The dataset to write (HDF5)."""
+    write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "not written", Path)] = None
+    """Write the mapping that results from flags and --mapping."""
+    plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
+    """Also draw the spectra before and after the filter, with the cut-off, into this folder."""
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Read, check, prepare, write and show."""
+        if not self.logs:
+            raise InvalidInput("give at least one log.")
+        self.require_free_file(self.out)
+        self.require_free_file(self.write_mapping, _is_mapping, "a mapping")
+        self.require_free(self.plots)
+        preparation, mapping = self._preparation(), None
+        if forcegp.data.is_dataset(self.logs[0]):
+            raw, done = self._dataset(preparation), {}
+        else:
+            mapping, model = self._mapping(terminal, self.write_mapping), self._model()
+            given = {"model": model, "options": self._options()}
+            with terminal.progress("importing") as report:
+                raw = forcegp.import_recordings(self.logs, mapping, **given, report=report)
+            done = dict(raw.metadata["import"])
+            if done["open_switches"]:
+                preparation = replace(preparation, stance="auto")
+        dataset, prepared = raw, None
+        if not preparation.changes_nothing or self.plots is not None:
+            with terminal.progress("preparing"):
+                prepared = preparation.apply(raw)
+            dataset = prepared.dataset
+            done |= {"rows": len(dataset), "preparation": prepared.report}
+        with atomic_file(self.out, overwrite=self.overwrite) as temporary:
+            dataset.save(temporary)
+            if prepared is not None and self.plots is not None:  # plots that fail leave no dataset behind
+                with self.folder(self.plots, {"data": str(self.logs[0]), "preparation": prepared.report}) as folder:
+                    figure = forcegp.scores.preparation_figure(raw, prepared.preparation)
+                    forcegp.scores.save_figure(figure, folder / "spectra.png")
+                terminal.note(f"plots: {self.plots}")
+            if self.write_mapping is not None and mapping is not None:
+                write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
+        shown = [] if mapping is None else [_imported(terminal, self.out, done)]
+        terminal.show(*shown, *([] if prepared is None else _price(self.out, raw, prepared)))
+        return {"out": str(self.out), **done}
+
+    def _dataset(self, preparation: forcegp.Preparation) -> forcegp.Dataset:
+        """The dataset that is to be prepared. Raises InvalidInput for options that are about logs."""
+        path, *others = self.logs
+        own = {each.name for each in fields(PreparationOptions) + fields(RobotOptions) + fields(Overwriting)}
+        about_logs = self.words(*(name for name in self.options if name not in own | NOT_ABOUT_LOGS))
+        if others or about_logs:
+            what = about_logs[0].partition("=")[0] if about_logs else "more than one file"
+            raise InvalidInput(f"{path} is a dataset of forcegp already, of which one is prepared; leave {what} out.")
+        if preparation.changes_nothing:
+            raise InvalidInput(
+                f"{path} is a dataset of forcegp already, so there is nothing to do: give --cutoff, --delay, --lag, "
+                "--stance, --every or --trim."
+            )
+        dataset = forcegp.Dataset.load(path)
+        return replace(dataset, model=self.model_if_any(dataset, path))
 
 
 def _is_mapping(path: Path) -> bool:
@@ -209,8 +249,8 @@ def _is_mapping(path: Path) -> bool:
     return True
 
 
-def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
-    """What was guessed, repaired and left out, and what came out."""
+def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:
+    """What was guessed, repaired and left out, as notes, and what came out."""
     for found in done["guessed"]:
         terminal.note(f"found by name: {found}")
     for recording in done["recordings"]:
@@ -231,28 +271,61 @@ def _report(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> None:
         terminal.note(
             f"resampled to {1 / done['resampled_to_step']:.6g} Hz: steps deviate by up to {worst:.0%} from their median"
         )
-    if "preparation" in done:
-        report = done["preparation"]
-        for name in ("cutoff", "delay", "lag"):
-            if name in report["why"]:
-                terminal.note(f"{name}: {report['why'][name]}")
-        if "stance" in report:
-            terminal.note(f"stance: {stance_text(report)}")
-        settings = ", ".join(f"{name} {report[name]}" for name in ("cutoff", "delay", "lag", "every", "trim"))
-        terminal.note(f"prepared: {settings}; {report['rows'][0]} rows became {report['rows'][1]}")
     how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
     if done.get("preparation", {}).get("cutoff") is not None:
         how = "filtered and differentiated anew"
     seconds = sum(recording["seconds"] for recording in done["recordings"])
     rows, episodes = _counted(done["rows"], "row"), _counted(len(done["episodes"]), "episode")
-    terminal.show(f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}")
+    return f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> list[Any]:
+    """The price, joint by joint."""
+    report = prepared.report
+    before, after = report["rows"]
+    values = {"rows": f"{before} -> {after}"}
+    if "sample_rate" in report:
+        values["sample rate"] = " -> ".join(f"{rate:.4g} Hz" for rate in report["sample_rate"])
+    cutoff = report["cutoff"]
+    filtered = "none" if cutoff is None else f"{cutoff:.3g} Hz, order {report['order']}, forwards and backwards"
+    values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
+    for name in ("delay", "lag"):
+        seconds, why = report[name], report["why"].get(name)
+        if any(seconds) or why is not None:
+            milliseconds = ", ".join(
+                f"{1e3 * each:.1f}" for each in (seconds if len(set(seconds)) > 1 else seconds[:1])
+            )
+            values[f"{name} of u"] = f"{milliseconds} ms{'' if why is None else f'; {why}'}"
+    if "stance" in report:
+        values["stance"] = stance_text(report)
+    tables: list[Any] = [facts(f"{out}: prepared", values)]
+    if cutoff is None:
+        return tables
+
+    noise, removed = report["acceleration_noise"], report["power_removed"]
+    own = dataset.joint_names
+    inputs = own if dataset.model is None else dataset.model.actuators
+    forces = dict(zip(inputs, removed["u"], strict=False))
+    header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
+    rows = [
+        [name, shown(noise["before"][joint]), shown(noise["after"][joint])]
+        + [shown(removed[signal][joint], "{:.2g} %", 100.0) for signal in ("q", "v", "a")]
+        + [shown(forces.get(name), "{:.2g} %", 100.0)]
+        for joint, name in enumerate(own)
+    ]
+    rows += [[name, *5 * [shown(None)], shown(forces[name], "{:.2g} %", 100.0)] for name in forces if name not in own]
+    unit = dataset.units["a"]
+    title = f"What it costs; noise in {unit if isinstance(unit, str) else 'the units of each joint'}, shares of power"
+    tables.append(columns(title.replace("^2", "²"), header, rows))
+    tables.append("Noise is that of differenced positions above the noise floor; – where the log shows no floor.")
+    return tables
 
 
 def stance_text(report: Mapping[str, Any]) -> str:
     """How long each foot stands, and how many rows leave it open, of a report of `Preparation`."""
     shares = ", ".join(f"{name} {share:.0%}" for name, share in report["stance"]["standing"].items())
     return f"{shares}; {report['stance']['open_rows']} rows left out, which leave one open"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -9,14 +9,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from typing_extensions import override
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 
 import forcegp
 import forcegp.data
-import forcegp.evaluation
 import forcegp.posterior
+import forcegp.scores
 from forcegp.atomic_files import SUMS, require_unchanged
-from forcegp.cli.command import IDENTIFIED, URDF, Command, listed, numbers_of, unless_given
+from forcegp.cli.command import (
+    FIELDS,
+    IDENTIFIED,
+    URDF,
+    Command,
+    listed,
+    numbers_of,
+    split_list,
+    unless_given,
+)
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -180,28 +189,22 @@ def _finite(text: str, what: str) -> float:
 SystemChoice = Literal["model", "data"]
 
 
-def model_and_data(
-    terminal: Terminal, run: Path, data: Path, choice: SystemChoice
-) -> tuple[forcegp.posterior.Posterior, forcegp.Dataset]:
-    """A fitted model for the chosen system, and a recording of the same robot; what was changed is reported on stderr.
+def for_system(
+    terminal: Terminal, posterior: forcegp.posterior.Posterior, log: forcegp.Dataset, choice: SystemChoice
+) -> forcegp.posterior.Posterior:
+    """A fitted model for the chosen system; what was changed is reported on stderr.
 
-    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the data.
-    A model of air observes a slow force from the past of the recording. Raises InvalidInput for another robot, where
-    the data carry no system, and where the model cannot move there.
+    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the log.
+    Raises InvalidInput where the log carries no system, and where the model cannot move there.
     """
-    posterior, dataset = forcegp.load_posterior(run), forcegp.Dataset.load(data)
-    require_same_joints(posterior, dataset, data)
-    if choice == "data":
-        if dataset.model is None:
-            raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-        model = forcegp.evaluation.moved_model(posterior, dataset.model)
-        if model is not dataset.model:
-            terminal.note("--system data: contacts of the data; the robot stays the identified one")
-        posterior = posterior.with_model(model)
-    observed, seen = forcegp.posterior.observing(posterior, dataset)
-    if observed is not posterior:
-        terminal.note("wind: observed from earlier rows of each episode (aerodynamic:observe=0 leaves it unknown)")
-    return observed, seen
+    if choice == "model":
+        return posterior
+    if log.model is None:
+        raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
+    model = forcegp.scores.moved_model(posterior, log.model)
+    if model is not log.model:
+        terminal.note("--system data: contacts of the data; the robot stays the identified one")
+    return posterior.with_model(model)
 
 
 def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
@@ -211,6 +214,25 @@ def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp
             f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
             f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidateOptions(Command):
+    """What every command asks that compares models."""
+
+    forces: Annotated[UseAppendAction[tuple[str, ...]], unless_given("FORCE,...", "some of every kind")] = ()
+    """A model to fit, FORCE,...[@EVIDENCE,...] as for forcegp fit; give one --forces per model. given: the robot as
+    given. identified: with all inertias, friction and rotors from the log. gp:independent: without physics.
+    gp:joint-friction: unknown forces on the robot as given; identified,gp:joint-friction: on it as identified.
+    viscous,coulomb@torques: laws alone. identified@motions:1: refined on motions."""
+
+    def candidates(self) -> tuple[str, ...]:
+        """Their names in Python, FORCES[@EVIDENCE] joined by "+"."""
+        names = tuple("@".join("+".join(split_list(part, FIELDS)) for part in each.split("@")) for each in self.forces)
+        for name in names:
+            if names.count(name) > 1:
+                raise InvalidInput(f"--forces {name} is named twice; name each model once.")
+        return names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,10 +259,10 @@ class CutoffOptions(Command):
 class PreparationOptions(CutoffOptions):
     """What every command asks that makes rows to learn from out of a raw log."""
 
-    delay: Annotated[str, arg(metavar="S|auto|each")] = "0"
-    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together.
-    each: estimated per joint. Both need the robot."""
-    lag: Annotated[str, arg(metavar="S|auto|each")] = "0"
+    delay: Annotated[str, arg(metavar="S|auto")] = "0"
+    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together,
+    which needs the robot."""
+    lag: Annotated[str, arg(metavar="S|auto")] = "0"
     """Time constant in s with which actuators of first order follow u: as for --delay."""
     every: Annotated[int | None, unless_given("N", "1", int)] = None
     """Keep every N-th row, after the filter."""
@@ -252,8 +274,8 @@ class PreparationOptions(CutoffOptions):
         late: dict[str, Any] = {}
         for name in ("delay", "lag"):
             given = getattr(self, name)
-            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, auto or each.".format
-            if given not in ("auto", "each"):
+            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, or auto.".format
+            if given != "auto":
                 each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in given.split(","))
                 given = each[0] if len(each) == 1 else each
             late[name] = given

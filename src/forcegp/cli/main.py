@@ -20,7 +20,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
-from forcegp.cli.command import Command, Listed
+from forcegp.cli.command import Command, Listed, repeats
 from forcegp.cli.help_pages import command_page, flag_of, front_page, show
 from forcegp.cli.terminal import Terminal, with_option_names
 from forcegp.errors import ForceGPError, InvalidInput, NotEnoughMemory
@@ -34,24 +34,21 @@ or step by step:
   forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
   forcegp simulate kuka-surface --seconds 100 --seed 2 --out test.h5
   forcegp fit train.h5 --points 100 --out run
-  forcegp evaluate run test.h5 --plots figures
+  forcegp score run test.h5 --out scores
 
-Every command has --help, --json and --debug, and writes its lists with commas, as in --models a,b."""
+Every command has --help, --json and --debug, and writes its lists with commas, as in --forces a,b."""
 
 COMMANDS: Mapping[str, str] = {
     "auto": "go from logs and a URDF to a validated model, in one command",
-    "demo": "simulate, learn, evaluate and draw, in a minute",
+    "demo": "simulate, learn, score and draw, in a minute",
     "simulate": "make a dataset with ground truth",
-    "import": "make a dataset from logs: CSV, Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot",
+    "import": "make a dataset from logs (CSV, ROS bags, ...), and filter it",
     "robot": "show a robot file: tree, limits, masses, repairs, and a picture",
     "check": "find mistakes in a log, with the correction of each",
-    "prepare": "filter and differentiate a raw log, and report the signal lost",
     "fit": "find what a model leaves open: coefficients, bodies, unknown forces",
     "payload": "estimate mass, centre of mass and inertia of a payload",
-    "evaluate": "score a fitted model on another dataset",
-    "validate": "compare models on unseen time of a log",
+    "score": "score and compare models on time that they have not seen",
     "view": "show a recording and its learned forces in 3D, in the browser",
-    "rollout": "predict whole motions and compare them with the recorded ones",
     "monitor": "find contacts in a log without a force sensor: time, link and force",
     "excite": "the most informative motion to record next",
     "export": "write a fitted model as a C program",
@@ -136,7 +133,7 @@ def _checked_options(name: str, kind: type[Command], words: Sequence[str]) -> di
             hint = f" Did you mean {close[0]}?" if close else ""
             raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
         values = [value] if value else list(takewhile(lambda each: not each.startswith("-"), words[place + 1 :]))
-        if flag in given:
+        if flag in given and not repeats(flags[flag]):
             entries = shlex.quote(",".join([*given[flag][:1], *values[:1]]))
             once = f"write one list: {flag} {entries}" if flag in lists else "give it once"
             raise InvalidInput(f"{flag} is given twice; {once}.")

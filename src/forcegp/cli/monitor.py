@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
-import forcegp.evaluation
 import forcegp.recordings
+import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import LOG, MAPPING, MODEL, Overwriting, unless_given
 from forcegp.cli.input_options import require_same_joints
@@ -95,8 +94,8 @@ class Monitor(Overwriting):
             time, _, state = max(parts, key=lambda part: len(part[0]))
             shown = [(each["start"], each["end"]) for each in contacts if time[0] <= each["start"] <= time[-1]]
             arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
-            figure = forcegp.evaluation.contacts_figure(*arrays, shown, log.joint_names, title)
-            forcegp.evaluation.save_figure(figure, folder / "contacts.png")
+            figure = forcegp.scores.contacts_figure(*arrays, shown, log.joint_names, title)
+            forcegp.scores.save_figure(figure, folder / "contacts.png")
         terminal.note(f"figure: {self.out / 'contacts.png'}")
         limit = monitor.threshold
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
@@ -114,13 +113,11 @@ class Monitor(Overwriting):
         else:
             beside = self.mapping or forcegp.recordings.beside(path)
             mapping = forcegp.ColumnMapping() if beside is None else forcegp.recordings.read_mapping(beside)
-            with tempfile.TemporaryDirectory() as folder, terminal.progress(f"reading {path}") as report:
-                out = Path(folder) / "log.h5"
+            with terminal.progress(f"reading {path}") as report:
                 try:
-                    forcegp.import_recordings([path], out, mapping, model=posterior.model, report=report)
+                    dataset = forcegp.import_recordings([path], mapping, model=posterior.model, report=report)
                 except InvalidInput as error:
                     raise InvalidInput(f"{error} Or write a dataset of {path} by `forcegp import`.") from None
-                dataset = forcegp.Dataset.load(out)
         require_same_joints(posterior, dataset, path)
         return dataset
 

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.evaluation
 import forcegp.posterior
+import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, FIELDS, Overwriting, listed, unless_given
 from forcegp.cli.estimates import estimates_table
@@ -48,7 +48,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
     """What is estimated beside it, as for forcegp fit."""
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Low-pass filter of a raw log. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto|each")] = "auto"
+    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
     """Delay of u in the log, in s."""
     out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
     """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
@@ -61,7 +61,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
         notes += forces_of(model)
         words = [word for word in self.forces if word != "none"]
-        model = forcegp.evaluation.named_model(model, words)
+        model = forcegp.scores.named_model(model, words)
         with terminal.progress("identifying", may_end_early=True) as report:
             found = with_payload(model, rows, self.link, baseline, report)
         content = {"data": str(self.data), **payload_dict(found, baseline is not None)}
@@ -110,7 +110,7 @@ def with_payload(
     noisy = "u" if model.robot.space.is_vector_space else "both"
     evidence = (forcegp.Torques(noisy, mean=WINDOW),)
     loaded = model.with_forces(*bodies, forcegp.Payload(link))
-    return forcegp.evaluation.learn(loaded, rows, evidence, baseline=baseline, report=report)[0]
+    return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline, report=report)[0]
 
 
 def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.evaluation
 import forcegp.report
+import forcegp.scores
 from forcegp.cli.command import URDF, Overwriting, unless_given
 from forcegp.cli.input_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
@@ -79,7 +79,7 @@ class Robot(RobotFileOptions, Overwriting):
             if scene.doubts:
                 terminal.note(f"{len(scene.doubts)} meshes are drawn as capsules, for example: {scene.doubts[0]}")
             if drawn is not None:
-                forcegp.evaluation.save_figure(forcegp.report.robot_figure(scene), drawn)
+                forcegp.scores.save_figure(forcegp.report.robot_figure(scene), drawn)
                 content["picture"] = str(drawn)
                 terminal.note(f"picture: {drawn}")
             if self.browser:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import forcegp
 import forcegp.checks
-import forcegp.evaluation
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -33,7 +32,7 @@ OTHERWISE = {
 """Options whose argument has another name in Python."""
 
 ELSEWHERE = {
-    "`posterior.with_model(dataset.model)`": "--system data (of forcegp evaluate and rollout)",
+    "`posterior.with_model(dataset.model)`": "--system data",
     "forcegp.data.rows_in_contact": "--rows in-contact",
 }
 """Calls of Python that an option stands for."""
@@ -230,9 +229,6 @@ def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> st
 
 
 NONE = "–"
-NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
-NORMAL_FORCES_KNOWN = "it follows from the known forces alone"
-NORMAL_FORCES_SEEN = "this prior leaves no force along the contact normal free, so accelerations decide it"
 
 
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
@@ -295,65 +291,6 @@ def findings_table(findings: Sequence[forcegp.checks.Finding], worded: Callable[
         if finding.remedy:
             table.add_row("", Text(f"→ {worded(finding.remedy)}", style="dim"))
     return table
-
-
-def evaluation_table(title: str, evaluation: forcegp.Evaluation) -> Table:
-    """One line per joint and their mean."""
-    header = ["joint", "MAE", "noise-\nfree", "RMSE", "NLPD", "in 95 %\nband", "MAE, known\nphysics"]
-    formats = {
-        "mae": number,
-        "mae_noise_free": number,
-        "rmse": number,
-        "nlpd": nats,
-        "coverage_95": percent,
-        "known_physics_mae": number,
-    }
-    rows = []
-    for joint, name in enumerate(evaluation.joint_names):
-        each = {score: getattr(evaluation, f"{score}_per_joint") for score in formats}
-        cells = [show(None if each[score] is None else each[score][joint]) for score, show in formats.items()]
-        rows.append([name, *cells])
-    means = [show(getattr(evaluation, score)) for score, show in formats.items()]
-    return columns(title, header, rows, last=["mean (NLPD: joint)", *means])
-
-
-def multiplier_scores(evaluation: forcegp.Evaluation) -> str:
-    """`MAE 1.2345 N, 90.1 % in the 95 % band`, against the true multipliers."""
-    inside = percent(evaluation.multiplier_coverage_95)
-    return f"MAE {number(evaluation.multiplier_mae)} N, {inside} in the 95 % band"
-
-
-def force_facts(scores: forcegp.evaluation.ForceScores, normal_forces: str) -> dict[str, str]:
-    """One line per force whose true value is given: its errors relative to its size, and whether the intervals hold.
-
-    `normal_forces` is a remark on what determines the multiplier.
-    """
-    values = {f"{name}, at the joints": _force_scores(score) for name, score in scores.joint_force.items()}
-    values |= {f"{name}, at its point": _force_scores(score) for name, score in scores.point_force.items()}
-    if scores.multiplier is not None:
-        text = f"MAE {number(scores.multiplier.mae)} N, {_force_scores(scores.multiplier)}; {normal_forces}"
-        values["contact force (multiplier)"] = text
-    return values
-
-
-def slip_facts(scores: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
-    """One line per foot: its least margin to slipping, and in how many rows it rather slips."""
-    return {
-        f"margin of {foot} to slipping": f"{each['least_margin']:.3g} ± {each['std']:.2g} N at least (row "
-        f"{each['row']}); slips in {percent(each['slipping'])} of the rows, "
-        f"with probability {each['most_likely']:.2g} at most"
-        for foot, each in scores.items()
-    }
-
-
-def _force_scores(score: forcegp.evaluation.ForceScore) -> str:
-    """`RMS error 2.3 %, 94.1 % in the 95 % band`; the error in Nm or N where there is no force."""
-    if score.relative_rmse is None:
-        error = f"{number(score.rmse)} (the true force is zero)"
-    else:
-        share = 100.0 * score.relative_rmse
-        error = f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %"
-    return f"RMS error {error}, {percent(score.coverage_95)} in the 95 % band"
 
 
 def number(value: float | None) -> str:

@@ -23,7 +23,7 @@ from typing_extensions import override
 from forcegp.atomic_files import atomic_file
 from forcegp.control.controller import per_joint
 from forcegp.data import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.evidence.identifiability import base_parameters, torque_regressor
@@ -33,7 +33,6 @@ from forcegp.inference.threads import blas_threads
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.components import inverse_dynamics
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.update import learn_more_rows
@@ -66,7 +65,7 @@ class LearnedForces:
 
     judged_at: tuple[Values, Values, Values]
 
-    def __init__(self, posterior: StructuredPosterior, rows: int) -> None:
+    def __init__(self, posterior: Posterior, rows: int) -> None:
         self.rows, free, own = rows, posterior.model.with_contacts(()), posterior.likelihood
         own = replace(own, model=free, fixed_standardization=own.standardization)
         self.posterior = replace(posterior, likelihood=own, target=free)
@@ -78,7 +77,7 @@ class LearnedForces:
         """u (n, nv) in Nm or N of q, v and a."""
         return inverse_dynamics(self.posterior, [torch.as_tensor(x) for x in states], None, False).mean.numpy()
 
-    def after(self, motion: Motion, posterior: StructuredPosterior) -> StructuredPosterior:
+    def after(self, motion: Motion, posterior: Posterior) -> Posterior:
         """`posterior` with rows of the motion, far apart, at which just what it predicts was measured."""
         some = far_apart(motion.q, motion.v, motion.u, self.rows)
         q, v, _, u = (x[some] for x in motion[1:])
@@ -87,7 +86,7 @@ class LearnedForces:
         rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model)
         return learn_more_rows(posterior, rows, None, rows_to_keep)
 
-    def spread(self, posterior: StructuredPosterior) -> np.ndarray:
+    def spread(self, posterior: Posterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""
         return posterior.predict(*self.judged_at).variance.mean(0).sqrt().numpy()
 
@@ -140,8 +139,8 @@ class Excitation(Summary):
     surfaces: Sequence[Contact]
     clearance: float
     motion: Motion
-    model: StructuredPosterior | None = None
-    expected: StructuredPosterior | None = None
+    model: Posterior | None = None
+    expected: Posterior | None = None
     spread: np.ndarray | None = None
     condition: float | None = None
 
@@ -284,7 +283,7 @@ def excitation(
 ) -> Excitation:
     """The motion from rest at `start` and back after which learned forces are surest.
 
-    * model: a `StructuredPosterior`, whose accelerations at the states of `task` (None: any within the limits) are to
+    * model: a `Posterior`, whose accelerations at the states of `task` (None: any within the limits) are to
       be sure once it has learned from `rows` rows of the motion; or a robot or another model, for the
       identification of base parameters and friction.
     * limits: of "position" (from the start), "velocity", "acceleration" and "torque", numbers or one per joint, in rad,
@@ -312,7 +311,7 @@ def excitation(
     start = finite_vector("start", start, robot.nv)
     bounds = motion_limits(robot, start, require_type("limits", {} if limits is None else limits, Mapping), margin)
     rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
-    learned = model if isinstance(model, StructuredPosterior) and model.latent_names else None
+    learned = model if isinstance(model, Posterior) and model.latent_names else None
     teaches = BaseParameters(known, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
     if known.loops:
         raise InvalidInput("motions are planned joint by joint, which would break the closed loops of this robot.")

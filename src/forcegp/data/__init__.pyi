@@ -3,8 +3,7 @@ from .row_selection import (
     require_disjoint as require_disjoint,
 )
 from .contact_evidence import (
-    contact_rows as contact_rows, rows_in_contact as rows_in_contact, ContactDoubt as ContactDoubt,
-    contact_doubts as contact_doubts,
+    contact_rows as contact_rows, rows_in_contact as rows_in_contact, contact_doubts as contact_doubts,
 )
 from .dataset import Dataset as Dataset
 from .memory import with_memory as with_memory

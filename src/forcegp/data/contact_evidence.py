@@ -7,8 +7,7 @@ same under other contacts: with the point moved, without any, or with one that t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +16,9 @@ from jaxtyping import Bool, Float
 import forcegp.mechanics
 from forcegp.data.contact_residual import BLOCKS, Residual, missing_contact, moved_points, tensors
 from forcegp.data.dataset import Dataset
+from forcegp.data.findings import Finding, look, wrong
 from forcegp.data.row_selection import move_on
+from forcegp.data.successive_rows import white_noise
 from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
@@ -107,7 +108,7 @@ class _PointMotion(NamedTuple):
 def _point_motions(
     dataset: Dataset,
     model: forcegp.Model,
-    noise_seen: tuple[np.ndarray, np.ndarray] | None = None,
+    noise_seen: tuple[np.ndarray, ...] | None = None,
 ) -> list[_PointMotion]:
     """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
     q, v, u, a = tensors(dataset)
@@ -167,32 +168,18 @@ NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ContactDoubt:
-    """What the rows say against the contacts: `seen` in words with numbers, `remedy`, and `numbers` for programs.
-
-    `kind`: "off" (the motion leaves the surface), "point" (forces act elsewhere), "no force", "missing".
-    """
-
-    kind: str
-    seen: str
-    remedy: str
-    numbers: dict[str, Any] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        return f"{self.seen} {self.remedy}"
-
-
-def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list[ContactDoubt]:
+def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list[Finding]:
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
-    say nothing. Not for contacts that hold several points of one body, nor for robots with closed loops.
+    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere), "no force"
+    or "missing". Not for contacts that hold several points of one body, nor for robots with closed loops.
     """
     model = dataset.model if model is None else model
     if model is None or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
         return []
-    noise = _white_noise(dataset.v, dataset), _white_noise(dataset.a, dataset)
+    seen = [white_noise(dataset, signal=name) if move_on(dataset) else None for name in ("v", "a")]
+    noise = tuple(np.zeros(dataset.nv) if each is None else np.nan_to_num(each) for each in seen)
     rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
     with torch.no_grad():
         try:
@@ -201,18 +188,7 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list
             return []  # states that no contact bears: who computes with them raises what is wrong
 
 
-def _white_noise(values: Float[np.ndarray, "rows nv"], dataset: Dataset) -> Float[np.ndarray, " nv"]:
-    """Standard deviations of white noise, from medians of third differences, whose variance is 20 times its.
-
-    0 for rows that are no recorded motion.
-    """
-    if not dataset.time_ordered or not move_on(dataset):
-        return np.zeros(dataset.nv)
-    thirds = np.concatenate([np.diff(values[dataset.episode == number], 3, axis=0) for number in dataset.episodes])
-    return 1.4826 * np.median(np.abs(thirds), axis=0) / 20.0**0.5 if len(thirds) else np.zeros(dataset.nv)
-
-
-def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, np.ndarray]) -> list[ContactDoubt]:
+def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> list[Finding]:
     touching = np.ones(len(rows), dtype=bool)
     motions = _point_motions(rows, model, noise_seen)
     for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
@@ -248,14 +224,14 @@ def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, n
         else:
             touching[acts] &= along
             continue
-        numbers = {"contact": index, "share": share, "distance": far}
-        return [ContactDoubt(kind="off", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]
+        numbers = {"kind": "off", "contact": index, "share": share, "distance": far}
+        return [wrong(subject="contact", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]
     if touching.sum() < FEWEST_ROWS:
         return []
     return _forces(rows.rows(touching), model)
 
 
-def _forces(rows: Dataset, model: forcegp.Model) -> list[ContactDoubt]:
+def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
     """Whether forces act at the points that the contacts state, and whether there are any."""
     if len(rows) * (rows.nv - len(model.contacts)) < 2 * (3 * rows.nv + 5 * len(model.contacts)):
         return []
@@ -278,27 +254,33 @@ def _forces(rows: Dataset, model: forcegp.Model) -> list[ContactDoubt]:
             point = np.asarray(contact.point) + shift @ tangents[index]
             text = ",".join(f"{value + 0.0:.3g}" for value in np.round(point, 4))
             doubts.append(
-                ContactDoubt(
-                    kind="point",
+                look(
+                    subject="contact",
                     seen=f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
                     f"{100.0 * min(size, 1.0):.2g} cm ± {100.0 * uncertain:.1g} cm beside the stated point.",
                     remedy=f"Check the contact's point (near {text}?), or what else presses against the robot.",
-                    numbers={"contact": index, "shift": size, "std": uncertain, "point": point.tolist()},
+                    numbers={
+                        "kind": "point",
+                        "contact": index,
+                        "shift": size,
+                        "std": uncertain,
+                        "point": point.tolist(),
+                    },
                 )
             )
     if not doubts and necessary < NO_FORCE:
         doubts.append(
-            ContactDoubt(
-                kind="no force",
+            look(
+                subject="contact",
                 seen="the accelerations show no force of the stated contact: they fit as well without it.",
                 remedy="If nothing was touched, leave the contact out (`contacts=none`).",
-                numbers={"gain": necessary},
+                numbers={"kind": "no force", "gain": necessary},
             )
         )
     return doubts
 
 
-def _missing(rows: Dataset, model: forcegp.Model) -> list[ContactDoubt]:
+def _missing(rows: Dataset, model: forcegp.Model) -> list[Finding]:
     """A point of a last link that stays on a plane or sphere, with a force that accelerations need."""
     found = missing_contact(rows, model)
     if found is None:
@@ -311,11 +293,11 @@ def _missing(rows: Dataset, model: forcegp.Model) -> list[ContactDoubt]:
     else:
         where = "a sphere" if isinstance(surface, forcegp.mechanics.Sphere) else "a surface"
     return [
-        ContactDoubt(
-            kind="missing",
+        look(
+            subject="contact",
             seen=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations "
             "need a force along its normal.",
             remedy="State it (`contacts`), or leave out the rows in contact.",
-            numbers={"frame": contact.frame, "gain": gain},
+            numbers={"kind": "missing", "frame": contact.frame, "gain": gain},
         )
     ]

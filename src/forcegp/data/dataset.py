@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, overload
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -16,16 +16,20 @@ from typing_extensions import override
 import forcegp.model
 from forcegp.data.dataset_fields import (
     FrozenDict,
-    arrays_of,
     finite_columns,
-    frame_of,
     frozen_json,
     integer_column,
     units_for,
     validated_units,
 )
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_known, usable_arguments
+from forcegp.errors import (
+    DatasetError,
+    FileFormatError,
+    InvalidInput,
+    require_type,
+    usable_arguments,
+)
 from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
@@ -128,47 +132,9 @@ class Dataset(Summary):
     __iter__: ClassVar[None] = None
     """Rows are arrays: without this, Python would iterate by `dataset[0]`, `dataset[1]`, ..."""
 
-    @overload
-    def __getitem__(self, index: str) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, index: int | np.integer | slice | Sequence[int] | np.ndarray) -> Dataset: ...
-    def __getitem__(self, index: str | int | np.integer | slice | Sequence[int] | np.ndarray) -> np.ndarray | Dataset:
-        """`dataset["q"]` is a column, `dataset[10:20]`, `dataset[mask]`, `dataset[[3, 1]]`, `dataset[5]` are `rows`.
-
-        Raises InvalidInput for a column or row that is not there.
-        """
-        if not isinstance(index, str):
-            return self.rows([int(index)] if isinstance(index, int | np.integer) else index)
-        columns = self._columns()
-        require_known("column", index, "this Dataset", columns)
-        return columns[index]
-
-    def to_pandas(self) -> Any:
-        """A pandas DataFrame: time, episode, `q.JOINT` ..., `truth.Q_U.JOINT` ....
-
-        Raises MissingExtra without pandas.
-        """
-        truth = {f"truth.{name}": values for name, values in self.truth.items()}
-        return frame_of(
-            {**self._columns(), **truth}, {name: self._columns_of(name) for name in "quva"} | {"": self.joint_names}
-        )
-
-    @staticmethod
-    def from_pandas(frame: Any, model: forcegp.model.Model | None = None, **more: Any) -> Dataset:
-        """The Dataset of a frame with the columns of `to_pandas`, of which time, q, v, u and a must be there.
-
-        `more` are other fields, for example `units` and `noise_std`. Raises DatasetError for columns that are missing
-        or not valid, MissingExtra without pandas.
-        """
-        own = {} if model is None else {"q": model.robot.position_names, "u": model.inputs}
-        given: dict[str, Any] = {**arrays_of(frame, own), "model": model, **more}
-        return Dataset(**given)
-
-    def _columns(self) -> dict[str, np.ndarray]:
-        names = ("time", "episode", "q", "v", "u", "a", "noise_std")
-        stated = {name: getattr(self, name) for name in names}
-        by_row = {"noise_std": None if self.noise_std is None else np.broadcast_to(self.noise_std, self.v.shape)}
-        return {name: values for name, values in {**stated, **by_row}.items() if values is not None}
+    def __getitem__(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
+        """`dataset[10:20]`, `dataset[mask]` and `dataset[[3, 1]]` are `rows`."""
+        return self.rows(index)
 
     def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
         return partial(Dataset, **self._fields()), ()
@@ -220,20 +186,6 @@ class Dataset(Summary):
                 f"no episodes {missing if wanted else '(none asked for)'}; this Dataset has {list(self.episodes)}."
             )
         return self.rows(np.isin(self.episode, wanted))
-
-    def split_by_episode(self, test_episodes: Iterable[int]) -> tuple[Dataset, Dataset]:
-        """`(train, test)`, where `test` holds whole episodes and no trajectory is in both.
-
-        Raises InvalidInput for numbers that do not occur and when nothing is left for training.
-        """
-        wanted = set(test_episodes)
-        test = self.select_episodes(sorted(wanted))
-        rest = [number for number in self.episodes if number not in wanted]
-        if not rest:
-            raise InvalidInput(
-                f"all {len(self.episodes)} episodes {list(self.episodes)} are for testing; none is left to train on."
-            )
-        return self.select_episodes(rest), test
 
     def save(self, path: str | Path) -> None:
         """Write an HDF5 file (docs/how-to/data-format.md); an interrupted write leaves the old file, or none."""
@@ -365,3 +317,13 @@ def _row_numbers(index: slice | Sequence[int] | np.ndarray, rows: int) -> np.nda
         values, counts = np.unique(chosen, return_counts=True)
         raise InvalidInput(f"row {values[counts > 1][0]} is selected more than once; select each row once.")
     return chosen
+
+
+def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str, example: str = "") -> None:
+    """Raise InvalidInput unless `rows` is a Dataset with these joints, which are those of `whose`."""
+    own = require_type(name, rows, Dataset, example).joint_names
+    if tuple(own) != tuple(joint_names):
+        raise InvalidInput(
+            f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}; give data of the "
+            "same robot, with its joints in the same order"
+        )

@@ -1,4 +1,4 @@
-"""What a Dataset is made of: checked read-only columns, units, frozen metadata; and its columns as a pandas frame."""
+"""What a Dataset is made of: checked read-only columns, units, frozen metadata."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 import forcegp.robots
-from forcegp.errors import DatasetError, required_extra
+from forcegp.errors import DatasetError
 from forcegp.robots.arguments import real_array
 
 
@@ -163,55 +163,3 @@ def _per_quantity(per_joint: Sequence[Mapping[str, str]]) -> FrozenDict:
     columns = {name: tuple(own[name] for own in per_joint) for name in ROTATION}
     merged = {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in columns.items()}
     return FrozenDict({**merged, "time": "s"})
-
-
-TRUTH = "truth."
-
-
-def frame_of(arrays: Mapping[str, np.ndarray], names: Mapping[str, tuple[str, ...]]) -> Any:
-    """Arrays (rows,) and (rows, columns) by name; `names` of the columns of some, "" of the others.
-
-    Raises MissingExtra without pandas.
-    """
-    pandas = required_extra("pandas", "pandas", "a DataFrame")
-    columns = {}
-    for name, values in arrays.items():
-        if values.ndim == 1:
-            columns[name] = values
-            continue
-        own = names.get(name, names[""])
-        labels = own if values.shape[1] == len(own) else range(values.shape[1])
-        columns |= {f"{name}.{label}": values[:, k] for k, label in enumerate(labels)}
-    return pandas.DataFrame(columns)
-
-
-def arrays_of(frame: Any, own: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
-    """Arguments of a Dataset from the columns of `frame_of`, the joints in the order of v.
-
-    `own` names the columns of q and u where these are not the joints.
-    """
-    required_extra("pandas", "pandas", "a DataFrame")
-    joints = tuple(column[2:] for column in map(str, frame.columns) if column.startswith("v."))
-    columns: dict[str, dict[str, np.ndarray]] = {}
-    for column in map(str, frame.columns):
-        name, _, label = column.partition(".")
-        if column.startswith(TRUTH):  # both names may hold dots
-            ends = [joint for joint in joints if column.endswith(f".{joint}")]
-            label = max(ends, key=len, default=column.rpartition(".")[2])
-            name = column.removesuffix(f".{label}")
-        columns.setdefault(name, {})[label] = frame[column].to_numpy()
-    missing = [name for name in ("q", "v", "u", "a", "time") if name not in columns]
-    if missing:
-        raise DatasetError(
-            f"the frame lacks columns of {', '.join(missing)}; it needs time, and q.JOINT, v.JOINT, u.JOINT, "
-            "a.JOINT of every joint, as to_pandas() writes them."
-        )
-    arrays: dict[str, Any] = {"joint_names": joints, "truth": {}}
-    for name, parts in columns.items():
-        wanted = own.get(name, joints)
-        labels = wanted if set(parts) == set(wanted) else tuple(parts)
-        values = parts[""] if "" in parts else np.column_stack([parts[label] for label in labels])
-        if name in ("q", "v", "u", "a", "noise_std") and labels != wanted:
-            raise DatasetError(f"the frame has {name} of {', '.join(parts)}, but v of {', '.join(joints)}.")
-        (arrays["truth"] if name.startswith(TRUTH) else arrays)[name.removeprefix(TRUTH)] = values
-    return arrays

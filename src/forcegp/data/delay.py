@@ -15,8 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 import forcegp.robots
-from forcegp.data.dataset import Dataset
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import Dataset, require_rows
 from forcegp.data.filtering import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 
@@ -58,12 +57,6 @@ class Delay:
     residual: Float[np.ndarray, "2 nv"]
     remains: float
     kind: str = "delay"
-
-    @property
-    def each(self) -> Float[np.ndarray, " nv"]:
-        """That of each joint where it is more than three standard deviations from zero and explains something, or 0."""
-        remains = self.residual[1] / np.maximum(self.residual[0], TINY)
-        return np.where((np.abs(self.seconds) > SIGNIFICANT * self.std) & (remains < WORTH), self.seconds, 0.0)
 
     def _showing(self, seconds: float) -> np.ndarray:
         """Delays of the joints that show this one, to within three standard deviations or a half of it."""
@@ -108,17 +101,16 @@ def estimate_delay(
     robot: forcegp.robots.Robot | None = None,
     *,
     kind: Literal["delay", "lag"] = "delay",
-    largest: float = LARGEST_DELAY,
 ) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
-    For every shift up to `largest` [s] to either side, u is fitted by least squares to what rigid bodies with friction
+    For every shift up to .2 s to either side, u is fitted by least squares to what rigid bodies with friction
     in the joints need: the torque regressor of `robot` (default: that of `dataset.model`), acceleration and velocity
     of the joint, smooth signs of the velocity of several widths, and a constant. So the delay rests neither on the
     robot's parameters nor on one law of friction: with one smooth sign, friction that falls with velocity looked 20 ms
     late. The laws of the dataset's model have columns, too. The best
     shift has the least sum of squares, by a parabola through the three smallest: among shifts up to 50 ms and, where it
-    lies at their end, up to `largest`, for each joint and for all together. Its standard deviation comes from leaving
+    lies at their end, up to .2 s, for each joint and for all together. Its standard deviation comes from leaving
     out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and the bootstrap for general
     stationary observations").
 
@@ -128,13 +120,13 @@ def estimate_delay(
     whose forces are not known; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
-    near = _estimated(dataset, robot, min(largest, USUAL_DELAY), kind)
+    near = _estimated(dataset, robot, USUAL_DELAY, kind)
     open_ones = np.isnan(near.seconds) & np.isfinite(near.residual[0])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
-    if largest <= USUAL_DELAY or not (open_ones.any() or at_end):
+    if not (open_ones.any() or at_end):
         return near
     try:
-        far = _estimated(dataset, robot, largest, kind)
+        far = _estimated(dataset, robot, LARGEST_DELAY, kind)
     except DatasetError:  # too short for that
         return near
     if at_end:
@@ -231,8 +223,6 @@ class _Shifts:
     """The rows that are compared, and how to shift a torque against them."""
 
     def __init__(self, dataset: Dataset, largest: float, kind: str) -> None:
-        if not 0.0 < largest < np.inf:
-            raise InvalidInput(f"the largest delay is {largest} s; it must be positive and finite.")
         thin = max(1, -(-len(dataset) // MOST_ROWS))
         rows, self.episodes = [np.zeros(0, int)], []
         for number, part, _ in episodes_in_order(dataset):

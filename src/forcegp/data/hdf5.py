@@ -3,9 +3,9 @@
 Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
 """
 
-import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,19 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
     """Write the fields of a Dataset, as `atomic_file` writes and raises."""
     arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
-    with atomic_file(path) as temporary, NewFile(temporary) as file:
+    with atomic_file(path) as temporary, new_file(temporary) as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
-        describe(fields, file)
+        file.attrs["format"] = FORMAT
+        file.attrs["format_version"] = VERSION
+        file.attrs["written_by"] = f"forcegp {__version__}"
+        file.attrs["time_ordered"] = fields["time_ordered"]
+        for name, unit in fields["units"].items():
+            file[name].attrs.create("units", unit, dtype=_TEXT)
+        file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
+        file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
+        if fields["model"] is not None:
+            file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
 
 
 def is_dataset(path: Path) -> bool:
@@ -45,79 +54,18 @@ def is_dataset(path: Path) -> bool:
         return False
 
 
-class NewFile(h5py.File):
-    """An empty HDF5 file to write to, whose context raises OSError where the disk is full.
+@contextmanager
+def new_file(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file that is written as a whole where the context ends. Raises OSError where the disk is full.
 
-    HDF5 that cannot write cannot close its file either, and crashes the process at its end (2.0.0, segmentation fault).
-    So it writes through `_Sink`, which keeps the error to itself until the file is closed.
+    Until then it is in memory: HDF5 that cannot write cannot close its file either, and crashes the process at its end
+    (2.0.0, segmentation fault).
     """
-
-    def __init__(self, path: Path) -> None:
-        self._sink = _Sink(path, "x+b")
-        super().__init__(self._sink, "w")
-
-    def close(self) -> None:
-        """Write what is left. Raises OSError where something was not written."""
-        super().close()
-        self._sink.close()
-        self.require_written()
-
-    def require_written(self) -> None:
-        """Raise what kept data from being written so far."""
-        error = self._sink.error
-        if error is not None:
-            raise OSError(error.errno, error.strerror, str(self._sink.name))
-
-
-class _Sink(io.FileIO):
-    """A file that takes whatever it is given: what the disk does not take, and all that follows, stays in memory.
-
-    So HDF5 reads what it has written, which it needs in order to close the file.
-    """
-
-    error: OSError | None = None
-
-    def __init__(self, path: Path, mode: str) -> None:
-        super().__init__(path, mode)
-        self._lost: list[tuple[int, bytes]] = []
-
-    def write(self, data: Any, /) -> int:
-        view, begin = memoryview(data).cast("B"), self.tell()
-        done = 0
-        try:
-            while done < len(view) and self.error is None:
-                done += super().write(view[done:])
-        except OSError as error:
-            self.error = error
-        if done < len(view):
-            self._lost.append((begin + done, bytes(view[done:])))
-            self.seek(begin + len(view))
-        return len(view)
-
-    def readinto(self, buffer: Any, /) -> int:
-        view, begin = memoryview(buffer).cast("B"), self.tell()
-        count = super().readinto(view)
-        if not self._lost:
-            return count
-        for start, data in self._lost:
-            first, last = max(start, begin), min(start + len(data), begin + len(view))
-            if first < last:
-                view[first - begin : last - begin] = data[first - start : last - start]
-        self.seek(begin + len(view))
-        return len(view)
-
-    def seek(self, place: int, whence: int = 0, /) -> int:
-        if whence == io.SEEK_END and self._lost:
-            end = max(super().seek(0, io.SEEK_END), *(start + len(data) for start, data in self._lost))
-            return super().seek(end + place)
-        return super().seek(place, whence)
-
-    def truncate(self, size: int | None = None, /) -> int:
-        try:
-            return super().truncate(size)
-        except OSError as error:
-            self.error = self.error or error
-            return size or 0
+    with h5py.File("new", "w", driver="core", backing_store=False, block_size=2**24) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    path.write_bytes(image)
 
 
 def read_fields(path: Path) -> dict[str, Any]:
@@ -133,20 +81,6 @@ def read_fields(path: Path) -> dict[str, Any]:
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
         kind = "is damaged" if h5py.is_hdf5(path) else "is not an HDF5 file"
         raise FileFormatError(f"{path} {kind}: {error}. Write it again, or convert the log to a Dataset.") from error
-
-
-def describe(fields: Mapping[str, Any], file: h5py.File) -> None:
-    """Write what is no array of numbers; those whose units are stated must be in the file."""
-    file.attrs["format"] = FORMAT
-    file.attrs["format_version"] = VERSION
-    file.attrs["written_by"] = f"forcegp {__version__}"
-    file.attrs["time_ordered"] = fields["time_ordered"]
-    for name, unit in fields["units"].items():
-        file[name].attrs.create("units", unit, dtype=_TEXT)
-    file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
-    file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
-    if fields["model"] is not None:
-        file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
 
 
 def _check_header(path: Path, file: h5py.File) -> None:

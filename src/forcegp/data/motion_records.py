@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import InvalidInput
@@ -56,11 +56,10 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
         raise InvalidInput(
             f"no episode lasts {steps * dt:.4g} s: the longest has {dt * longest:.4g} s; ask for fewer seconds."
         )
+    before = _uneven_steps(dataset, dt)
     if isinstance(starts, int):
         if starts < 1:
             raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
-        gaps = np.abs(np.diff(dataset.time) - dt) > EVEN_STEPS * dt
-        before = np.concatenate([[0], np.cumsum(gaps)])
         whole = possible[before[possible + steps] == before[possible]]
         possible = whole if whole.size else possible  # which is refused then
         chosen = possible[np.unique(np.linspace(0, len(possible) - 1, starts).round().astype(int))]
@@ -77,7 +76,13 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
                     if latest[row] >= 0
                     else f"only {left:.4g} s are left from row {row} on, {steps * dt:.4g} s are needed; ask for fewer."
                 )
-    _require_even(dataset, chosen, steps, dt)
+    for row in chosen[before[chosen + steps] != before[chosen]][:1]:
+        pauses = np.diff(dataset.time[row : row + steps + 1])
+        worst = int(np.abs(pauses - dt).argmax())
+        raise InvalidInput(
+            f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere; resample "
+            "the recording to equal steps, or start where there is no gap."
+        )
     index = chosen[:, None] + np.arange(steps + 1)
     return RecordedMotions(
         tuple(int(row) for row in chosen), dt, dataset.q[index], dataset.v[index], dataset.u[index[:, :-1]]
@@ -92,13 +97,11 @@ def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[
     dt = _time_step(dataset)
     stride = max(1, int(longest_step / dt * (1.0 + EVEN_STEPS)))
     steps = stride * max(1, round(seconds / dt / stride))
-    starts = []
+    before, starts = _uneven_steps(dataset, dt), list[int]()
     for number in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == number)
-        for first in rows[: len(rows) - steps : steps]:
-            pauses = np.diff(dataset.time[first : first + steps + 1])
-            if np.abs(pauses - dt).max() <= EVEN_STEPS * dt:
-                starts.append(int(first))
+        firsts = rows[: len(rows) - steps : steps]
+        starts += firsts[before[firsts + steps] == before[firsts]].tolist()
     if not starts:
         raise InvalidInput(
             f"no stretch of {steps * dt:.4g} s has equal steps of {dt:.4g} s; give fewer seconds, or resample the "
@@ -114,12 +117,6 @@ def _time_step(dataset: Dataset) -> float:
     return float(np.median(pauses))
 
 
-def _require_even(dataset: Dataset, starts: np.ndarray, steps: int, dt: float) -> None:
-    for row in starts:
-        pauses = np.diff(dataset.time[row : row + steps + 1])
-        worst = int(np.abs(pauses - dt).argmax())
-        if abs(pauses[worst] - dt) > EVEN_STEPS * dt:
-            raise InvalidInput(
-                f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere; "
-                "resample the recording to equal steps, or start where there is no gap."
-            )
+def _uneven_steps(dataset: Dataset, dt: float) -> Int[np.ndarray, " rows"]:
+    """How many steps before each row are not of dt seconds."""
+    return np.concatenate([[0], np.cumsum(np.abs(np.diff(dataset.time) - dt) > EVEN_STEPS * dt)])

@@ -14,8 +14,7 @@ from forcegp.data.configurations import actuators, as_vectors, space_of
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, shifted, torques_of_joints
 from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
-from forcegp.data.held_out_cutoff import held_out_cutoff
-from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, motion_spectrum
+from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
@@ -23,7 +22,6 @@ from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
-AUTOMATIC = "auto", "each"
 PASSED, FEW = 3.0, 2_000  # rows in a period of the cut-off, of which more repeat their neighbours; of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 
@@ -37,10 +35,9 @@ class Preparation:
         and u as they are.
     order: of the filter; it runs forwards and backwards.
     delay: how much later than it acts u was logged [s], one number or one per actuator: `u(t) := u_logged(t + delay)`;
-        "auto" estimates one for all joints, "each" one for each (`estimate_delay`), used where it is sure and explains
-        something.
+        "auto" estimates one for all joints (`estimate_delay`), used where it is sure and explains something.
     lag: time constant of the actuators [s], one or one per actuator: `u` becomes what an actuator of first order makes
-        of it, T u_a' + u_a = u; "auto" and "each" as for the delay. Delay and lag look alike: estimate one of them.
+        of it, T u_a' + u_a = u; "auto" as for the delay. Delay and lag look alike: estimate one of them.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -52,8 +49,8 @@ class Preparation:
 
     cutoff: float | Literal["auto"] | None = None
     order: int = 4
-    delay: float | tuple[float, ...] | Literal["auto", "each"] = 0.0
-    lag: float | tuple[float, ...] | Literal["auto", "each"] = 0.0
+    delay: float | tuple[float, ...] | Literal["auto"] = 0.0
+    lag: float | tuple[float, ...] | Literal["auto"] = 0.0
     every: int = 1
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
@@ -69,11 +66,11 @@ class Preparation:
             if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
                 object.__setattr__(self, name, tuple(given))
             each = seconds_of(getattr(self, name))
-            if given not in AUTOMATIC and not (each and all(_finite(value) for value in each)):
-                raise InvalidInput(f"{name} is {given!r}; give seconds, one number per joint, 'auto' or 'each'.")
-            if name == "lag" and given not in AUTOMATIC and min(each) < 0.0:
+            if given != "auto" and not (each and all(_finite(value) for value in each)):
+                raise InvalidInput(f"{name} is {given!r}; give seconds, one number per joint, or 'auto'.")
+            if name == "lag" and given != "auto" and min(each) < 0.0:
                 raise InvalidInput(f"lag is {given!r}; an actuator acts after its command: at least 0 s.")
-        if self.delay in AUTOMATIC and self.lag in AUTOMATIC:
+        if self.delay == self.lag == "auto":
             raise InvalidInput("delay and lag are both to be estimated, and look alike; give one of them in s.")
         whole_number("every", self.every, 1)
         if not _finite(self.trim) or self.trim < 0:
@@ -129,23 +126,8 @@ def memory(metadata: Mapping[str, Any]) -> float:
 
 def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     """`metadata["preparation"]` as a `Preparation` leaves it; empty for what others may have put there."""
-    report: Any = metadata.get("preparation")
-    shapes = {
-        "cutoff": lambda value: value is None or (_are_numbers([value]) and 0.0 < value < np.inf),
-        **dict.fromkeys(("every", "trim"), lambda value: value is not None and _are_numbers([value])),
-        **dict.fromkeys(LATE, lambda value: None not in value and _are_numbers(value)),
-        "why": lambda value: isinstance(value, Mapping),
-        **dict.fromkeys(("power_removed", "acceleration_noise"), lambda value: all(map(_are_numbers, value.values()))),
-    }
-    try:
-        whole = all(fits(report[name]) for name, fits in shapes.items() if name in report)
-        return report if whole and isinstance(report, Mapping) else {}
-    except (TypeError, AttributeError):
-        return {}
-
-
-def _are_numbers(values: Any) -> bool:
-    return isinstance(values, list | tuple) and all(value is None or isinstance(value, int | float) for value in values)
+    report = metadata.get("preparation")
+    return report if isinstance(report, Mapping) and {"cutoff", "why", "rows"} <= report.keys() else {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -185,10 +167,9 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         chosen = replace(given, cutoff=cutoff)
         reasons["cutoff_per_joint"] = plain(each)
     for name in LATE:
-        how = getattr(given, name)
-        if how not in AUTOMATIC:
+        if getattr(given, name) != "auto":
             continue
-        if name == "lag" and how == "auto" and thruster_columns(dataset.model):
+        if name == "lag" and thruster_columns(dataset.model):
             seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
             pushing = thruster_columns(dataset.model)  # joints beside them do not follow so
             each = tuple(seconds * (column in pushing) for column in range(actuators(dataset)))
@@ -196,8 +177,8 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
             reasons[name] = f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
             continue
         found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
-        chosen = replace(chosen, **{name: found.significant if how == "auto" else tuple(found.each)})
-        reasons[name] = found.reason if how == "auto" else "that of each joint where it is sure"
+        chosen = replace(chosen, **{name: found.significant})
+        reasons[name] = found.reason
         reasons[f"{name}_common"], reasons[f"{name}_common_std"] = plain(np.array([found.common, found.common_std]))
         reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = plain(found.seconds), plain(found.std)
     return chosen, reasons

@@ -66,14 +66,14 @@ ROUNDING = 1e-13
 
 
 def farthest_point_sampling(
-    points: Float[np.ndarray, "rows features"], count: int, *, start: int | None = None, seed: int | None = None
+    points: Float[np.ndarray, "rows features"], count: int, *, start: int = 0
 ) -> Int[np.ndarray, " count"]:
     """Numbers of `count` rows of which each is the farthest from all rows chosen before it.
 
     Greedy k-centre (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance") with Euclidean distances
-    on columns standardised to zero mean and unit standard deviation. The first row is `start`, or drawn by `seed`, or
-    row 0. The result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are
-    the sample of size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
+    on columns standardised to zero mean and unit standard deviation. The first row is `start`. The
+    result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are the sample of
+    size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
     Time O(rows * count * features), memory O(rows * features).
 
     Raises InvalidInput if `points` is not a finite table, or for a `count` or `start` outside the rows.
@@ -88,7 +88,7 @@ def farthest_point_sampling(
     columns = _standardized_columns(table)
     distance = np.full(rows, np.inf)
     chosen = np.empty(count, dtype=np.int64)
-    chosen[0] = _first_row(rows, start, seed)
+    chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
     for position in range(count):
         if position:
             chosen[position] = np.argmax(distance)  # the lowest row number among equals
@@ -103,13 +103,13 @@ def farthest_point_sampling(
     return chosen
 
 
-def farthest_rows(dataset: Dataset, count: int, *, start: int | None = None, seed: int | None = None) -> Dataset:
+def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
     """The `count` rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`.
 
     A model trained on fewer points takes the first ones: `farthest_rows(data, 1000).rows(slice(100))`.
     """
     points = np.hstack([dataset.q, dataset.v, dataset.u])
-    return dataset.rows(farthest_point_sampling(points, count, start=start, seed=seed))
+    return dataset.rows(farthest_point_sampling(points, count, start=start))
 
 
 def _standardized_columns(table: np.ndarray) -> np.ndarray:
@@ -121,18 +121,6 @@ def _standardized_columns(table: np.ndarray) -> np.ndarray:
     spread[spread < ROUNDING] = 0.0
     centred = columns - columns.mean(axis=1, keepdims=True)
     return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)
-
-
-def _first_row(rows: int, start: int | None, seed: int | None) -> int:
-    if start is not None and seed is not None:
-        raise InvalidInput("give start (a row number) or seed (which draws one), not both.")
-    if seed is not None:
-        return int(np.random.default_rng(seed).integers(rows))
-    if start is None:
-        return 0
-    if not 0 <= start < rows:
-        raise InvalidInput(f"start is {start}; it must be a row number from 0 to {rows - 1}.")
-    return int(start)
 
 
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.data.dataset_arguments import require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.data.memory import with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows
@@ -19,7 +19,6 @@ from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.checks import check_forces, refuse_what_looks_alike, warn_of_contacts
-from forcegp.fit.independent import fit_independent
 from forcegp.fit.joint import (
     CHANGE,
     MOST_ROUNDS,
@@ -48,12 +47,12 @@ from forcegp.fit.search import (
     resolved_noise,
 )
 from forcegp.fit.widening import widened
-from forcegp.forces import IndependentAccelerations, UnknownForces
+from forcegp.forces import UnknownForces
 from forcegp.forces.registry import described_force
 from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
-from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
 from forcegp.robots.arguments import whole_number
@@ -84,8 +83,8 @@ def fit(
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
     Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
-    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then the functions
-    are conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`,
+    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then functions are
+    conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`,
     `posterior.predict(q, v, u)`.
 
     Parameters
@@ -208,7 +207,7 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
 
 def _of_numbers(
     model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int, progress: FitProgress | None
-) -> StructuredPosterior:
+) -> Posterior:
     """Laws and bodies alone, from all rows."""
     report = None if progress is None else partial(progress, ALL_ROWS)
     if rows is not None:
@@ -226,7 +225,7 @@ def _of_numbers(
         "noise": found.noise.to_dict(),
     }
     noise = found.noise.parameters(model.robot.nv, model.robot.device)
-    return StructuredPosterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)
+    return Posterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +244,6 @@ class _Functions:
         plain = unobserved(self.model)
         if len(plain.inputs) < len(self.model.inputs) and dataset.u.shape[1] == len(plain.inputs):
             return replace(self, model=plain).fitted(dataset, points, evidence)
-        if any(isinstance(force, IndependentAccelerations) for force in self.model.unknown_forces):
-            return fit_independent(self.model, dataset, points, self.search)
         if found := in_air(self.model, dataset):
             settings, seen = found
             assert seen.model is not None, "it was given one"
@@ -256,7 +253,7 @@ class _Functions:
             return learned.with_model(unobserved(learned.model)).with_settings(**settings)
         return self._of_rows(dataset, points)
 
-    def _of_rows(self, dataset: Dataset, points: int | None) -> StructuredPosterior:
+    def _of_rows(self, dataset: Dataset, points: int | None) -> Posterior:
         """From accelerations: hyper-parameters from some of the rows, the posterior from all."""
         chosen = engine_of(self.engine)
         all_rows = dataset
@@ -279,7 +276,7 @@ class _Functions:
         report = None if progress is None else partial(progress, ALL_ROWS)
         return on_all_rows(fitted, all_rows, chosen, described, hyperprior, report)
 
-    def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> StructuredPosterior:
+    def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> Posterior:
         """From windows: hyper-parameters and the posterior from all of them."""
         if not isinstance(engine_of(self.engine) or Exact(), Exact) or self.learning_points is not None:
             raise InvalidInput(
@@ -312,7 +309,7 @@ class _Functions:
                 start = closed._search(ordered.rows(slice(stage)), dataset).hyperparameters
         return start
 
-    def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
+    def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> Posterior:
         """Searches for functions with numbers of laws and bodies free, where these are open."""
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
@@ -339,16 +336,16 @@ class _Functions:
 
     def _beside_numbers(
         self, rows: Dataset | WindowedRows, dataset: Dataset, space: ParameterSpace, x: np.ndarray
-    ) -> StructuredPosterior:
+    ) -> Posterior:
         """One search with the numbers about x free."""
         here = replace(space.model_at(x), noise=self.model.noise)
         return replace(self, model=here)._search(rows, dataset, lambda given: with_free_numbers(given, space, x))
 
-    def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> StructuredPosterior:
+    def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> Posterior:
         """One search, or more under the normal force that friction changes."""
         first = self._search(rows, dataset)
 
-        def again(forces: UnknownForces, last: StructuredPosterior) -> StructuredPosterior:
+        def again(forces: UnknownForces, last: Posterior) -> Posterior:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DataWarning)  # the first fit gave it, of the same rows
                 begin = replace(self.search, restarts=1, start=last.hyperparameters)
@@ -362,7 +359,7 @@ class _Functions:
         rows: Dataset | WindowedRows,
         dataset: Dataset,
         beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None,
-    ) -> StructuredPosterior:
+    ) -> Posterior:
         """One search on these rows or windows of the log with the model as it is, and the exact posterior there.
 
         `beside` gives the likelihood in which numbers are free.
@@ -387,4 +384,4 @@ class _Functions:
         starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
         result, of_search = self.search.best(objective, starts)
         found = result.parameters | fixed, result, {**described, **of_search}
-        return StructuredPosterior.conditioned(model, training, *found, estimates=Estimates())
+        return Posterior.conditioned(model, training, *found, estimates=Estimates())

@@ -31,7 +31,7 @@ from forcegp.inference import LatentKernels, Terms
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.likelihood import deflated_covariance, whiten
 from forcegp.inference.linear_functionals import Functionals
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 
 MOST_ROUNDS = 6
@@ -130,7 +130,7 @@ def with_free_numbers(likelihood: MarginalLikelihood, space: ParameterSpace, x: 
 
 
 def numbers_beside(
-    posterior: StructuredPosterior, space: ParameterSpace, x: Float[np.ndarray, " k"]
+    posterior: Posterior, space: ParameterSpace, x: Float[np.ndarray, " k"]
 ) -> tuple[np.ndarray, Fit, float]:
     """Coordinates at fixed kernels, the search, and by how many standard deviations the farthest moved."""
     likelihood, slopes = posterior.likelihood, Slopes(posterior.training, space)

@@ -13,7 +13,7 @@ from forcegp.data.motion_records import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.training_data import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
-from forcegp.posterior import Posterior, StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.motion_intervals import DEVIATIONS, HORIZONS, MotionIntervals
 from forcegp.posterior.observed_wrench import in_own_air, observing, require_unobserved
 from forcegp.posterior.rollout import Rollout
@@ -50,17 +50,12 @@ def calibrated(
     Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
     """
     require_type("posterior", posterior, Posterior, ", as in calibrated(posterior, log)")
-    if not isinstance(posterior, StructuredPosterior):
-        raise InvalidInput(
-            f"a {posterior.description} would have to be trained again for every stretch that is left out; take a "
-            "model with physics."
-        )
     intervals = _intervals(posterior, dataset, horizons, integrator, report)
     return posterior.with_settings(motion_intervals=intervals.to_dict())
 
 
 def _intervals(
-    posterior: StructuredPosterior,
+    posterior: Posterior,
     dataset: Dataset,
     horizons: Sequence[float],
     integrator: str,
@@ -142,7 +137,7 @@ def _motions(part: Dataset, seconds: float) -> RecordedMotions:
     return RecordedMotions(found.rows, stride * found.dt, found.q[:, ends], found.v[:, ends], u)
 
 
-def _without(posterior: StructuredPosterior, rest: Dataset) -> StructuredPosterior:
+def _without(posterior: Posterior, rest: Dataset) -> Posterior:
     """The model from the other rows: as many of them, at the same hyper-parameters; refined on motions if it was."""
     refined = posterior.settings.get("motions")
     if refined is not None:

@@ -37,7 +37,7 @@ from forcegp.fit.motion_unknowns import SCALES, Unknowns
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.engines import InducingWeights
 from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 from forcegp.posterior.observed_wrench import in_own_air, require_unobserved, unobserved
 from forcegp.robots.manifold import ConfigurationSpace
@@ -261,16 +261,14 @@ class MotionFit:
 
 @torch.no_grad()
 def refine_on_motions(
-    posterior: StructuredPosterior, dataset: Dataset, seconds: float, bodies: bool, report: Report | None = None
-) -> StructuredPosterior:
+    posterior: Posterior, dataset: Dataset, seconds: float, bodies: bool, report: Report | None = None
+) -> Posterior:
     """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
 
     `report(step, rms of q in rad or m)` is called after each step. Where a base moves, errors of positions are steps in
     its axes. Observed wind counts as known. Raises InvalidInput for models without physics, windows that no episode has
     room for and uneven steps, NumericalError where no motion is found near the recorded one.
     """
-    if not isinstance(posterior, StructuredPosterior):
-        raise InvalidInput(f"a {posterior.description} has no forces that motions could refine; leave Motions() out.")
     require_unobserved(posterior, "refinements on motions")
     if posterior.carries_known_forces:
         raise InvalidInput(
@@ -296,9 +294,7 @@ def refine_on_motions(
     return found if seen is dataset else replace(found, target=unobserved(found.model))
 
 
-def _refined(
-    fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float, bodies: bool
-) -> StructuredPosterior:
+def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float, bodies: bool) -> Posterior:
     """The posterior there, with the covariance of the weights and of the numbers."""
     N, *_ = fit.curvature(here, noise, sigma)
     unknowns = fit.unknowns

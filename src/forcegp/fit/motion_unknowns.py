@@ -19,7 +19,7 @@ from forcegp.inference.inducing import WeightSpace, pivoted_cholesky
 from forcegp.integration.integrators import rows_jacobian
 from forcegp.integration.midpoint_sensitivities import Accelerations, Linear
 from forcegp.model import Model
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 
 POINTS = {1: 48, 2: 64}
 """Inducing points of a latent with so many features; `MORE` of others. What too few cannot be is small beside forces
@@ -34,14 +34,14 @@ a function is none: where laws of friction are all there is, it would cost motio
 class Unknowns:
     """Coordinates of the numbers of laws and bodies, then latent weights, and what they make of a posterior."""
 
-    start: StructuredPosterior
+    start: Posterior
     weights: WeightSpace
     space: ParameterSpace
     scales: Float[Tensor, " C"]
     """Standard deviation of the weights of each latent a priori, over that of its kernel."""
 
     @classmethod
-    def of(cls, posterior: StructuredPosterior, dataset: Dataset, bodies: bool) -> "Unknowns":
+    def of(cls, posterior: Posterior, dataset: Dataset, bodies: bool) -> "Unknowns":
         """Laws of the joints that the model lists, bodies where asked for, inducing points of its functions."""
         robot, _ = thickened(posterior.model.robot)
         model = posterior.model.with_robot(robot) if bodies else posterior.model
@@ -125,7 +125,7 @@ class Unknowns:
         """The model with these numbers."""
         return self.space.model_at(self.split(x)[0])
 
-    def posterior(self, x: Tensor, weights: WeightSpace | None = None) -> StructuredPosterior:
+    def posterior(self, x: Tensor, weights: WeightSpace | None = None) -> Posterior:
         """The posterior of that model with these weights."""
         weights = replace(self.weights, mean=self.split(x)[1]) if weights is None else weights
         latent = InducingPosterior(weights.kernels, weights) if self.weights.count else self.start.latent
@@ -166,7 +166,7 @@ class Unknowns:
         return Accelerations(mean, at, space)
 
 
-def _space(posterior: StructuredPosterior) -> WeightSpace:
+def _space(posterior: Posterior) -> WeightSpace:
     """Weights of as many inducing points as the latents' features need; of a refined model, those that it has."""
     if isinstance(posterior.engine, InducingWeights):
         assert isinstance(posterior.latent, InducingPosterior), "its engine is"

@@ -38,7 +38,7 @@ from forcegp.inference.linear_functionals import require_memory_for_functionals
 from forcegp.inference.memory import require_memory
 from forcegp.inference.threads import blas_threads
 from forcegp.noise import ACCELERATION
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.robots.arguments import whole_number
 
 FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9  # rows that noise is learned from, and the share of them that needs no word
@@ -105,13 +105,13 @@ def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
 
 
 def on_all_rows(
-    fitted: StructuredPosterior,
+    fitted: Posterior,
     rows: Dataset,
     engine: Engine | None,
     described: Mapping[str, Any],
     hyperprior: bool,
     report: Iteration | None = None,
-) -> StructuredPosterior:
+) -> Posterior:
     """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
 
     `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
@@ -148,9 +148,7 @@ TOLERANCE = 1e-6
 """Fraction of the bound by which an iteration must lower it for the search to go on."""
 
 
-def refined(
-    posterior: StructuredPosterior, hyperprior: bool, report: Callable[[int, float], None] | None = None
-) -> StructuredPosterior:
+def refined(posterior: Posterior, hyperprior: bool, report: Callable[[int, float], None] | None = None) -> Posterior:
     """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
 
     Where physical parameters were learned they and all others stay, for their standard errors belong together. Warns
@@ -204,10 +202,10 @@ of `PLACES`, whose difference is noise, it would soon be far from the curve itse
 
 
 def fit_with_refined_loads(
-    first: StructuredPosterior,
-    again: Callable[[UnknownForces, StructuredPosterior], StructuredPosterior],
+    first: Posterior,
+    again: Callable[[UnknownForces, Posterior], Posterior],
     rounds: int = ROUNDS,
-) -> StructuredPosterior:
+) -> Posterior:
     """`first` itself, or the last of the fits that follow it with the normal forces of the one before.
 
     Where an earlier one is more likely by more than `NOTICEABLE`, or the loads have not settled, the most likely one.
@@ -249,7 +247,7 @@ def fit_with_refined_loads(
     return best
 
 
-def _table(posterior: StructuredPosterior, latent: str) -> TabulatedCurve:
+def _table(posterior: Posterior, latent: str) -> TabulatedCurve:
     """The posterior mean of a friction curve over the velocities that the data visited, 0 included, and beyond."""
     visited = posterior.curve(latent, points=2).visited[:, 0]
     low, high = float(visited[0].clamp_max(0.0)), float(visited[1].clamp_min(0.0))
@@ -261,7 +259,7 @@ def _table(posterior: StructuredPosterior, latent: str) -> TabulatedCurve:
     return TabulatedCurve(tuple(places), tuple(mean.tolist()))
 
 
-def _change(posterior: StructuredPosterior, prior: UnknownForces) -> float:
+def _change(posterior: Posterior, prior: UnknownForces) -> float:
     """How much the other prior's mixing vectors differ at the training points."""
     with torch.no_grad():
         dynamics = posterior.likelihood.dynamics

@@ -27,7 +27,7 @@ from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.inference import LatentPosterior
 from forcegp.inference.posterior import FactorizedPosterior
 from forcegp.inference.threads import blas_threads
-from forcegp.posterior import StructuredPosterior
+from forcegp.posterior import Posterior
 from forcegp.posterior.motion_intervals import DEVIATIONS
 
 CONTENT, CONFIDENCE = 0.9, 0.995
@@ -45,7 +45,7 @@ NEGLIGIBLE = 1e-6
 """Standard deviation, as a fraction of the largest, below which a constraint leaves nothing open."""
 
 
-def widened(posterior: StructuredPosterior, hyperprior: bool) -> StructuredPosterior:
+def widened(posterior: Posterior, hyperprior: bool) -> Posterior:
     """The posterior with its `widening`, at least 1; without latents, itself."""
     if not len(posterior.kernels.kernels):
         return posterior
@@ -61,7 +61,7 @@ def widened(posterior: StructuredPosterior, hyperprior: bool) -> StructuredPoste
 class _States:
     """Some training states of a posterior, and the accelerations there as linear functions of the latents."""
 
-    def __init__(self, posterior: StructuredPosterior) -> None:
+    def __init__(self, posterior: Posterior) -> None:
         training = posterior.training
         count = len(training.q)
         at = torch.linspace(0, count - 1, min(STATES, count), device=training.q.device).round().long()
@@ -87,7 +87,7 @@ class _States:
         inside = torch.quantile((drawn[open_ones] / std[open_ones, None]).abs(), CONTENT, dim=0)
         return max(1.0, float(torch.quantile(inside, CONFIDENCE)) / DEVIATIONS)
 
-    def mixture_factor(self, posterior: StructuredPosterior, hyperprior: bool) -> float:
+    def mixture_factor(self, posterior: Posterior, hyperprior: bool) -> float:
         """Standard deviations with the hyper-parameters unknown, over those with them known; at least 1."""
         likelihood, kernels = posterior.likelihood, posterior.kernels
         _, fixed = likelihood.split_noise

@@ -147,7 +147,7 @@ class AerodynamicForce(BaseWrench):
     RA-L 2018) and a thrust that differs from the data sheet; "deviation" beside it is what they leave. Velocities are
     those against the air: the fit finds the wind of its rows (`forcegp.data.find_wind`), and where u has no columns of
     an `ObservedWind`, the air moves with `wind` [m/s, world], which the fit sets to the mean of its rows. `forcegp
-    evaluate` and `forcegp rollout` observe the wind of a recording, and the force that stays unexplained, from the rows
+    score` observes the wind of a recording, and the force that stays unexplained, from the rows
     before each (`forcegp.posterior.observing`). `observe` is the time in s that the observer of this force looks back;
     with None it follows the recording, and 0 observes nothing, neither here nor in the fit.
     """

@@ -157,11 +157,16 @@ class JointAccelerations(JointForces):
 
 @dataclass(frozen=True)
 class IndependentAccelerations(JointAccelerations):
-    """The accelerations themselves, whatever the contacts are: one Gaussian process per joint, without physics.
+    """Those of a model without contacts and laws: one Gaussian process per joint, without physics.
 
     The baseline "GP" of Rath et al. (2021), the row "independent GP" of every comparison. Nothing is shared between
-    joints, so that a fit costs nv N^3 and not (nv N)^3. It is a model's only force: `model.black_box()`.
+    joints, so that a search costs nv N^3 and not (nv N)^3. It is a model's only force: `model.black_box()`.
     """
+
+    @override
+    def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
+        if contacts:
+            raise InvalidInput("IndependentAccelerations know of no contact; model.black_box() is the model of them.")
 
 
 class PerJoint(Unknown):

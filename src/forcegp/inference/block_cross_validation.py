@@ -53,19 +53,6 @@ class LeaveOut:
         """Sum of `log_density` in nats, the score that models of the same data and blocks are compared by."""
         return float(self.log_density.sum())
 
-    @classmethod
-    def of_independent_outputs(cls, parts: "Sequence[LeaveOut]") -> "LeaveOut":
-        """The same rows and blocks, from models of one output each that share nothing."""
-        first = parts[0]
-        return cls(
-            first.blocks,
-            torch.stack([part.log_density for part in parts]).sum(0),
-            first.rows,
-            torch.stack([part.per_row for part in parts]).sum(0),
-            torch.cat([part.residual for part in parts], dim=-1),
-            torch.diag_embed(torch.cat([part.covariance[..., 0] for part in parts], dim=-1)),
-        )
-
 
 def leave_blocks_out(
     system: DeflatedSystem, noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"], blocks: Blocks | None = None

@@ -3,7 +3,6 @@ from .casadi_export import casadi_function as casadi_function, export_casadi as 
 from .components import Components as Components, Curve as Curve, ForceComponent as ForceComponent
 from .estimates import Estimate as Estimate, Estimates as Estimates
 from .friction_margin import FrictionMargins as FrictionMargins, friction_margins as friction_margins
-from .independent import IndependentPosterior as IndependentPosterior
 from .motion_intervals import HORIZONS as HORIZONS, MotionIntervals as MotionIntervals
 from .observed_wrench import observing as observing
 from .posterior import Posterior as Posterior
@@ -11,4 +10,3 @@ from .prediction import Linearization as Linearization, Gaussian as Gaussian, Pr
 from .predictor import Predictor as Predictor
 from .rollout import Rollout as Rollout, StepLinearization as StepLinearization
 from .storage import load_posterior as load_posterior, save_posterior as save_posterior
-from .structured import StructuredPosterior as StructuredPosterior

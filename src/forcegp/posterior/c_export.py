@@ -19,14 +19,14 @@ from torch import Tensor
 from forcegp.atomic_files import atomic_folder, require_writable
 from forcegp.codegen.library import Purpose, compile_library
 from forcegp.codegen.tracing import trace
-from forcegp.errors import CompilerError, InvalidInput, NumericalError
+from forcegp.errors import CompilerError, InvalidInput, NumericalError, require_type
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.posterior.c_files import CFiles, Check, identifier
 from forcegp.posterior.fused_rollouts import require_step
+from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor_code import PredictorCode
 from forcegp.posterior.predictor_preparation import rows_for, sample_states
-from forcegp.posterior.structured import StructuredPosterior
 
 STATES = 300
 """States at which the program is compared."""
@@ -56,7 +56,7 @@ class CExport:
 
 
 def export_c(
-    posterior: StructuredPosterior,
+    posterior: Posterior,
     folder: str | Path,
     *,
     covariance: bool = False,
@@ -85,11 +85,7 @@ def export_c(
     the engine has none to compress, steps that are no positive number, another integrator, and a folder that has files;
     CompilerError where the compiler fails, NumericalError where the program and `predict` differ, OSError.
     """
-    if not isinstance(posterior, StructuredPosterior):
-        raise InvalidInput(
-            f"a {type(posterior).__name__} cannot be exported as C; only models with rigid-body dynamics can: fit a "
-            "structured model (forcegp fit)."
-        )
+    require_type("posterior", posterior, Posterior)
     posterior = posterior.to("cpu") if posterior.training.q.device.type != "cpu" else posterior
     if steps is not None:
         require_step(steps, integrator, posterior.model)
@@ -126,7 +122,7 @@ def export_c(
     return CExport(export.name, folder, files, differences, inflation)
 
 
-def exported_code(posterior: StructuredPosterior, compressed: CompressedCovariance | None = None) -> PredictorCode:
+def exported_code(posterior: Posterior, compressed: CompressedCovariance | None = None) -> PredictorCode:
     """The programs. Raises InvalidInput that names the term of the prior, where one cannot be traced."""
     try:
         return posterior.code(compressed=compressed)
@@ -134,7 +130,7 @@ def exported_code(posterior: StructuredPosterior, compressed: CompressedCovarian
         raise _named(posterior, error) from None
 
 
-def _named(posterior: StructuredPosterior, error: InvalidInput) -> InvalidInput:
+def _named(posterior: Posterior, error: InvalidInput) -> InvalidInput:
     """The error of a graph that cannot be made, with the term of the prior that is the cause; others as they are."""
     why, traced, _ = str(error).partition(", which the model's")
     if not traced:

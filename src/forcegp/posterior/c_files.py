@@ -13,9 +13,9 @@ from forcegp.codegen.c_writer import head, write_function
 from forcegp.data import units_for
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.posterior.fused_rollouts import step_source
+from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.predictor_code import PredictorCode
-from forcegp.posterior.structured import StructuredPosterior
 
 STORED = 10
 """States of the self-test."""
@@ -52,7 +52,7 @@ class Check:
 class CFiles:
     """The texts of all files of a program; `reference` computes by torch what it does."""
 
-    posterior: StructuredPosterior
+    posterior: Posterior
     reference: Predictor
     code: PredictorCode
     name: str

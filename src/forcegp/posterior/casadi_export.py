@@ -18,7 +18,7 @@ from torch import Tensor
 from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.codegen.tracing import trace
-from forcegp.errors import InvalidInput, MissingExtra, NumericalError
+from forcegp.errors import MissingExtra, NumericalError, require_type
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.posterior.c_export import exported_code
@@ -27,7 +27,6 @@ from forcegp.posterior.fused_rollouts import require_step
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor_code import PredictorCode
 from forcegp.posterior.predictor_preparation import rows_for, sample_states
-from forcegp.posterior.structured import StructuredPosterior
 
 STATES = 100
 TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
@@ -57,8 +56,7 @@ def casadi_function(
         raise MissingExtra(
             "casadi_function needs CasADi, which is not installed; pip install 'forcegp[casadi]'."
         ) from None
-    if not isinstance(posterior, StructuredPosterior):
-        raise InvalidInput(f"no program can be written of a {posterior.description}; export a structured model.")
+    require_type("posterior", posterior, Posterior)
     code = exported_code(posterior)
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
@@ -77,7 +75,7 @@ def casadi_function(
 
 
 def export_casadi(
-    posterior: StructuredPosterior,
+    posterior: Posterior,
     folder: str | Path,
     *,
     steps: float | None = None,

@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.evidence import Accelerations
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import ConstrainedDynamics
@@ -113,7 +114,7 @@ class Curve:
 
 
 def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:
-    """Q_K + Q_U, the mean of what acts on the joints of a StructuredPosterior beside the contacts."""
+    """Q_K + Q_U, the mean of what acts on the joints of a Posterior beside the contacts."""
     Q_U = posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
     return dynamics.Q_K + Q_U
 
@@ -126,7 +127,7 @@ def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tens
 
 
 def require_actuated(posterior: Any) -> None:
-    """Raises InvalidInput for a StructuredPosterior of which no u can be solved for."""
+    """Raises InvalidInput for a Posterior of which no u can be solved for."""
     actuated = any(isinstance(force, Actuation) and force.known for force in posterior.model.laws)
     nv, nu = posterior.model.sizes[1:]
     if nv != nu:
@@ -142,7 +143,7 @@ def require_actuated(posterior: Any) -> None:
 
 
 def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool) -> Gaussian:
-    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a StructuredPosterior at rows of q, v and a.
+    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a Posterior at rows of q, v and a.
 
     u stands on both sides: friction in proportion to the load changes with what presses the robot onto the surface,
     and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
@@ -177,3 +178,56 @@ def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any
         at = posterior.dynamics(q, v, u)
         response = torch.linalg.solve(rows_jacobian(surplus, u)[1], posterior.trained.unknown.direction(at))
         return Gaussian(u, posterior.latents(at, True).through(response).covariance)
+
+
+def quantity_of(posterior: Any, of: Any, predicted: Any, states: Sequence[Any]) -> Gaussian:
+    """One of the quantities that `Posterior.predict` takes as `of`, from its prediction at these states."""
+    contacts, forces = list(posterior.model.contacts), list(posterior.model.unknown_forces)
+    if isinstance(of, Accelerations):
+        return predicted.acceleration
+    if of in contacts:
+        return predicted.contact_force.entries(slice(3 * contacts.index(of), 3 * contacts.index(of) + 3))
+    if of in forces:
+        components = posterior.components(*states, covariance=predicted.covariance is not None)
+        return list(components.values())[forces.index(of)].joint_force
+    raise InvalidInput(
+        f"of holds {of!r}; give Accelerations(), or a contact or an unknown force of the model that predicts."
+    )
+
+
+def curve_of(posterior: Any, latent: str, features: Any, points: int) -> Curve:
+    """What `Posterior.curve` documents."""
+    names = posterior.latent_names
+    require_known("latent", latent, "this model", names)
+    index = names.index(latent)
+    prior, robot = posterior.trained.unknown, posterior.trained.robot
+    with torch.no_grad():
+        given = prior.features(posterior.likelihood.dynamics)[index]
+        visited = torch.stack([given.amin(0), given.amax(0)]) if given.shape[-1] else given[:2]
+        z = _curve_features(latent, features, visited, points)
+        standardization = posterior.likelihood.standardization
+        shift, scale = (part[index] for part in (standardization.shift, standardization.scale))
+        mean, variance = posterior.latent.one(index, (z - shift) / scale)
+    labels = prior.feature_names(robot)
+    inputs = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
+    std = posterior.widening * variance.clamp_min(0.0).sqrt()
+    return Curve(latent, prior.latent_units(robot)[index], inputs, z, mean, std, visited)
+
+
+def _curve_features(latent: str, given: Any, visited: Tensor, points: int) -> Tensor:
+    """Features (n, d) of a curve, checked."""
+    count = visited.shape[-1]
+    if given is None:
+        if not count:
+            return visited[:1]  # a constant has one value
+        if count != 1:
+            raise InvalidInput(f"{latent!r} is a function of {count} features; give features (n, {count})")
+        if points < 1:
+            raise InvalidInput(f"a curve of points={points} was asked for; give 1 or more")
+        steps = torch.linspace(0.0, 1.0, points, dtype=torch.float64, device=visited.device)
+        return visited[0] + steps[:, None] * (visited[1] - visited[0])
+    z = real_tensor(f"features of {latent!r}", given, visited.device)
+    z = z[:, None] if z.dim() == 1 and count == 1 else z
+    if z.dim() != 2 or z.shape[-1] != count or not bool(torch.isfinite(z).all()):
+        raise InvalidInput(f"features of {latent!r} have shape {tuple(z.shape)}; give finite numbers (n, {count})")
+    return z

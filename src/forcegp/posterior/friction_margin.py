@@ -21,7 +21,6 @@ from forcegp.forces.contact_friction import ContactFriction
 from forcegp.mechanics import ConstrainedDynamics, Held, LoopClosure, RollingContact, surface_axes
 from forcegp.posterior.posterior import Array, Posterior
 from forcegp.posterior.prediction import Gaussian
-from forcegp.posterior.structured import StructuredPosterior
 
 POINTS = 2048
 """Probabilities are multiples of 1 / POINTS, with errors of about that size."""
@@ -59,7 +58,7 @@ def friction_margins(
     (surfaces have their own). Friction that a `ContactFriction` of the prior adds at a contact counts to its force.
     Raises ContactError without contacts with the world, InvalidInput for models without forces and a negative mu.
     """
-    if not isinstance(posterior, StructuredPosterior) or posterior.carries_known_forces:
+    if posterior.carries_known_forces:
         raise InvalidInput(f"{posterior.description} predicts no contact forces; fit one with an analytical mean.")
     contacts = posterior.model.contacts
     feet: dict[tuple[str, str | None], list[int]] = {}
@@ -96,7 +95,7 @@ def margin_moments(force: Gaussian, mu: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _forces(
-    posterior: StructuredPosterior, dynamics: ConstrainedDynamics, feet: Collection[list[int]], normal: Tensor
+    posterior: Posterior, dynamics: ConstrainedDynamics, feet: Collection[list[int]], normal: Tensor
 ) -> list[Gaussian]:
     """Force (..., 3) on every foot along t1, t2 and n, friction of the prior at its contacts included."""
     prior, model = posterior.trained.unknown, posterior.model

@@ -15,7 +15,10 @@ from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
 from forcegp.forces.thrusters import FADES
 from forcegp.model import Model
-from forcegp.posterior.posterior import ROWS_PER_BLOCK, AnyPosterior, Posterior
+from forcegp.posterior.prediction import ROWS_PER_BLOCK
+
+Posterior = Any
+"""A `Posterior`, whose module imports this one."""
 
 NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 LASTING = tuple(name.replace("observed", "lasting") for name in NAMES)
@@ -25,8 +28,8 @@ SLOW, AHEAD, LEARNING = 4.0, 0.5, 10.0  # s: of the mean that stays, of what is 
 
 
 def observing(
-    posterior: AnyPosterior, dataset: Dataset, *, seconds: float | None = None, whole: bool = False
-) -> tuple[AnyPosterior, Dataset]:
+    posterior: Posterior, dataset: Dataset, *, seconds: float | None = None, whole: bool = False
+) -> tuple[Posterior, Dataset]:
     """The posterior and the recording with an `ObservedWrench`, in six or twelve more columns of u.
 
     Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
@@ -172,7 +175,7 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
     return late
 
 
-def _in_observed_wind(posterior: AnyPosterior, dataset: Dataset) -> tuple[AnyPosterior, Dataset]:
+def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior, Dataset]:
     """Both with the wind that the rows before each one show, where the fit found a law of air."""
     stored = posterior.settings.get("air")
     if stored is None or _observes(posterior.model):

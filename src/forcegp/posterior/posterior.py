@@ -1,64 +1,88 @@
-"""What every posterior offers: `fit(model, log) -> posterior`, `posterior.predict(q, v, u)`."""
+"""`Posterior`: what a fit knows of a model, as a value that predicts."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, TypeVar, overload
+from typing import Any, overload
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.data.dataset import require_rows
+from forcegp.errors import InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
-from forcegp.evidence.training_data import TrainingData
-from forcegp.forces import Force
-from forcegp.inference import Engine, LeaveOut, OptimizationResult
+from forcegp.evidence.likelihood import MarginalLikelihood
+from forcegp.evidence.training_data import TrainingData, second_moments, shrunk
+from forcegp.forces import Force, IndependentAccelerations, JointAccelerations, JointForces
+from forcegp.inference import (
+    Engine,
+    Exact,
+    InducingPosterior,
+    LatentKernels,
+    LatentPosterior,
+    LeaveOut,
+    OptimizationResult,
+    exact,
+    leave_blocks_out,
+)
+from forcegp.inference.cholesky_update import rows_to_keep
+from forcegp.inference.prepared_kernels import CompressedCovariance
+from forcegp.inference.threads import blas_threads
 from forcegp.integration import Feedback
 from forcegp.integration.integrators import check_time_step
-from forcegp.mechanics import Baumgarte, ConstrainedDynamics, Contact
+from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
-from forcegp.posterior.components import Components, Curve
+from forcegp.noise import ACCELERATION, FORCE, Noise
+from forcegp.posterior.components import Components, Curve, components_of, curve_of, quantity_of
 from forcegp.posterior.estimates import Estimates
 from forcegp.posterior.motion_intervals import MotionIntervals
-from forcegp.posterior.prediction import Gaussian, Inputs, Positions, Prediction, Rows, join_predictions
+from forcegp.posterior.observed_wrench import rows_of_own_system
+from forcegp.posterior.prediction import (
+    ROWS_PER_BLOCK,
+    Array,
+    Gaussian,
+    Inputs,
+    Positions,
+    Prediction,
+    Rows,
+    join_predictions,
+    state_rows,
+    state_tensor,
+)
 from forcegp.posterior.predictor import Predictor
-from forcegp.posterior.rollout import AccelerationFunction, AccelerationModel, Rollout, remembering, roll_out
+from forcegp.posterior.predictor_code import PredictorCode
+from forcegp.posterior.predictor_preparation import physics_of, prepared_predictor, rows_for
+from forcegp.posterior.rollout import AccelerationModel, Rollout, accelerations_of, remembering, roll_out
+from forcegp.posterior.update import Keep, learn_and_forget, learn_more_rows
 from forcegp.robots import Robot
-from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, rounded
 
-ROWS_PER_BLOCK = 4096
-"""States that are predicted at once; bounds the memory of long recordings."""
 
-AnyPosterior = TypeVar("AnyPosterior", bound="Posterior")  # beartype cannot check Self where a module is hooked
-
-Array = Tensor | np.ndarray | Sequence[Any]
-
-
-class Posterior(Summary, ABC):
-    """What a fit has learned of a model, as a frozen value.
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Summary):
+    """a = M^-1 Q_b + H (Q_K + B f) + noise, f ~ GP (Rath et al. 2021, eqs. 6-7), conditioned on a log by `forcegp.fit`.
 
     `trained` is the model with the numbers that were found; `hyperparameters` are those of kernels and noise by name;
     `estimates` the numbers of laws and bodies (`parameters`); `settings` is the resolved configuration of the fit
     (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
-    training data); `result` is the history of the search and why it ended. A subclass is a frozen dataclass with these
-    and the abstract members; an entry in `forcegp.posterior.storage.KINDS` lets it be stored.
+    training data); `result` is the history of the search and why it ended.
     """
 
     trained: Model
+    likelihood: MarginalLikelihood
     hyperparameters: Mapping[str, Tensor]
-    settings: Mapping[str, Any]
     result: OptimizationResult
-    estimates: Estimates
+    settings: Mapping[str, Any]
+    latent: LatentPosterior
+    """The posterior of the latent functions."""
+    engine: Engine
+    """What computed `latent`."""
+    estimates: Estimates = field(default_factory=Estimates)
     target: Model | None = None
     """The model that predictions are for, where it is not the one that was trained (`with_model`)."""
-    engine: Any = None
-    """The Engine that computed the posterior, stored with it; None where there is no choice."""
 
     @property
     def model(self) -> Model:
@@ -71,9 +95,8 @@ class Posterior(Summary, ABC):
         return self.estimates
 
     @classmethod
-    @abstractmethod
     def conditioned(
-        cls: type[AnyPosterior],
+        cls,
         model: Model,
         training: TrainingData,
         hyperparameters: Mapping[str, Tensor],
@@ -82,36 +105,54 @@ class Posterior(Summary, ABC):
         engine: Engine | None = None,
         solution: Tensor | None = None,
         estimates: Estimates | None = None,
-    ) -> AnyPosterior:
+    ) -> "Posterior":
         """The posterior at given hyper-parameters, without a search: what a stored one is loaded with.
 
         `engine` computes it, where there is a choice; `solution` is what that engine had found (`Posterior.solution`),
         which saves it most of its work.
         """
+        likelihood = MarginalLikelihood(model, replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
+        engine = engine or Exact()
+        # now: a failure belongs to the fit, not to the first prediction
+        latent = likelihood.condition(likelihood.kernels, hyperparameters, engine, start=solution)
+        found = dict(hyperparameters), result, dict(settings), latent, engine, estimates or Estimates()
+        return cls(model, likelihood, *found)
 
     @staticmethod
-    @abstractmethod
     def parameter_shapes(model: Model, training: TrainingData) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the hyper-parameters that a posterior on these rows needs."""
+        return MarginalLikelihood(model, training).parameter_shapes
 
     @property
-    @abstractmethod
+    def kernels(self) -> LatentKernels:
+        """Of the latent functions, at their start values."""
+        return self.likelihood.kernels
+
+    @property
     def training(self) -> TrainingData:
         """The rows that the model was trained on."""
+        return self.likelihood.training
 
     @property
-    @abstractmethod
     def noise_std(self) -> Float[Tensor, "nv"]:
         """Standard deviation of the acceleration noise per joint, given, learned or estimated."""
+        return self.hyperparameters[ACCELERATION].exp()
+
+    @property
+    def solution(self) -> Tensor | None:
+        """What conditioning on these rows again can begin from, stored with the model; None where it is cheap."""
+        return self.engine.solution(self.latent)
 
     @cached_property
-    @abstractmethod
     def negative_log_likelihood(self) -> float:
-        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior."""
+        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior.
 
-    @abstractmethod
-    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
-        """`predict` for one block of checked states."""
+        With inducing points its upper bound.
+        """
+        with torch.no_grad():
+            if isinstance(self.latent, InducingPosterior):
+                return float(self.likelihood.bound(self.kernels, self.hyperparameters, self.latent.features))
+            return float(self.likelihood(self.kernels, self.hyperparameters))
 
     @override
     def facts(self) -> dict[str, object]:
@@ -126,14 +167,37 @@ class Posterior(Summary, ABC):
         }
 
     @property
-    @abstractmethod
     def description(self) -> str:
         """What kind of model it is, in a few words, for titles and tables."""
+        forces = self.trained.unknown
+        mean = "zero mean" if self.carries_known_forces else "analytical mean"
+        if not forces.terms:
+            return "identified model" if self.estimates else "analytical model"
+        if self.is_black_box:
+            return "independent GP"
+        if isinstance(forces.terms[0], JointAccelerations):
+            return f"unconstrained accelerations, {mean}"
+        names = list(forces.term_names)
+        shown = "" if names == [JointForces().title] else f"{' + '.join(names)}, "
+        return f"{shown}{mean}"
+
+    @property
+    def is_black_box(self) -> bool:
+        """Whether it learned accelerations, whatever the forces are, and predicts nothing else."""
+        return any(isinstance(force, IndependentAccelerations) for force in self.trained.unknown_forces)
+
+    @property
+    def carries_known_forces(self) -> bool:
+        """Whether the predicted `unknown_force` holds the known forces, too."""
+        return self.trained.carries_known_forces
 
     @property
     def motion_intervals(self) -> MotionIntervals | None:
         """Widths of the intervals of motions, where they were calibrated (`forcegp.calibrated`); a rollout has them."""
-        return None
+        stored = self.settings.get("motion_intervals")
+        found = None if stored is None else MotionIntervals.from_dict(stored)
+        # widths of motions that an observer's columns were part of are not those of motions without
+        return None if found is None or found.inputs not in ((), self.model.inputs) else found
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -145,13 +209,18 @@ class Posterior(Summary, ABC):
         """What `result.history` holds, with its unit in brackets."""
         return "negative log likelihood with hyperpriors [nats]"
 
-    predicts_forces: ClassVar[bool] = True
-    """Whether predictions hold the forces behind the acceleration."""
+    @property
+    def latent_names(self) -> tuple[str, ...]:
+        """The processes that the prior is made of."""
+        return self.trained.unknown.latent_names(self.trained.robot)
 
     @property
-    def carries_known_forces(self) -> bool:
-        """Whether the predicted `unknown_force` holds the known forces, too."""
-        return False
+    def widening(self) -> float:
+        """How many times as wide intervals are as those of `latent`, whose hyper-parameters count as known.
+
+        `fit/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
+        """
+        return float(self.settings.get("widening", 1.0))
 
     def dynamics(
         self, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"], u: Float[Tensor, "*batch nu"]
@@ -201,31 +270,82 @@ class Posterior(Summary, ABC):
                 "float64 there, the mass matrix is singular, or a surface has no normal; check q, v and u of that "
                 "row, and the model by Model.check_states."
             )
-        return predicted if of is None else tuple(self._quantity(each, predicted, q, v, u) for each in of)
+        return predicted if of is None else tuple(quantity_of(self, each, predicted, (q, v, u)) for each in of)
 
-    def _quantity(self, of: Any, predicted: Prediction, q: Array, v: Array, u: Array) -> Gaussian:
-        """One quantity that is affine in the forces."""
-        contacts, forces = list(self.model.contacts), list(self.model.unknown_forces)
-        if isinstance(of, Accelerations):
-            return predicted.acceleration
-        if of in contacts and predicted.contact_force is not None:
-            part = slice(3 * contacts.index(of), 3 * contacts.index(of) + 3)
-            mean, spread = predicted.contact_force.mean[..., part], predicted.contact_force.covariance
-            return Gaussian(mean, None if spread is None else spread[..., part, part])
-        if of in forces and self.predicts_forces:
-            components = self.components(q, v, u, covariance=predicted.covariance is not None)
-            return list(components.values())[forces.index(of)].joint_force
-        raise InvalidInput(
-            f"of holds {of!r}; give Accelerations(), or a contact or an unknown force of the model that predicts."
+    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
+        """`predict` for one block of checked states."""
+        dynamics = self.dynamics(q, v, u)
+        B = self.trained.unknown.direction(dynamics)
+        latents = self.latents(dynamics, covariance)
+
+        def through(affine: AffineMap) -> Gaussian:
+            return latents.through(affine.matrix @ B, affine.offset)
+
+        acceleration, torque_noise = self.acceleration_map(dynamics)
+        predicted = through(acceleration)
+        noise, spread = dict(self.hyperparameters), predicted.covariance
+        if torque_noise is not None:  # it counts as unknown, not as noise of the measured acceleration
+            del noise[FORCE]
+            spread = None if spread is None else spread + torque_noise
+        if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
+            return Prediction(predicted.mean, spread, None, None, None, _noise_covariance(noise, dynamics))
+        return Prediction(
+            predicted.mean,
+            spread,
+            multiplier=through(dynamics.multiplier_map()),
+            contact_force=through(dynamics.contact_force_map()),
+            unknown_force=latents.through(B),
+            noise_covariance=_noise_covariance(noise, dynamics),
         )
 
-    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
-        """Every force by itself, at states as for `predict`. Raises InvalidInput for models that predict no forces."""
-        raise InvalidInput(f"a {self.description} predicts no forces, so it has no components; use a structured model.")
+    def acceleration_map(self, dynamics: ConstrainedDynamics) -> tuple[AffineMap, Tensor | None]:
+        """Acceleration as a function of the unknown force, and what u's own noise leaves open; None for exact u."""
+        affine = dynamics.acceleration_map()
+        noise = self.trained.noise
+        if noise is None or not noise.measured_torque:
+            return affine, None
+        return shrunk(affine, dynamics.H, self.hyperparameters[FORCE].exp(), second_moments(self.training.a))
 
+    def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:
+        """All processes at a batch of states: mean (..., C), and their joint covariance (..., C, C) where asked for."""
+        batch = dynamics.state.q.shape[:-1]
+        given = self.likelihood.standardization(self.trained.unknown.features(dynamics))
+        features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
+        latents = len(features)
+        if not latents:
+            nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
+            return Gaussian(nothing.flatten(-2), nothing if covariance else None)
+        mean, spread = self.latent.mean(features).reshape(*batch, latents), None
+        if covariance:
+            spread = self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents)
+        return Gaussian(mean, spread)
+
+    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
+        """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
+
+        States as for `predict`, as many as fit into memory at once. `components(q, v, u)["joint-friction"].joint_force`
+        is a `Gaussian` (..., nv) in Nm or N. Raises InvalidInput for wrong shapes or values that are not finite.
+        """
+        require_type("covariance", covariance, bool)
+        states, batch = self.checked_states(q, v, u)
+        dynamics = self.dynamics(*(x.reshape(*batch, x.shape[-1]) for x in states))
+        latents = self.latents(dynamics, covariance)
+        return components_of(self.trained.unknown, dynamics, latents)
+
+    @usable_arguments("curve")
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
-        """One process of the prior over its features. Raises InvalidInput for models without a prior on forces."""
-        raise InvalidInput(f"a {self.description} has no latent forces, so it has no curves; use a structured model.")
+        """One process of the prior over its features: a friction curve, for example.
+
+        Parameters
+        ----------
+        latent: its name, one of `latent_names`.
+        features: (n, d), or (n,) where the process has one feature, in the units of `prior.feature_names`. None takes
+            `points` values over the range that the training data visited, for processes of one feature; a constant,
+            which has none, is one value.
+
+        Raises InvalidInput for another name, wrong shapes, and None for processes of several features.
+        """
+        return curve_of(self, latent, features, points)
 
     def predictor(
         self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 1536, compile: bool = True
@@ -247,44 +367,27 @@ class Posterior(Summary, ABC):
         ------
         InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
         """
-        raise InvalidInput(
-            f"a {self.description} has no predictor for control rates; call predict, or use a structured Gaussian "
-            "process."
-        )
+        how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
+        physics, training = physics_of(self, self.model), rows_for(self.training, self.trained, self.model)
+        return replace(prepared_predictor(self.latent, self.widening, training, physics, **how), posterior=self)
 
     def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
         """States as rows of float64 tensors on the model's device, and their batch dimensions.
 
         Raises InvalidInput for wrong shapes or values that are not finite.
         """
-        sizes = self.model.sizes
-        device = self.model.robot.device
-        named = zip("qvu", (q, v, u), sizes, strict=True)
-        given = [_tensor(name, values, size, device) for name, values, size in named]
-        batch = broadcast_batch(dict(zip("qvu", (x.shape[:-1] for x in given), strict=True)))
-        return [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]) for x in given], batch
+        return state_rows(self.model, q, v, u)
 
-    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
-        """What `rollout` integrates, under this stabilisation.
+    def code(self, model: Model | None = None, compressed: CompressedCovariance | None = None) -> PredictorCode:
+        """The mean as a graph, from which programs are written, in another system if one is given.
 
-        By default the mean of `predict`, from which no functions can be drawn. Raises InvalidInput for a stabilisation
-        where the model has no constraint.
+        Raises InvalidInput for operations that no graph holds, models on another device, and noisy torques.
         """
-        if baumgarte is not None:
-            raise InvalidInput(
-                f"baumgarte was given, but a {type(self).__name__} has no constraint, so there is "
-                "nothing to stabilise; give baumgarte=None, and `integrator='projected'` to stay on the surface."
-            )
-
-        def mean() -> AccelerationFunction:
-            return lambda q, v, u: self.predict(q, v, u, covariance=False).mean
-
-        def sampled(samples: int, seed: int) -> AccelerationFunction:
-            raise InvalidInput(
-                f"no functions can be drawn from a {type(self).__name__}; give `samples=0`, or use a structured model."
-            )
-
-        return AccelerationModel(self.model, None, mean, sampled)
+        model = self.model if model is None else model
+        physics = physics_of(self, model)
+        rows = rows_for(self.training, self.trained, model)
+        example = [x[:1] for x in (rows.q, rows.v, rows.u)]
+        return PredictorCode.of(physics, example, model.robot.space, self.latent, compressed, self.widening)
 
     def rollout(
         self,
@@ -330,13 +433,17 @@ class Posterior(Summary, ABC):
         model = self.accelerations(baumgarte)
         if self.model.held_inputs:
             check_time_step(dt)
-            u = self.model.foreseen(_tensor("u", u, self.model.sizes[2], self.model.robot.device), dt)
+            u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device), dt)
         if self.model.memory.names:
-            given = _tensor("u", u, self.model.sizes[2], self.model.robot.device)
+            given = state_tensor("u", u, self.model.sizes[2], self.model.robot.device)
             u, feedback = remembering(self.model, given, dt, feedback)
         how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed, "progress": progress}
         moved = roll_out(model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
         return replace(moved, intervals=self.motion_intervals)
+
+    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
+        """What `rollout` integrates, under this stabilisation. Raises InvalidInput for one without contacts."""
+        return accelerations_of(self, baumgarte)
 
     def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
         """How well training rows are predicted from those outside their block: in closed form, without another fit.
@@ -346,17 +453,18 @@ class Posterior(Summary, ABC):
         those that were fitted to all rows, so the scores flatter a model with many of them a little.
         Raises InvalidInput for blocks that overlap, and for models that would have to be trained again.
         """
-        raise InvalidInput(
-            f"a {self.description} would have to be trained again for every block that is left out; evaluate it on "
-            "another recording instead, or use a Gaussian process."
-        )
+        with torch.no_grad(), blas_threads(self.training.q.numel()):
+            *_, noise = self.likelihood.terms(self.hyperparameters)
+            return leave_blocks_out(exact(self.latent, "leaving rows out").system, noise, blocks)
 
-    @property
-    def solution(self) -> Tensor | None:
-        """What conditioning on these rows again can begin from, stored with the model; None where it is cheap."""
-        return None
-
-    def update(self, rows: Dataset, budget: int | None = None) -> "Posterior":
+    def update(
+        self,
+        rows: Dataset,
+        budget: int | None = None,
+        *,
+        keep: Keep = rows_to_keep,
+        horizon: float | Mapping[str, float] | None = None,
+    ) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
         Parameters, noise level and standardization stay those of the fit, so the result is exactly that of
@@ -372,22 +480,51 @@ class Posterior(Summary, ABC):
         Raises InvalidInput for rows that do not fit and for models that would have to be trained again, ContactError
         for rows at which the contacts cannot hold.
         """
-        raise InvalidInput(
-            f"a {self.description} cannot learn from more rows without another fit: fit it again to all rows, or use "
-            "a structured model with engine='exact'."
-        )
+        example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
+        require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
+        own, rows = replace(self, target=None), rows_of_own_system(self, rows)
+        if horizon is None:
+            return replace(learn_more_rows(own, rows, budget, keep), target=self.target)
+        return replace(learn_and_forget(own, rows, budget, horizon), target=self.target)
 
-    def with_model(self: AnyPosterior, model: Model) -> AnyPosterior:
-        """The same knowledge in another model (robot, contacts, laws) with the same joints.
+    def with_model(self, model: Model) -> "Posterior":
+        """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.
 
-        Raises InvalidInput for models that it cannot be carried to: for every one that learned accelerations.
+        Those of contacts that it lacks are zero there, and its `forces` do not list them.
+
+        Raises InvalidInput for other joints, and, without `RigidBodies`, for another robot: the processes hold
+        the weight and inertia of the one that they were trained on; UnknownFrame where a force acts on a frame that the
+        robot lacks.
         """
-        raise InvalidInput(
-            f"a {self.description} learned the accelerations of one robot, contacts included, so it cannot move to "
-            "another; fit it to data from there, or use a structured model, which learns forces."
-        )
+        require_type("model", model, Model)
+        trained = self.trained
+        if self.is_black_box:
+            raise InvalidInput(
+                f"a {self.description} learned the accelerations of one robot, so it cannot move to another model; fit "
+                "it to data from there, or learn forces."
+            )
+        if model.robot.joint_names != trained.robot.joint_names:
+            raise InvalidInput(
+                f"the model was trained on joints {', '.join(trained.robot.joint_names)}; the other robot has "
+                f"{', '.join(model.robot.joint_names)}. Forces can move to robots with the same joints only."
+            )
+        if self.carries_known_forces and not model.robot.tree.equals(trained.robot.tree):
+            raise InvalidInput(
+                "the mean has no rigid bodies, so the processes hold gravity and inertia of the robot that it was "
+                "trained on and cannot move to another; fit a model with RigidBodies()."
+            )
+        # asks for the frames, at a state where a surface is likely to have a normal
+        q, v, u = (x[:1].to(model.robot.device) for x in (self.training.q, self.training.v, self.training.u))
+        u = u.new_zeros(1, model.sizes[2]) if len(u[0]) != model.sizes[2] else u
+        self.trained.unknown.direction(model.dynamics(q, v, u))
+        # the training rows are always conditioned in their own system: nothing is factorised again, no number changes
+        # widths of intervals of motions were found in the system before
+        kept = {name: value for name, value in self.settings.items() if name != "motion_intervals"}
+        there = (force for force in trained.unknown_forces if _has_its_place(force, model))
+        model = replace(model, forces=(*model.laws, *there), noise=trained.noise)
+        return replace(self, target=model, settings=kept)
 
-    def with_contacts(self: AnyPosterior, contacts: Sequence[Contact | Sequence[Contact]]) -> AnyPosterior:
+    def with_contacts(self, contacts: Sequence[Contact | Sequence[Contact]]) -> "Posterior":
         """The same knowledge under other contacts, without another fit: another surface, or none at all, `[]`.
 
         What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
@@ -395,14 +532,14 @@ class Posterior(Summary, ABC):
         """
         return self.with_model(self.model.known.with_contacts(contacts))
 
-    def with_robot(self: AnyPosterior, robot: Robot) -> AnyPosterior:
+    def with_robot(self, robot: Robot) -> "Posterior":
         """The same knowledge on another robot with the same joints, for example with another known tool.
 
         Raises InvalidInput as `with_model`.
         """
         return self.with_model(self.model.with_robot(robot))
 
-    def to(self: AnyPosterior, device: torch.device | str) -> AnyPosterior:
+    def to(self, device: torch.device | str) -> "Posterior":
         """The same knowledge on another device, for instance "cuda": conditioned there on the same rows.
 
         Raises InvalidInput for a device that is not there.
@@ -414,7 +551,7 @@ class Posterior(Summary, ABC):
             parameters=_all_on(self.result.parameters, at),
             iterates=tuple(_all_on(point, at) for point in self.result.iterates),
         )
-        there = type(self).conditioned(
+        there = Posterior.conditioned(
             model,
             self.training.to(at),
             _all_on(self.hyperparameters, at),
@@ -427,20 +564,24 @@ class Posterior(Summary, ABC):
         carried = there if self.target is None else there.with_model(self.target.to(device))
         return carried.with_settings(**self.settings)
 
-    def with_settings(self: AnyPosterior, **settings: Any) -> AnyPosterior:
+    def with_settings(self, **settings: Any) -> "Posterior":
         """The same posterior with more entries in `settings`."""
-        return replace(self, settings={**self.settings, **settings})  # type: ignore[type-var]  # every posterior is a dataclass
+        return replace(self, settings={**self.settings, **settings})
 
 
 def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
 
 
-def _tensor(name: str, values: Array, size: int, device: torch.device) -> Tensor:
-    tensor = real_tensor(name, values, device)
-    if tensor.dim() == 0 or tensor.shape[-1] != size:
-        raise InvalidInput(
-            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one value per joint."
-        )
-    require_finite(name, tensor)
-    return tensor
+def _has_its_place(force: Force, model: Model) -> bool:
+    """Whether a model has what a force acts at; without its contact a force is zero."""
+    try:
+        force.check(model.robot, model.contacts)
+    except InvalidInput:
+        return False
+    return True
+
+
+def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDynamics) -> Tensor:
+    noise = Noise.covariance(parameters, dynamics.H)
+    return torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise

@@ -4,20 +4,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownRow
+from forcegp.model import Model
+from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, listed
 
+ROWS_PER_BLOCK = 4096
+"""States that are predicted at once; bounds the memory of long recordings."""
 Rows = Float[Tensor, "rows nv"]
 """One number per state and joint."""
 Positions = Float[Tensor, "rows nq"]
 """One state per row; more numbers than joints where some have a quaternion, or cos and sin."""
 Inputs = Float[Tensor, "rows nu"]
 """One number per state and input of the system."""
+Array = Tensor | np.ndarray | Sequence[Any]
 AnyGaussian = TypeVar("AnyGaussian", bound="Gaussian")  # beartype cannot check Self where a module is hooked
 
 
@@ -107,14 +113,6 @@ class Prediction(Gaussian):
         forces = [name for name in ("multiplier", "contact_force", "unknown_force") if getattr(self, name) is not None]
         return {**super().facts(), "forces": listed(forces)}
 
-    @classmethod
-    def of_accelerations(
-        cls, mean: Float[Tensor, "*b nv"], variance: Float[Tensor, "*b nv"] | None, noise: Float[Tensor, "*b nv"]
-    ) -> "Prediction":
-        """Of a model of independent joints without forces; `noise` is the variance of a measurement about it."""
-        covariance = None if variance is None else torch.diag_embed(variance)
-        return cls(mean, covariance, None, None, None, torch.diag_embed(noise))
-
     @property
     def acceleration(self) -> Gaussian:
         """`mean` and `covariance` under their full name."""
@@ -158,3 +156,22 @@ class JointForces(NamedTuple):
     M: Tensor
     A: Tensor
     b: Tensor
+
+
+def state_rows(model: Model, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
+    """What `Posterior.checked_states` documents."""
+    named = zip("qvu", (q, v, u), model.sizes, strict=True)
+    given = [state_tensor(name, values, size, model.robot.device) for name, values, size in named]
+    batch = broadcast_batch(dict(zip("qvu", (x.shape[:-1] for x in given), strict=True)))
+    return [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]) for x in given], batch
+
+
+def state_tensor(name: str, values: Array, size: int, device: torch.device) -> Tensor:
+    """Finite float64 numbers (..., size). Raises InvalidInput."""
+    tensor = real_tensor(name, values, device)
+    if tensor.dim() == 0 or tensor.shape[-1] != size:
+        raise InvalidInput(
+            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one value per joint."
+        )
+    require_finite(name, tensor)
+    return tensor

@@ -105,7 +105,7 @@ def prepared_predictor(
     largest_rank: int,
     compile: bool,
 ) -> Predictor:
-    """What `StructuredPosterior.predictor` documents, from the posterior of the latents and the terms of a state."""
+    """What `Posterior.predictor` documents, from the posterior of the latents and the terms of a state."""
     if not isinstance(covariance, str) or covariance not in COVARIANCES:
         raise InvalidInput(f"covariance is {covariance!r}; give one of {', '.join(map(repr, COVARIANCES))}.")
     number = isinstance(tolerance, int | float)
@@ -223,3 +223,14 @@ def sample_states(
         q = states[0]
         moved[0] = space.integrate(q[i], STEP * space.difference(q[k], q[j]))
     return [torch.cat([x[own], between, x[other]]) for x, between, other in zip(states, moved, mixed, strict=True)]
+
+
+def physics_of(posterior: Any, model: Model) -> PredictorPhysics:
+    """Of a `Posterior` in this model. Raises InvalidInput where u is a noisy measurement."""
+    noise = posterior.trained.noise
+    if noise is not None and noise.measured_torque:
+        raise InvalidInput(
+            "a predictor is for commanded torques, and in this model u comes from a noisy sensor; call "
+            "predict, or fit with Noise(..., measured_torque=False)."
+        )
+    return PredictorPhysics(model, posterior.trained.unknown, posterior.likelihood.standardization)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
+from forcegp.inference.pathwise import draw_functions, mean_function
 from forcegp.inference.threads import blas_threads
 from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
 from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
@@ -34,20 +35,52 @@ AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class AccelerationModel:
-    """What a rollout integrates: accelerations of a fitted model in `system`, under the stabilisation of that rollout.
+    """What a rollout integrates: accelerations of a fitted model, under the stabilisation of that rollout.
 
     `mean()` is the mean acceleration at states (n, nv). `sampled(samples, seed)` are the accelerations of so many
-    functions drawn from the model, each at states of its own (samples, n, nv); it raises InvalidInput for models from
-    which none can be drawn.
+    functions drawn from the model, each at states of its own (samples, n, nv).
     """
 
     model: Model
     baumgarte: Baumgarte | None
     mean: Callable[[], AccelerationFunction]
     sampled: Callable[[int, int], AccelerationFunction]
-    compiled: Callable[[str, int, int], list[FusedLoop] | None] | None = None
+    compiled: Callable[[str, int, int], list[FusedLoop] | None]
     """(integrator, samples, seed) -> loops over the functions that `sampled` draws, or with 0 samples over the mean, as
     machine code; None where there are none."""
+
+
+def accelerations_of(posterior: Any, baumgarte: Baumgarte | None) -> AccelerationModel:
+    """Of a `Posterior`, under this stabilisation. Raises InvalidInput for one where the model has no contacts."""
+    if baumgarte is not None and not posterior.model.contacts:
+        raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
+    model = replace(posterior.model, baumgarte=baumgarte)
+    prior, standardize = posterior.trained.unknown, posterior.likelihood.standardization
+
+    def through(functions: Callable[[list[Tensor]], Tensor]) -> AccelerationFunction:
+        def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+            dynamics = model.dynamics(q, v, u)
+            affine, _ = posterior.acceleration_map(dynamics)
+            mixing = prior.direction(dynamics)
+            if not mixing.shape[-1]:
+                return affine.offset
+            latents = functions(standardize(prior.features(dynamics)))
+            return affine((mixing @ latents[..., None])[..., 0])
+
+        return acceleration
+
+    def mean() -> AccelerationFunction:
+        return through(mean_function(posterior.latent))
+
+    def sampled(samples: int, seed: int) -> AccelerationFunction:
+        if not len(posterior.kernels.kernels):  # no unknown force: all functions are the same
+            return mean()
+        return through(draw_functions(posterior.latent, samples, seed, posterior.widening))
+
+    def compiled(integrator: str, samples: int, seed: int) -> list[FusedLoop] | None:
+        return posterior.code(model).loops(integrator, posterior.latent, samples, seed)
+
+    return AccelerationModel(model, baumgarte, mean, sampled, compiled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +180,7 @@ def roll_out(
     grad: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rollout:
-    """Integrate a fitted model: what every posterior's `rollout` calls (`StructuredPosterior.rollout` documents it)."""
+    """Integrate a fitted model: what `rollout` calls (`Posterior.rollout` documents it)."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model.model)
     require_type("grad", grad, bool)

@@ -24,15 +24,9 @@ from forcegp.evidence.training_data import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.model import Model
 from forcegp.posterior.estimates import Estimates
-from forcegp.posterior.independent import IndependentPosterior
 from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.structured import StructuredPosterior
 
-KINDS: dict[str, type[Posterior]] = {
-    "forcegp structured posterior": StructuredPosterior,
-    "forcegp independent posterior": IndependentPosterior,
-}
-"""Name in `model.json` -> the class of a posterior."""
+KIND = "forcegp posterior"
 
 
 RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
@@ -79,15 +73,11 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
                 f"{path} holds files that forcegp did not write there ({', '.join(others[:3])}), so it is not "
                 "overwritten; move them away or choose another name"
             )
-    kind = next((name for name, stored in KINDS.items() if type(posterior) is stored), None)
-    if kind is None:
-        kinds = ", ".join(KINDS)
-        raise FileFormatError(f"a {type(posterior).__name__} cannot be stored: it has no entry in KINDS ({kinds})")
     model = posterior.trained.to_dict()
     target = None if posterior.target is None else posterior.target.to_dict()
     robots = {ROBOT: model.pop("urdf")} | ({} if target is None else {TARGET: target.pop("urdf")})
     document = {
-        "kind": kind,
+        "kind": KIND,
         "format_version": FORMAT_VERSION,
         "features": _features(posterior),
         "forcegp_version": __version__,
@@ -146,7 +136,7 @@ def load_posterior(path: str | Path) -> Posterior:
     try:
         model = Model.from_dict({**document["model"], "urdf": urdf})
         settings = dict(document["settings"])
-        kind, estimates = KINDS[document["kind"]], Estimates.from_dict(document["estimates"])
+        estimates = Estimates.from_dict(document["estimates"])
         engine = None if document["engine"] is None else engine_from_dict(document["engine"])
         moved = None if moved_to is None else {**document["target"], "urdf": moved_to}
         target = None if moved is None else Model.from_dict(moved)
@@ -180,11 +170,11 @@ def load_posterior(path: str | Path) -> Posterior:
         if rows is not None:
             _check_rows(file, model, prefix, rows)
     given = {name: tuple(value.shape) for name, value in parameters.items()}
-    if given != kind.parameter_shapes(model, training):
+    if given != Posterior.parameter_shapes(model, training):
         raise FileFormatError(f"{file} does not hold the parameters of its model")
     try:
         found_before = parameters, optimization, settings, engine, tensors.get(SOLUTION), estimates
-        posterior = kind.conditioned(model, training, *found_before)
+        posterior = Posterior.conditioned(model, training, *found_before)
     except (InvalidInput, RuntimeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}; fit the model again") from None
     if target is not None:
@@ -268,8 +258,8 @@ def _document(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path} holds no model.json; give the folder that `forcegp fit --out` wrote") from None
     except (ValueError, RecursionError) as error:  # also numbers of 5000 digits
         raise FileFormatError(f"{file} is damaged: {error}") from None
-    if not isinstance(document, dict) or document.get("kind") not in [*KINDS]:
-        raise FileFormatError(f"{file} is not a stored forcegp model; there are: {', '.join(KINDS)}")
+    if not isinstance(document, dict) or document.get("kind") != KIND:
+        raise FileFormatError(f"{file} is not a stored forcegp model.")
     version = document.get("format_version")
     if version != FORMAT_VERSION:
         raise FileFormatError(

@@ -25,7 +25,7 @@ from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
 Structured = Any
-"""A `StructuredPosterior`, whose module imports this one."""
+"""A `Posterior`, whose module imports this one."""
 Keep = Callable[[ExactPosterior, int], Tensor]
 """(posterior, budget) -> numbers of the rows to keep, ascending."""
 
@@ -37,7 +37,7 @@ OTHER_NOISE = 0.1
 
 
 def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, keep: Keep) -> Structured:
-    """What `StructuredPosterior.update` documents without a horizon."""
+    """What `Posterior.update` documents without a horizon."""
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
     budget = None if budget is None else whole_number("budget", budget, 2)
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)

@@ -2,7 +2,7 @@ from .delimited_text import DELIMITERS as DELIMITERS
 from .formats import open_source as open_source
 from .importing import ImportOptions as ImportOptions, import_recordings as import_recordings
 from .mapping import (
-    ColumnMapping as ColumnMapping, beside as beside, by_quantity as by_quantity, factors_of as factors_of,
+    ColumnMapping as ColumnMapping, beside as beside, by_quantity as by_quantity,
     mapping_of as mapping_of, mapping_text as mapping_text, read_mapping as read_mapping,
 )
 from .source import Source as Source

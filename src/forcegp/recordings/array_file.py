@@ -35,7 +35,7 @@ class ArrayFile(Source):
 
     With `within`, only what is under that name counts, and names begin after it: a file with one array or one group per
     episode is read as one table per episode. An array by itself is then `[0] ... [k-1]`.
-    Subclasses list the arrays (`shapes`) and give them in pieces (`blocks`).
+    Subclasses list the arrays (`shapes`) and give them (`array`).
     """
 
     def __init__(self, path: Path, *, within: str | None = None) -> None:
@@ -47,8 +47,8 @@ class ArrayFile(Source):
         """Every array of numbers by its full name; raises FileFormatError for a file that cannot be read."""
 
     @abstractmethod
-    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        """The array of that full name in pieces of exactly `rows` rows, but for the last."""
+    def array(self, name: str) -> np.ndarray:
+        """The array of that full name."""
 
     def episodes(self, pattern: str) -> list[str]:
         """Names that a pattern such as `data/demo_*` matches, in the order of numbers. Raises InvalidInput for none."""
@@ -93,8 +93,7 @@ class ArrayFile(Source):
         return tuple(self._places)
 
     @override
-    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        self.require(names)
+    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
         arrays = list(dict.fromkeys(self._places[name][0] for name in names))
         shapes = self.shapes()
         lengths = {shapes[array][0] for array in arrays}
@@ -103,24 +102,7 @@ class ArrayFile(Source):
             raise FileFormatError(
                 f"{self.path}: its arrays have different numbers of rows ({counts}); map those of one."
             )
-        for pieces in zip(*(self.blocks(array, rows) for array in arrays), strict=True):
-            tables = dict(zip(arrays, pieces, strict=True))
-            yield columns_of(tables, {name: self._places[name] for name in names})
-
-
-def require_numbers(path: Path, name: str, dtype: np.dtype) -> bool:
-    """Whether an array holds numbers; text is left out. Raises FileFormatError for Python objects, which are code."""
-    if dtype.hasobject:
-        raise FileFormatError(
-            f"{path}: {name!r} holds Python objects, which are never read because reading them runs code; "
-            "save it as an array of numbers."
-        )
-    return dtype.kind in "fiu"
-
-
-def pieces_of(values: np.ndarray, rows: int) -> Iterator[np.ndarray]:
-    """An array that is in memory, as `ArrayFile.blocks` gives it."""
-    return (values[start : start + rows] for start in range(0, len(values), rows))
+        yield columns_of({name: self.array(name) for name in arrays}, {name: self._places[name] for name in names})
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
@@ -137,8 +119,7 @@ class NumpyArchive(ArrayFile):
     """The arrays of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     @cached_property
-    def _arrays(self) -> dict[str, tuple[str, tuple[int, ...], bool, np.dtype]]:
-        """Name -> (member, shape, column-major, type)."""
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
         found = {}
         with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive:
             members = archive.infolist()
@@ -146,48 +127,30 @@ class NumpyArchive(ArrayFile):
             require_plausible_size(self.path, "the archive", declared, self.path.stat().st_size)
             for member in members:
                 require_plausible_size(self.path, repr(member.filename), member.file_size, member.compress_size)
-                if not member.filename.endswith(".npy"):
-                    continue
                 name = member.filename.removesuffix(".npy")
-                with archive.open(member) as stream:
-                    shape, column_major, dtype = _header(stream)
-                if not require_numbers(self.path, name, dtype):
+                if name == member.filename:
                     continue
+                with archive.open(member) as stream:
+                    read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
+                    shape, _, dtype = read(stream)
+                if dtype.hasobject:
+                    raise FileFormatError(
+                        f"{self.path}: {name!r} holds Python objects, which are never read because reading them runs "
+                        "code; save it as an array of numbers."
+                    )
                 if math.prod(shape) * dtype.itemsize > member.file_size:
                     raise FileFormatError(
                         f"{self.path}: {name!r} claims the shape {shape}, but the file does not hold that much."
                     )
-                if name in found:
-                    raise FileFormatError(f"{self.path}: {name!r} is in the archive twice; write it again.")
-                found[name] = (member.filename, shape, column_major, dtype)
+                if dtype.kind in "fiu":
+                    found[name] = shape
         return found
 
     @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        return {name: shape for name, (_, shape, _, _) in self._arrays.items()}
+        return self._shapes
 
     @override
-    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        member, shape, column_major, dtype = self._arrays[name]
-        with reading(self.path, WHAT, *_ERRORS), zipfile.ZipFile(self.path) as archive, archive.open(member) as stream:
-            _header(stream)
-            if column_major and len(shape) > 1:  # its first row ends where the array ends: there are no pieces
-                table = np.frombuffer(stream.read(), dtype, count=math.prod(shape)).reshape(shape, order="F")
-                yield from pieces_of(table, rows)
-                return
-            row_bytes = dtype.itemsize * math.prod(shape[1:])
-            length = self.shapes()[name][0]
-            for start in range(0, length, rows):
-                count = min(rows, length - start)
-                data = stream.read(count * row_bytes)
-                if len(data) < count * row_bytes:
-                    raise EOFError(f"{name!r} ends before its last row")
-                yield np.frombuffer(data, dtype).reshape(count, *shape[1:])
-            if stream.read(1):  # to the end, where the checksum is compared
-                raise EOFError(f"{name!r} goes on after its last row")
-
-
-def _header(stream) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = npy.read_magic(stream)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    return read(stream)
+    def array(self, name: str) -> np.ndarray:
+        with reading(self.path, WHAT, *_ERRORS), np.load(self.path, allow_pickle=False) as archive:
+            return archive[name]

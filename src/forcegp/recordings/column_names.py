@@ -1,13 +1,10 @@
 """Columns of a log: lists in short, names that are guessed, and linear combinations.
 
-    expression = ["+"] term { ("+" | "-") term }
-    term       = ["-"] factor { ("*" | "/") factor }    at most one column, and only numbers below "/"
-    factor     = number | "pi" | column | `column`
-
-Known columns are recognised letter by letter, the longest first, so most names need no quotes whatever they contain;
-backticks settle the rest.
+Combinations have the grammar of Python: numbers, pi, columns, + - * / and parentheses. Known columns are recognised
+letter by letter, the longest first, so most names need no quotes whatever they contain; backticks settle the rest.
 """
 
+import ast
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -135,9 +132,8 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     return bool(words & WORDS[signal])
 
 
-FACTOR = (
-    r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?))(?!\w)|(?P<pi>pi)(?!\w)"
-    r"|(?P<word>[^\s+*/`]+)"
+TOKEN = (
+    r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w))|(?P<word>[^\s+*/`()-]+)"
 )
 
 
@@ -172,76 +168,63 @@ class LinearExpression:
 def parse_expression(text: str, columns: Collection[str], owner: str) -> LinearExpression:
     """Read a linear combination of `columns`; `owner` is the file that has them, for messages.
 
-    Raises InvalidInput, saying where, for anything that is not a linear combination, and for a column of another name.
+    Raises InvalidInput for anything that is not a linear combination, and for a column of another name.
     """
     if text in columns:
         return LinearExpression({text: 1.0})
-    return _Parser(text, columns, owner).expression()
+    names = sorted(columns, key=len, reverse=True)
+    known = "|".join(re.escape(name) + (r"(?!\w)" if re.match(r"\w", name[-1]) else "") for name in names)
+    words: list[str] = []
+
+    def placed(found: re.Match[str]) -> str:
+        """A name that Python can read in place of a column, or of a word that is none."""
+        if found.lastgroup == "number":
+            return found[0]
+        if found.lastgroup == "word" and found[0] == "pi":
+            return repr(math.pi)
+        words.append(found[found.lastgroup or 0])
+        return f" _{len(words) - 1} "
+
+    try:
+        tree = ast.parse(re.sub(TOKEN % (known or "(?!)"), placed, text).strip(), mode="eval")
+        weights = _linear(tree.body, words)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise InvalidInput(
+            f"{text!r:.200} is no linear combination of columns: {getattr(error, 'msg', error)}. For example: "
+            "theta2 - theta1, 0.5*`a-b` + pi/2."
+        ) from None
+    if not all(map(math.isfinite, weights.values())):
+        raise InvalidInput(f"{text!r:.200} has a number that is not finite.")
+    constant = weights.pop(None, 0.0)
+    for word in weights:
+        where = "" if word == text else f" (in {text!r})"
+        require_known("column", word, f"{owner}{where}", columns)
+    return LinearExpression({name: weight for name, weight in weights.items() if name and weight != 0.0}, constant)
 
 
-class _Parser:
-    """What is left of the text is `rest`, without blanks before it."""
-
-    def __init__(self, text: str, columns: Collection[str], owner: str) -> None:
-        self.text, self.columns, self.owner = text, columns, owner
-        self.rest = text.lstrip()
-        longest_first = sorted(columns, key=len, reverse=True)
-        names = "|".join(re.escape(name) + (r"(?!\w)" if re.match(r"\w", name[-1]) else "") for name in longest_first)
-        self.factor = re.compile(FACTOR % names)
-
-    def expression(self) -> LinearExpression:
-        weights: dict[str | None, float] = {}  # None: the constant
-        sign = 1.0
-        self._taken("+")
-        while sign:
-            name, factor = self._term()
-            weights[name] = weights.get(name, 0.0) + sign * factor
-            sign = 1.0 if self._taken("+") else -1.0 if self._taken("-") else 0.0
-        if self.rest:
-            raise self._wrong("expected + or -")
-        if not all(math.isfinite(weight) for weight in weights.values()):
-            raise InvalidInput(f"{self.text!r} has a number that is not finite.")
-        constant = weights.pop(None, 0.0)
-        return LinearExpression({name: weight for name, weight in weights.items() if name and weight != 0.0}, constant)
-
-    def _term(self) -> tuple[str | None, float]:
-        sign = -1.0 if self._taken("-") else 1.0
-        name, value = self._factor()
-        value *= sign
-        while True:
-            if self._taken("*"):
-                other, factor = self._factor()
-                if name is not None and other is not None:
-                    raise self._wrong(f"{name!r} times {other!r} is not linear")
-                name, value = name or other, value * factor
-            elif self._taken("/"):
-                other, factor = self._factor()
-                if other is not None or factor == 0.0:
-                    raise self._wrong("only division by a number other than 0 is linear")
-                value /= factor
-            else:
-                return name, value
-
-    def _factor(self) -> tuple[str | None, float]:
-        found = self.factor.match(self.rest)
-        if found is None or found.lastgroup is None:
-            backtick = self.rest.startswith("`")
-            raise self._wrong("a backtick without its partner" if backtick else "expected a column or a number")
-        kind, word = found.lastgroup, found[found.lastgroup]
-        self.rest = self.rest[found.end() :].lstrip()
-        if kind in ("number", "pi"):
-            return None, float(word) if kind == "number" else math.pi
-        where = "" if word == self.text else f" (in {self.text!r})"
-        require_known("column", word, f"{self.owner}{where}", self.columns)
-        return word, 1.0
-
-    def _taken(self, sign: str) -> bool:
-        taken = self.rest.startswith(sign)
-        self.rest = self.rest[1:].lstrip() if taken else self.rest
-        return taken
-
-    def _wrong(self, why: str) -> InvalidInput:
-        return InvalidInput(
-            f"{self.text!r} is not a linear combination of columns: {why} at {self.rest[:20]!r}. "
-            "For example: theta2 - theta1, 0.5*`a-b` + pi/2."
-        )
+def _linear(node: ast.expr, words: Sequence[str]) -> dict[str | None, float]:
+    """Weights of the columns, and under None the constant. Raises ValueError for what is not linear."""
+    match node:
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+            return {None: float(value)}
+        case ast.Name(id=name):
+            return {words[int(name[1:])]: 1.0}
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=operand):
+            own = _linear(operand, words)
+            return own if isinstance(sign, ast.UAdd) else {name: -weight for name, weight in own.items()}
+        case ast.BinOp(left=left, op=operator, right=right):
+            one, other = _linear(left, words), _linear(right, words)
+            if isinstance(operator, ast.Mult) and not other.keys() <= {None}:
+                one, other = other, one
+            number = other.get(None, 0.0)
+            match operator:
+                case ast.Add() | ast.Sub():
+                    side = 1.0 if isinstance(operator, ast.Add) else -1.0
+                    return {
+                        name: one.get(name, 0.0) + side * other.get(name, 0.0) for name in dict.fromkeys([*one, *other])
+                    }
+                case ast.Mult() if other.keys() <= {None}:
+                    return {name: weight * number for name, weight in one.items()}
+                case ast.Div() if other.keys() <= {None} and number != 0.0:
+                    return {name: weight / number for name, weight in one.items()}
+    raise ValueError("this is not linear")

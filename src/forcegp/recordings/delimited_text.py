@@ -1,6 +1,7 @@
 """CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow in pieces."""
 
 import csv
+import gzip
 import io
 import re
 from collections.abc import Iterator, Sequence
@@ -16,12 +17,10 @@ from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings.source import (
     Columns,
     Source,
-    Wrapper,
     arrow_numbers,
-    exact,
-    gzip_stream,
     reading,
     require_distinct,
+    require_plausible_gzip,
 )
 
 FIRST_BYTES = 2**16
@@ -35,7 +34,10 @@ _OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
 
 def opened(path: Path) -> io.BufferedReader:
     """The bytes of a text file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
-    raw: Any = gzip_stream(path) if path.suffix.lower() == ".gz" else io.FileIO(path)
+    compressed = path.suffix.lower() == ".gz"
+    if compressed:
+        require_plausible_gzip(path)
+    raw: Any = gzip.GzipFile(path, "rb") if compressed else io.FileIO(path)
     stream = io.BufferedReader(raw, 2**20)
     try:
         first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
@@ -61,13 +63,17 @@ def _require_text(path: Path, first: bytes) -> None:
         ) from error
 
 
-class CleanLines(Wrapper):
+class CleanLines(io.RawIOBase):
     """A stream without comment lines and, if `blanks`, with one tab between the words of a line."""
 
     def __init__(self, stream: io.BufferedReader, *, blanks: bool) -> None:
         self.stream = stream
         self.blanks = blanks
         self._ready = b""
+
+    @override
+    def readable(self) -> bool:
+        return True
 
     @override
     def readinto(self, buffer) -> int:
@@ -197,17 +203,16 @@ class DelimitedText(Source):
         return f"row {row} (line {self._lines_before + row * self._lines_per_row + 1})"
 
     @override
-    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        self.require(names)
+    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
         try:
-            yield from self._read(names, rows, threads=True)
+            yield from self._read(names, threads=True)
         except FileFormatError as error:
             if isinstance(error.__cause__, ValueError):  # pyarrow counts rows on one thread only
-                for _ in self._read(names, rows, threads=False):
+                for _ in self._read(names, threads=False):
                     pass
             raise
 
-    def _read(self, names: Sequence[str], rows: int, *, threads: bool) -> Iterator[Columns]:
+    def _read(self, names: Sequence[str], *, threads: bool) -> Iterator[Columns]:
         stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns
         kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}
@@ -226,24 +231,22 @@ class DelimitedText(Source):
                     convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
                 )
                 columns = ({name: arrow_numbers(batch.column(name)) for name in wanted} for batch in batches)
-                yield from exact(self._stacked(columns, names) if stacked else columns, rows)
+                if stacked:
+                    yield self._stacked(np.concatenate([batch["c1"] for batch in columns]), names)
+                else:
+                    yield from columns
             except pa.ArrowInvalid as error:
                 raise self._told_by_pyarrow(error) from error
 
-    def _stacked(self, batches: Iterator[Columns], names: Sequence[str]) -> Iterator[Columns]:
+    def _stacked(self, values: np.ndarray, names: Sequence[str]) -> Columns:
         """Rows from a file with one number per line."""
-        width, rest, count = self._lines_per_row, np.empty(0), 0
-        for batch in batches:
-            values = np.concatenate([rest, batch["c1"]])
-            count += len(batch["c1"])
-            whole = len(values) - len(values) % width
-            table, rest = values[:whole].reshape(-1, width), values[whole:]
-            yield {name: np.ascontiguousarray(table[:, self._columns.index(name)]) for name in names}
-        if rest.size:
+        width = self._lines_per_row
+        if len(values) % width:
             raise FileFormatError(
-                f"{self.path} has {count} numbers, which is no multiple of {width}; another `headerless` may be right, "
-                "or the file is truncated."
+                f"{self.path} has {len(values)} numbers, which is no multiple of {width}; another `headerless` may be "
+                "right, or the file is truncated."
             )
+        return {name: values[self._columns.index(name) :: width] for name in names}
 
     def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
         text = str(error)

@@ -1,17 +1,16 @@
 """The stamps of a recording, the stretches between its gaps, and their rows as a Dataset has them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Int
 from scipy.interpolate import make_interp_spline
 
 from forcegp.data.filtering import JITTER
 from forcegp.errors import DatasetError, MistakenUnit
 from forcegp.recordings.moving_base import Layout
-from forcegp.recordings.reading import ROWS_AT_A_TIME, RawRecording, Spool
+from forcegp.recordings.reading import RawRecording
 
 REPEATED = 0.05
 """Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
@@ -30,11 +29,9 @@ SLOWEST, FASTEST = 2.0, 2e5
 
 @dataclass(frozen=True)
 class Stretch:
-    """Rows of a recording without gap: [start, end), counted in the recording; `number` is the log's episode."""
+    """Numbers of the rows of a recording that are used, without gap; `number` is the log's episode."""
 
-    recording: RawRecording
-    start: int
-    end: int
+    rows: Int[np.ndarray, " rows"]
     number: int
 
 
@@ -42,12 +39,11 @@ class Stretch:
 class Stamps:
     """The stamps of one recording.
 
-    `kept` (rows,) are the rows that are used; `step` is the median of the steps between them [s]; `worst` the largest
-    relative deviation of a step within a stretch from it.
+    `step` is the median of the steps between rows that are used [s]; `worst` the largest relative deviation of a step
+    within a stretch from it.
     """
 
     stretches: tuple[Stretch, ...]
-    kept: Bool[np.ndarray, " rows"]
     step: float
     worst: float
     repeated: int
@@ -90,8 +86,7 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
         if last - first < FEWEST_ROWS:
             dropped += last - first
             continue
-        own = int(recording.episodes[number[first], 0])
-        stretches.append(Stretch(recording, int(used[first]), int(used[last - 1]) + 1, own))
+        stretches.append(Stretch(used[first:last], int(recording.episodes[number[first], 0])))
     if not stretches:
         raise DatasetError(
             f"{recording.label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
@@ -99,7 +94,7 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
         )
     gaps = tuple(between[same & ~inside].tolist())
     worst = float(np.abs(between[inside] / step - 1.0).max())
-    return Stamps(tuple(stretches), kept & ~paused, step, worst, repeated, gaps, dropped)
+    return Stamps(tuple(stretches), step, worst, repeated, gaps, dropped)
 
 
 def _typical_step(recording: RawRecording) -> float:
@@ -167,47 +162,18 @@ def _first_of_each(time: np.ndarray, begins: np.ndarray, least: float) -> np.nda
     return kept
 
 
-SPLINE_HALO = 64
-"""Rows on either side that a piece of a spline is fitted with: the rest moves it by less than 0.27^64 of itself."""
-
-DIFFERENCE_HALO = 3
-"""Rows on either side that two differences reach: 2 where both are central, 3 where one is one-sided at an end."""
-
-
 def episode_rows(
-    spool: Spool, stretch: Stretch, kept: np.ndarray, layout: Layout, step: float | None, rows: int = ROWS_AT_A_TIME
-) -> Iterator[dict[str, np.ndarray]]:
-    """Time and the signals q, v, u, a of a stretch, `rows` at a time, as those of all at once up to rounding.
-
-    Parameters: `kept` as in `Stamps`; `layout` of the spool; `step` [s] between even times, or None for the times of
-    the log.
-    """
-    recording, first = stretch.recording, stretch.start
-    numbers = first + np.flatnonzero(kept[first : stretch.end])  # rows of the recording that are used
-    time = stamps = recording.time[numbers]
+    recording: RawRecording, used: Int[np.ndarray, " rows"], layout: Layout, step: float | None
+) -> dict[str, np.ndarray]:
+    """Time and the signals q, v, u, a of these rows, `step` [s] apart, or for None at the times of the log."""
+    time, signals = recording.time[used], {name: values[used] for name, values in recording.signals.items()}
     if step is not None:
+        stamps, held = time, list(layout.held)
         count = int(np.floor((stamps[-1] - stamps[0]) / step * (1 + 1e-12))) + 1
         time = np.minimum(stamps[0] + step * np.arange(count), stamps[-1])
-
-    def logged(start: int, end: int) -> np.ndarray:
-        used = numbers[start:end]
-        table = spool.read(recording.first + int(used[0]), recording.first + int(used[-1]) + 1)
-        return table if len(table) == len(used) else table[used - used[0]]
-
-    def interpolated(at: np.ndarray) -> np.ndarray:
-        low = max(int(np.searchsorted(stamps, at[0])) - SPLINE_HALO, 0)
-        high = min(int(np.searchsorted(stamps, at[-1])) + SPLINE_HALO, len(stamps))
-        table, held = logged(low, high), list(layout.held)
-        between = make_interp_spline(stamps[low:high], table, k=3)(at)
+        before = np.searchsorted(stamps, time * (1 + 1e-12), side="right") - 1
+        u = signals.get("u", np.zeros((len(stamps), 0)))[before]
+        signals = {name: make_interp_spline(stamps, values, k=3)(time) for name, values in signals.items()}
         if held:
-            before = np.searchsorted(stamps[low:high], at * (1 + 1e-12), side="right") - 1
-            between[:, held] = table[before][:, held]
-        return between
-
-    for start in range(0, len(time), rows):
-        end = min(start + rows, len(time))
-        low, high = max(start - DIFFERENCE_HALO, 0), min(end + DIFFERENCE_HALO, len(time))
-        table = logged(low, high) if step is None else interpolated(time[low:high])
-        signals = layout.signals(table, time[low:high])
-        own = slice(start - low, end - low)
-        yield {"time": time[start:end]} | {name: values[own] for name, values in signals.items()}
+            signals["u"][:, held] = u[:, held]
+    return {"time": time, **layout.signals(signals, time)}

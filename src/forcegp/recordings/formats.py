@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import zip_longest
 from pathlib import Path
 
 from typing_extensions import override
@@ -14,7 +13,7 @@ from forcegp.recordings.delimited_text import DelimitedText
 from forcegp.recordings.hdf5_and_matlab import HDF5Arrays, matlab_file
 from forcegp.recordings.parquet import INFO, LeRobotFolder, ParquetFile
 from forcegp.recordings.ros_bag import RosBag
-from forcegp.recordings.source import Columns, Source, exact
+from forcegp.recordings.source import Columns, Source
 
 
 class SideBySide(Source):
@@ -59,23 +58,17 @@ class SideBySide(Source):
         return tuple(note for source in self.sources.values() for note in source.notes())
 
     @override
-    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        self.require(names)
-        used = list(dict.fromkeys(self._owners[name][0] for name in names))
-        own = {source: [self._owners[name][1] for name in names if self._owners[name][0] is source] for source in used}
-        streams = [exact(source.chunks(list(dict.fromkeys(own[source])), rows), rows) for source in used]
-        counts = dict.fromkeys(used, 0)
-        for pieces in zip_longest(*streams):
-            lengths = [len(next(iter(piece.values()))) if piece else 0 for piece in pieces]
-            for source, length in zip(used, lengths, strict=True):
-                counts[source] += length
-            if len(set(lengths)) > 1:
-                for source, stream in zip(used, streams, strict=True):
-                    counts[source] += sum(len(next(iter(piece.values()))) for piece in stream)
-                listed = ", ".join(f"{source.path.name} {count}" for source, count in counts.items())
-                raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
-            found = {source: piece for source, piece in zip(used, pieces, strict=True) if piece is not None}
-            yield {name: found[self._owners[name][0]][self._owners[name][1]] for name in names}
+    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
+        own: dict[Source, dict[str, str]] = {}
+        for name in names:
+            source, column = self._owners[name]
+            own.setdefault(source, {})[name] = column
+        read = {source: source.read(list(columns.values())) for source, columns in own.items()}
+        rows = {source.path.name: len(next(iter(columns.values()))) for source, columns in read.items()}
+        if len(set(rows.values())) > 1:
+            listed = ", ".join(f"{name} {count}" for name, count in rows.items())
+            raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
+        yield {name: read[source][column] for name, (source, column) in self._owners.items() if name in names}
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")

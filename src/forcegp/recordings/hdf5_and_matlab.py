@@ -1,17 +1,16 @@
 """HDF5 files of any layout, MATLAB files of version 7.3 (which are HDF5), and those of versions 5 to 7 by scipy."""
 
 import math
-from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import h5py
 import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError
-from forcegp.recordings.array_file import ArrayFile, pieces_of
+from forcegp.recordings.array_file import ArrayFile
 from forcegp.recordings.source import reading, require_plausible_size
 
 HDF5 = "an HDF5 file"
@@ -68,12 +67,11 @@ class HDF5Arrays(ArrayFile):
         return self._arrays
 
     @override
-    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
+    def array(self, name: str) -> np.ndarray:
         with reading(self.path, HDF5), h5py.File(self.path, "r") as file:
             stored = file[name]
             assert isinstance(stored, h5py.Dataset)
-            for start in range(0, self._arrays[name][0], rows):
-                yield stored[..., start : start + rows].T if self.transposed else stored[start : start + rows]
+            return stored[()].T if self.transposed else stored[()]
 
 
 WHAT = "a MATLAB file"
@@ -96,11 +94,8 @@ class MatlabHDF5(HDF5Arrays):
         return {name: (shape[1], 1) if _is_row(shape) else shape for name, shape in arrays.items()}
 
     @override
-    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        with reading(self.path, WHAT), h5py.File(self.path, "r") as file:
-            stored: Any = file[name]
-            row = stored[()].reshape(-1, 1) if _is_row(stored.shape[::-1]) else None
-        return super().blocks(name, rows) if row is None else pieces_of(row, rows)
+    def array(self, name: str) -> np.ndarray:
+        return super().array(name).reshape(self._arrays[name])
 
 
 class MatlabFile(ArrayFile):
@@ -142,8 +137,8 @@ class MatlabFile(ArrayFile):
         return {name: values.shape for name, values in self._arrays.items()}
 
     @override
-    def blocks(self, name: str, rows: int) -> Iterator[np.ndarray]:
-        return pieces_of(self._arrays[name], rows)
+    def array(self, name: str) -> np.ndarray:
+        return self._arrays[name]
 
 
 def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:

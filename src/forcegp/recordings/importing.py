@@ -1,4 +1,4 @@
-"""`import_recordings`: from log files to one dataset file, whatever their format and size."""
+"""`import_recordings`: from log files to one dataset, whatever their format."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 
 import forcegp.mechanics
 from forcegp.atomic_files import file_digest
-from forcegp.data.dataset_writer import DatasetWriter
+from forcegp.data import Dataset
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.recordings.array_file import ArrayFile
 from forcegp.recordings.episode_rows import Stamps, episode_rows, read_stamps
@@ -19,13 +19,11 @@ from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.reading import (
     RawRecording,
-    Spool,
     read_recording,
     require_plausible_positions,
-    warn_of_implausible_forces,
 )
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
-from forcegp.recordings.source import Source
+from forcegp.recordings.source import MOST_ROWS, Source
 
 ROUND_RATE = 1e-3
 """A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
@@ -41,8 +39,8 @@ class ImportOptions:
     ------
     gap: seconds without a row, or a message of one of several topics, that begin another episode; None for ten median
         steps.
-    resample: "auto" gives uneven rows even times at the median rate, "no" keeps every stamp.
-    rate: of the even times in Hz, instead of the median of the recordings' median rates.
+    rate: "auto" gives uneven rows even times at the median of the recordings' median rates, a number (Hz) all rows at
+        that rate; "log" keeps every stamp.
     start, end: seconds from the first row of each episode that are kept.
     unwrap: continue positions of turning joints that jump by a turn; those that count turns stay.
     beyond_limits: accept positions beyond the limits of the URDF.
@@ -54,23 +52,19 @@ class ImportOptions:
     """
 
     gap: float | None = None
-    resample: Literal["auto", "no"] = "auto"
-    rate: float | None = None
+    rate: float | Literal["auto", "log"] = "auto"
     start: float | None = None
     end: float | None = None
     unwrap: bool = False
     beyond_limits: bool = False
-    most_rows: int = 100_000_000
+    most_rows: int = MOST_ROWS
     stance: Literal["log", "auto"] = "log"
 
     @usable_arguments("ImportOptions")
     def __post_init__(self) -> None:
-        for name in ("gap", "rate"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < float("inf"):
+        for name, value in (("gap", self.gap), ("rate", self.rate)):
+            if value is not None and value not in ("auto", "log") and not 0.0 < value < float("inf"):
                 raise InvalidInput(f"{name} is {value}; it must be positive and finite.")
-        if self.rate is not None and self.resample == "no":
-            raise InvalidInput("a rate asks for resampling; leave out `rate` or `resample` no.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
         if self.stance not in ("log", "auto"):
@@ -81,27 +75,23 @@ class ImportOptions:
 
 def import_recordings(
     paths: Sequence[str | Path],
-    out: str | Path,
     mapping: ColumnMapping,
     *,
     model: forcegp.Model | None = None,
     options: ImportOptions | None = None,
     report: Progress = lambda done, total, note: None,
-) -> dict[str, Any]:
-    """Write the dataset that these logs hold and return what was done, which is also `metadata["import"]`.
+) -> Dataset:
+    """The dataset that these logs hold; `metadata["import"]` is what was done.
 
-    Each log is at least one episode; gaps and the episode numbers of a log make more. A log is read once, piece by
-    piece, and set aside in a temporary file beside `out` as float64, so that memory holds the time stamps only.
+    Each log is at least one episode; gaps and the episode numbers of a log make more. Only the columns that are used
+    have to fit into memory.
 
-    Raises FileFormatError, DatasetError and InvalidInput naming file, column, row, time and remedy; then nothing is
-    written. Warns (DataWarning) of what can be used but looks mistaken.
+    Raises FileFormatError, DatasetError and InvalidInput naming file, column, row, time and remedy. Warns
+    (DataWarning) of what can be used but looks mistaken.
     """
     options = options or ImportOptions()
-    out = Path(out)
     if not paths:
         raise InvalidInput("no logs are given.")
-    if not out.parent.is_dir():
-        raise InvalidInput(f"cannot write {out}: the folder {out.parent} does not exist; create it first.")
     robot, wheels = None, set[str]()
     if model is not None:  # wheels that roll turn as often as they like
         robot = model.robot
@@ -109,7 +99,7 @@ def import_recordings(
         wheels = {robot.layout.bodies[robot.frame(each.frame)[0]].name for each in rolling}
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
-    joined = [on_one_clock(source, signal_plan(mapping, source, model, **lacks), out.parent) for _, source in sources]
+    joined = [on_one_clock(source, signal_plan(mapping, source, model, **lacks)) for _, source in sources]
     sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
     plans = [plan for _, plan in joined]
     plan = plans[0]
@@ -118,43 +108,33 @@ def import_recordings(
             raise InvalidInput(
                 f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
             )
-    steps = 2 * len(sources)
-    with Spool(out.parent, plan.layout.width) as spool:
-        recordings = []
-        for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
-            report(index, steps, f"reading {label}")
-            found = read_recording(source, own, spool, label, unwrap=options.unwrap, most_rows=options.most_rows)
-            if not options.beyond_limits:
-                require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
-            warn_of_implausible_forces(found, own, robot)
-            recordings.append(found)
-        stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
-        step = _even_step(stamps, options)
-        episodes = [
-            (stretch, own.kept, each.layout)
-            for each, own in zip(plans, stamps, strict=True)
-            for stretch in own.stretches
-        ]
-        for stretch, *_ in episodes:  # inside an episode, derivatives would take a jump by a turn for motion
-            recording = stretch.recording
-            for row, seen, remedy in recording.jumps:
-                if stretch.start < row < stretch.end:
+    recordings = []
+    for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
+        report(index, len(sources), f"reading {label}")
+        found = read_recording(source, own, label, unwrap=options.unwrap, most_rows=options.most_rows)
+        if not options.beyond_limits:
+            require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
+        recordings.append(found)
+    stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
+    step = _even_step(stamps, options)
+    done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
+    pieces: list[dict[str, np.ndarray]] = []
+    for recording, own, each in zip(recordings, stamps, plans, strict=True):
+        for stretch in own.stretches:
+            rows = stretch.rows
+            for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
+                for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
                     raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
-        done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
-        with DatasetWriter(out, joint_names=plan.joints, units=plan.units, model=model) as writer:
-            for number, (stretch, kept, layout) in enumerate(episodes):
-                report(len(sources) + number * len(sources) // len(episodes), steps, "writing")
-                before = writer.rows
-                for piece in episode_rows(spool, stretch, kept, layout, step):
-                    writer.append(**piece, episode=number)
-                recording, begin = stretch.recording, stretch.start
-                stamp = recording.begin + float(recording.time[begin])
-                own = {"recording": recording.label, "number": stretch.number, "row": begin, "begin": stamp}
-                done["episodes"].append({**own, "rows": writer.rows - before})
-            done["rows"] = writer.rows
-            writer.finish({"import": done})
-    return done
+            piece = episode_rows(recording, rows, each.layout, step)
+            count, stamp = len(piece["time"]), recording.begin + float(recording.time[rows[0]])
+            pieces.append(piece | {"episode": np.full(count, len(pieces))})
+            told = {"recording": recording.label, "number": stretch.number, "row": int(rows[0]), "begin": stamp}
+            done["episodes"].append(told | {"rows": count})
+    columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
+    done["rows"] = len(columns["time"])
+    return Dataset(**columns, joint_names=plan.joints, units=plan.units, model=model, metadata={"import": done})
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:
@@ -186,17 +166,17 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
 def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
     """The step of even times that all episodes get, or None if every stamp stays."""
     median = float(np.median([own.step for own in stamps]))
-    if options.rate is not None:
+    if not isinstance(options.rate, str):
         if options.rate < 0.9 / median:
             warnings.warn(
                 f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
-                "of that appears as slow motion. Filter first: forcegp prepare --cutoff --every.",
+                "of that appears as slow motion. Filter first: forcegp import --cutoff --every.",
                 DataWarning,
                 stacklevel=3,
             )
         return 1.0 / options.rate
     alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in stamps)
-    if options.resample == "no" or (alike and all(own.even for own in stamps)):
+    if options.rate == "log" or (alike and all(own.even for own in stamps)):
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
@@ -231,7 +211,7 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
-                "seconds": float(sum(recording.time[x.end - 1] - recording.time[x.start] for x in own.stretches)),
+                "seconds": float(sum(np.ptp(recording.time[x.rows]) for x in own.stretches)),
                 "median_step": own.step,
                 "largest_deviation_of_a_step": own.worst,
                 "repeated_stamps_dropped": own.repeated,

@@ -1,7 +1,6 @@
 """ROS topics with different clocks as one table: rows of one topic, the others held or interpolated at its stamps."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,13 @@ from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.recordings.reading import Spool
 from forcegp.recordings.ros_bag import LOG_TIME, STAMP, RosBag
 from forcegp.recordings.signal_plan import SignalPlan
 from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import QUATERNION
 
 
-def on_one_clock(source: Source, plan: SignalPlan, folder: Path) -> tuple[Source, SignalPlan]:
+def on_one_clock(source: Source, plan: SignalPlan) -> tuple[Source, SignalPlan]:
     """The source with the columns of all topics on the clock of that of the time; others stay as they are.
 
     Inputs u hold the last message, which a row never precedes; everything else is interpolated. Raises InvalidInput
@@ -38,27 +36,27 @@ def on_one_clock(source: Source, plan: SignalPlan, folder: Path) -> tuple[Source
         if item.unit.si == "1" and part in QUATERNION:
             turns.setdefault(base, []).extend(item.expression.weights)
         if item.unit.si == "rad":  # half a turn, in the units of the log
-            half = {name: np.pi / abs(weight * item.factor) for name, weight in item.expression.weights.items()}
+            half = {name: np.pi / abs(weight) for name, weight in item.expression.weights.items()}
             most |= {name: turn / item.unit.in_si(np.ones(1)).item() for name, turn in half.items()}
     for row, item in enumerate(own.get("u", ())):
         elsewhere = {name for name in item.expression.weights if source.topic_of(name) != clock}
         most |= dict.fromkeys(elsewhere - measured, 0.0)
-        held += [plan.layout.places["u"].start + row] * bool(elsewhere)
+        held += [row] * bool(elsewhere)
     seconds = plan.time_unit.in_si(np.ones(1)).item()
-    joined = JoinedTopics(source, time, seconds, most, list(turns.values()), folder)
+    joined = JoinedTopics(source, time, seconds, most, list(turns.values()))
     return joined, replace(plan, layout=replace(plan.layout, held=tuple(sorted(set(held)))))
 
 
 @dataclass(frozen=True)
 class _Topic:
-    """The messages of one topic: stamps, and values in a spool.
+    """The messages of one topic: stamps and values.
 
     Values that differ by `most` or more are held: those of commands always, angles where they wrap. `turns` are places
     of quaternions, whose sign means nothing.
     """
 
     stamps: Shaped[np.ndarray, " messages"]
-    spool: Spool
+    table: Float[np.ndarray, "messages columns"]
     most: Float[np.ndarray, " columns"]
     turns: Sequence[Sequence[int]]
 
@@ -71,9 +69,7 @@ class _Topic:
             after = first + (since > 0)
             there &= after < len(self.stamps)
             after = np.minimum(after, len(self.stamps) - 1)
-        low = int(first.min())
-        table = self.spool.read(low, int(after.max()) + 1)
-        values, later = table[first - low], table[after - low]
+        values, later = self.table[first], self.table[after]
         for turn in self.turns:
             later[:, turn] *= np.where((values[:, turn] * later[:, turn]).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
         span = self.stamps[after] - self.stamps[first]
@@ -86,7 +82,7 @@ class JoinedTopics(Source):
     """The messages of the topic of `time`, with columns of other topics.
 
     These are interpolated between the messages before and behind, but for values that differ by `most` or more; columns
-    of `turns` are quaternions. Memory holds stamps, a file in `folder` the values. `seconds` is the unit of the time.
+    of `turns` are quaternions. `seconds` is the unit of the time.
     """
 
     row_word = "message"
@@ -98,14 +94,13 @@ class JoinedTopics(Source):
         seconds: float,
         most: Mapping[str, float],
         turns: Sequence[Sequence[str]],
-        folder: Path,
     ) -> None:
         super().__init__(bag.path)
-        self.bag, self.seconds, self.most, self.turns, self.folder = bag, seconds, most, turns, folder
+        self.bag, self.seconds, self.most, self.turns = bag, seconds, most, turns
         self.clock = bag.topic_of(time)
         self.stamp = time.removeprefix(f"{self.clock}:")
         self._notes: list[str] = []
-        self._silent: dict[str, tuple[float, list[np.ndarray]]] = {}
+        self._silent: list[tuple[float, np.ndarray]] = []
 
     @override
     def columns(self) -> tuple[str, ...]:
@@ -121,61 +116,53 @@ class JoinedTopics(Source):
 
     @override
     def paused(self, gap: float | None, steps: float) -> Bool[np.ndarray, " rows"] | None:
-        limits = [(ages, steps * step if gap is None else gap / self.seconds) for step, ages in self._silent.values()]
-        return np.any([np.concatenate(ages) > limit for ages, limit in limits], axis=0)
+        limits = [(ages, steps * step if gap is None else gap / self.seconds) for step, ages in self._silent]
+        return np.any([ages > limit for ages, limit in limits], axis=0)
 
     @override
-    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        self.require(names)
-        topics = dict.fromkeys(topic for name in names if (topic := self.bag.topic_of(name)) != self.clock)
-        self._notes, self._silent, outside, ways = [], {}, 0, []
-        with ExitStack() as stack:
-            tracks: dict[str, tuple[list[str], _Topic]] = {}
-            for topic in topics:
-                own = [name for name in names if self.bag.topic_of(name) == topic]
-                track = self._read(topic, own, rows, stack)
-                tracks[topic] = own, track
-                steps = np.diff(track.stamps)
-                self._silent[topic] = float(np.median(steps)) if len(steps) else np.inf, []
-                how = "interpolated" if track.most.all() else "interpolated, u held" if track.most.any() else "held"
-                ways.append(f"{topic} {how}" + f" (by {LOG_TIME})" * (self._stamp_of(topic) != self.stamp))
-            own = [name for name in names if self.bag.topic_of(name) == self.clock]
-            stamp = f"{self.clock}:{self.stamp}"
-            for piece in self.bag.chunks(list(dict.fromkeys([stamp, *own])), rows):
-                found = {topic: (own, *track.at(piece[stamp])) for topic, (own, track) in tracks.items()}
-                kept = np.all([there for _, _, _, there in found.values()], axis=0)
-                outside += int((~kept).sum())
-                joined = {name: values[kept] for name, values in piece.items()}
-                for topic, (own, values, ages, _) in found.items():
-                    self._silent[topic][1].append(ages[kept])
-                    joined |= {name: values[kept, column] for column, name in enumerate(own)}
-                if kept.any():
-                    yield {name: joined[name] for name in names}
-        if not sum(len(ages) for _, pieces in self._silent.values() for ages in pieces):
+    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
+        own: dict[str, list[str]] = {self.clock: [f"{self.clock}:{self.stamp}"]}
+        for name in names:
+            own.setdefault(self.bag.topic_of(name), []).append(name)
+        self._notes, self._silent, ways = [], [], []
+        found = self.bag.read(list(dict.fromkeys(own[self.clock])))
+        left_out, topics = self.bag.notes(), [topic for topic in own if topic != self.clock]
+        time = found[f"{self.clock}:{self.stamp}"]
+        kept, tracks = np.ones(len(time), bool), []
+        for topic in topics:
+            track = self._read(topic, own[topic])
+            steps = np.diff(track.stamps)
+            how = "interpolated" if track.most.all() else "interpolated, u held" if track.most.any() else "held"
+            ways.append(f"{topic} {how}" + f" (by {LOG_TIME})" * (self._stamp_of(topic) != self.stamp))
+            values, ages, there = track.at(time)
+            kept &= there
+            tracks.append((float(np.median(steps)) if len(steps) else np.inf, ages))
+            found |= {name: values[:, column] for column, name in enumerate(own[topic])}
+        if not kept.any():
             raise DatasetError(
                 f"{self.path}: the stamps of {', '.join([self.clock, *topics])} do not overlap; compare their clocks, "
                 f"or name `time` {self.clock}:{LOG_TIME}."
             )
+        self._silent = [(step, ages[kept]) for step, ages in tracks]
+        outside = int((~kept).sum())
         lost = f"; {outside} rows before the first or behind the last message of a topic left out" * bool(outside)
-        self._notes += [*self.bag.notes(), f"rows are those of {self.clock}: {', '.join(ways)}{lost}"]
+        self._notes += [*left_out, f"rows are those of {self.clock}: {', '.join(ways)}{lost}"]
+        yield {name: found[name][kept] for name in names}
 
-    def _read(self, topic: str, names: Sequence[str], rows: int, stack: ExitStack) -> _Topic:
+    def _read(self, topic: str, names: Sequence[str]) -> _Topic:
         """All messages of a topic. Raises DatasetError for stamps that run backwards."""
         stamp = f"{topic}:{self._stamp_of(topic)}"
-        spool, stamps = stack.enter_context(Spool(self.folder, len(names))), list[np.ndarray]()
-        for piece in self.bag.chunks(list(dict.fromkeys([stamp, *names])), rows):
-            stamps.append(piece[stamp])
-            spool.append(np.stack([piece[name] for name in names], axis=1).astype(np.float64))
+        columns = self.bag.read(list(dict.fromkeys([stamp, *names])))
         self._notes += self.bag.notes()
-        joined = np.concatenate(stamps)
-        back = float(np.diff(joined).min(initial=0)) * self.seconds
+        back = float(np.diff(columns[stamp]).min(initial=0)) * self.seconds
         if back < 0.0:
             raise DatasetError(
                 f"{self.path}: the stamps of {topic} run backwards by {-back:.6g} s; topics are joined in the order of "
                 f"time. Name `time` {self.clock}:{LOG_TIME}, or mend the bag."
             )
         turns = [[names.index(name) for name in turn] for turn in self.turns if {*turn} <= {*names}]
-        return _Topic(joined, spool, np.array([self.most.get(name, np.inf) for name in names]), turns)
+        table = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+        return _Topic(columns[stamp], table, np.array([self.most.get(name, np.inf) for name in names]), turns)
 
     def _stamp_of(self, topic: str) -> str:
         """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,43 +17,39 @@ from forcegp.recordings.source import reading
 
 @dataclass(frozen=True)
 class LogUnit:
-    """`numerator / denominator` is one unit in SI; both are kept, for x / 1000 rounds once and x * 0.001 twice."""
+    """One unit in SI is so many of these: whole thousandths are divided once, and come out to the last bit."""
 
     name: str
     si: str
-    numerator: float = 1.0
-    denominator: float = 1.0
+    per_si: float = 1.0
 
     def in_si(self, values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """The values in the SI unit; those that are in it already come out as they are."""
-        if self.numerator != 1.0:
-            values = values * self.numerator
-        return values / self.denominator if self.denominator != 1.0 else values
+        return values / self.per_si if self.per_si != 1.0 else values
 
 
-def _units(si: str, factors: Mapping[str, Fraction | float]) -> dict[str, LogUnit]:
-    parts = {name: (x, 1) if isinstance(x, float) else (x.numerator, x.denominator) for name, x in factors.items()}
-    return {name: LogUnit(name, si, float(above), float(below)) for name, (above, below) in parts.items()}
+def _units(si: str, per_si: Mapping[str, float]) -> dict[str, LogUnit]:
+    return {name: LogUnit(name, si, float(number)) for name, number in per_si.items()}
 
 
-_MILLI, _MICRO, _NANO = Fraction(1, 1000), Fraction(1, 10**6), Fraction(1, 10**9)
-_DEGREE, _TURN = math.pi / 180.0, 2.0 * math.pi
+_DEGREES, _TURNS = 180.0 / math.pi, 0.5 / math.pi
+"""In a radian."""
 
 ONE = LogUnit("1", "1")
 """Of parts of a quaternion, of shares of a thrust and of switches."""
 
 UNITS: dict[str, dict[str, LogUnit]] = {
-    "time": _units("s", {"s": 1, "ms": _MILLI, "us": _MICRO, "ns": _NANO, "min": 60}),
-    "q": _units("rad", {"rad": 1, "mrad": _MILLI, "deg": _DEGREE, "rev": _TURN})
-    | _units("m", {"m": 1, "cm": Fraction(1, 100), "mm": _MILLI, "um": _MICRO})
+    "time": _units("s", {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60}),
+    "q": _units("rad", {"rad": 1, "mrad": 1e3, "deg": _DEGREES, "rev": _TURNS})
+    | _units("m", {"m": 1, "cm": 100, "mm": 1e3, "um": 1e6})
     | {"1": ONE},
-    "v": _units("rad/s", {"rad/s": 1, "mrad/s": _MILLI, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0})
-    | _units("m/s", {"m/s": 1, "cm/s": Fraction(1, 100), "mm/s": _MILLI}),
-    "u": _units("Nm", {"Nm": 1, "mNm": _MILLI, "uNm": _MICRO, "kNm": 1000, "Ncm": Fraction(1, 100)})
-    | _units("N", {"N": 1, "mN": _MILLI, "kN": 1000})
+    "v": _units("rad/s", {"rad/s": 1, "mrad/s": 1e3, "deg/s": _DEGREES, "rev/s": _TURNS, "rpm": 60 * _TURNS})
+    | _units("m/s", {"m/s": 1, "cm/s": 100, "mm/s": 1e3}),
+    "u": _units("Nm", {"Nm": 1, "mNm": 1e3, "uNm": 1e6, "kNm": 1e-3, "Ncm": 100})
+    | _units("N", {"N": 1, "mN": 1e3, "kN": 1e-3})
     | {"1": ONE}
-    | _units("rad/s", {"rad/s": 1, "rev/s": _TURN, "rpm": _TURN / 60.0}),
-    "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREE}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": _MILLI}),
+    | _units("rad/s", {"rad/s": 1, "rev/s": _TURNS, "rpm": 60 * _TURNS}),
+    "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREES}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3}),
 }
 """By quantity and name: what `ColumnMapping.unit` accepts."""
 
@@ -73,12 +68,11 @@ ORIENTATIONS = ("xyzw", "wxyz", "angles")
 """Quaternions with w last or first; roll, pitch and yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or the yaw of a plane."""
 AXES = {"v": ("body", "world"), "a": ("body", "world", "imu")}
 """What linear and angular velocities and accelerations may be measured in."""
-Factors = Mapping[str, tuple[float, ...]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnMapping:
-    """What the columns of a log mean. A value in SI is `sign * scale * unit * (combination of columns) + offset`.
+    """What the columns of a log mean. A value in SI is `sign * unit * (combination of columns)`.
 
     Fields
     ------
@@ -92,7 +86,7 @@ class ColumnMapping:
     ned: the log's world is north, east, down and its base forward, right, down; both are turned about x by half a turn.
     unit: by signal and "time", one unit for all joints or one for each. Default: SI. With a base that moves, each unit
         is for the columns of its kind.
-    sign, scale, offset: by signal, one number for all joints or one for each; offset in SI, added last.
+    sign: by signal, 1 or -1 for all joints or for each.
     episode: a column that numbers the episodes.
     episodes: a pattern (`piece*`) for arrays or groups of the file, each of which is an episode.
     headerless: for text without header, the columns of each file in their order.
@@ -113,9 +107,7 @@ class ColumnMapping:
     axes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ned: bool = False
     unit: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    sign: Factors = field(default_factory=dict)
-    scale: Factors = field(default_factory=dict)
-    offset: Factors = field(default_factory=dict)
+    sign: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     episode: str | None = None
     episodes: str | None = None
     headerless: tuple[int, ...] = ()
@@ -144,22 +136,13 @@ class ColumnMapping:
                 raise InvalidInput(f"unit names {quantity!r}; it has {', '.join(UNITS)}.")
             for name in names:
                 log_unit(quantity, name)
-        for what in ("sign", "scale", "offset"):
-            for signal, numbers in getattr(self, what).items():
-                self._check_numbers(what, signal, numbers)
+        for signal, numbers in self.sign.items():
+            if signal not in SIGNALS:
+                raise InvalidInput(f"sign names {signal!r}; it has {', '.join(SIGNALS)}.")
+            if not set(numbers) <= {1.0, -1.0}:
+                raise InvalidInput(f"sign of {signal} is {', '.join(map(str, numbers))}; give 1 or -1.")
         if any(columns < 1 for columns in self.headerless):
             raise InvalidInput(f"headerless is {self.headerless}; a row has at least one number.")
-
-    def _check_numbers(self, what: str, signal: str, numbers: tuple[float, ...]) -> None:
-        if signal not in SIGNALS:
-            raise InvalidInput(f"{what} names {signal!r}; it has {', '.join(SIGNALS)}.")
-        for number in numbers:
-            if not abs(number) < float("inf") or (what == "sign" and number not in (1.0, -1.0)):
-                raise InvalidInput(
-                    f"{what} of {signal} is {number}; give {'1 or -1' if what == 'sign' else 'a number'}."
-                )
-            if what == "scale" and number == 0.0:
-                raise InvalidInput(f"scale of {signal} is 0, which would erase it.")
 
     def changed_by(self, other: "ColumnMapping") -> "ColumnMapping":
         """The mapping with everything that the other one states; time and step take each other's place."""
@@ -168,7 +151,7 @@ class ColumnMapping:
             for item in fields(other)
             if getattr(other, item.name) not in (None, (), {}, False)
         }
-        for name in ("axes", "unit", "sign", "scale", "offset"):
+        for name in ("axes", "unit", "sign"):
             if name in stated:
                 stated[name] = {**getattr(self, name), **stated[name]}
         if {"time", "step"} & stated.keys():
@@ -213,7 +196,7 @@ class ColumnMapping:
         return replace(self, **changes)
 
     def flags(self) -> list[str]:
-        """The words of `forcegp import` that state columns, units, signs, scales and offsets."""
+        """The words of `forcegp import` that state columns, units and signs."""
         words: list[str] = []
         for name, value in self.plain().items():
             if name in SIGNALS or name == "joints":
@@ -306,12 +289,9 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
             quantities = ", ".join(UNITS if key == "unit" else AXES)
             _require(isinstance(value, dict), key, value, f"name the quantity, as {_EXAMPLES[key]} ({quantities})")
             values[key] = {str(name): _texts(f"{key} of {name}", entry) for name, entry in value.items()}
-        elif key in ("sign", "scale", "offset"):
-            if not isinstance(value, dict):  # for all signals, which only a sign can be: it turns the axis of a joint
-                _require(key == "sign", key, value, f"name its signal, for example {_EXAMPLES[key]}")
-                value = dict.fromkeys(SIGNALS, value)
-            entries = {str(signal): _listed(entry) for signal, entry in value.items()}
-            values[key] = {name: tuple(_number(f"{key} of {name}", x) for x in own) for name, own in entries.items()}
+        elif key == "sign":  # for all signals, if none is named: it turns the axis of a joint
+            named = value if isinstance(value, dict) else dict.fromkeys(SIGNALS, value)
+            values[key] = {str(k): tuple(_number(f"{key} of {k}", x) for x in _listed(own)) for k, own in named.items()}
         elif key == "headerless":
             values[key] = tuple(_listed(value))
             for entry in values[key]:
@@ -355,20 +335,7 @@ def by_quantity(flag: str, text: str) -> dict[str, list[str]]:
     return found
 
 
-_EXAMPLES = {
-    "unit": "q=deg,time=ms",
-    "sign": "u=-1,1",
-    "scale": "u=0.001",
-    "offset": "q=0,1.5708",
-    "axes": "v=world,body",
-}
-
-
-def factors_of(flag: str, text: str) -> Any:
-    """The value of `sign`, `scale` or `offset` as a YAML file would have it."""
-    if "=" not in text:
-        return [_number(flag, part) for part in text.split(",")]
-    return {name: [_number(flag, part) for part in parts] for name, parts in by_quantity(flag, text).items()}
+_EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body"}
 
 
 def _texts(key: str, value: Any) -> tuple[str, ...]:

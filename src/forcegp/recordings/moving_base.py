@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from forcegp.data import differentiate
@@ -26,9 +26,6 @@ LARGEST_ERROR = 0.01
 """Of the length of a quaternion: more is no rounding."""
 ROUNDED = 1e-9
 """Differences from length 1 beyond this are reported."""
-
-MOST_JUMPS = 1000
-"""That are remembered of one piece: the first one that matters is reported."""
 
 
 def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
@@ -89,88 +86,70 @@ def columns_of(
     return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
 
 
-class Poses:
-    """Positions as the log writes them, piece by piece, as q: turns of length 1, quaternions whose sign never jumps.
+Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
+"""Rows before which something moves too far, what was seen, and what to do."""
 
-    `jumps` are rows before which a base turns by more than a quarter of a turn, what was seen, and what to do; `worst`
-    is the largest difference of a length from 1.
+
+def read_poses(
+    space: ConfigurationSpace,
+    orientation: str,
+    source: Source,
+    table: Float[np.ndarray, "rows columns"],
+    begins: Int[np.ndarray, " episodes"],
+) -> tuple[Float[np.ndarray, "rows nq"], list[Jumps], list[str]]:
+    """Positions as the log writes them, as q: turns of length 1, quaternions whose sign never jumps.
+
+    And rows before which a base turns by more than a quarter of a turn, `begins` of episodes left out; and what people
+    should know. Raises DatasetError, naming the row, where a turn is more than 1 % longer or shorter than 1.
     """
-
-    def __init__(self, space: ConfigurationSpace, orientation: str, source: Source) -> None:
-        self.space, self.orientation, self.source = space, orientation, source
-        self.last: dict[str, np.ndarray] = {}
-        self.jumps: list[tuple[int, str, str]] = []
-        self.worst = 0.0
-
-    def read(
-        self, table: Float[np.ndarray, "rows columns"], rows: int, restarts: Sequence[int]
-    ) -> Float[np.ndarray, "rows nq"]:
-        """q of a piece that follows `rows` others; rows in `restarts` begin another episode.
-
-        Raises DatasetError, naming the row, where a turn is more than 1 % longer or shorter than 1.
-        """
-        turned = list(spans(self.space, self.orientation))
-        q = np.delete(table, [column for _, span in turned for column in range(span.start, span.stop)], axis=1)
-        for group, span in turned:
-            pose = self._pose(group, table[:, span], rows, restarts)
-            q = np.hstack([q[:, : group.place], pose, q[:, group.place :]])
-        return q
-
-    def note(self) -> tuple[str, ...]:
-        """That orientations were divided by their length, if more than rounding."""
-        many = self.worst > ROUNDED
-        return (f"orientations divided by their length, which differs from 1 by up to {self.worst:.2g}",) * many
-
-    def _pose(self, group: Group, given: np.ndarray, rows: int, restarts: Sequence[int]) -> np.ndarray:
-        first = group.motion.turn.start
-        if self.orientation == "angles" and group.kind == "planar":
+    turned = list(spans(space, orientation))
+    q = np.delete(table, [column for _, span in turned for column in range(span.start, span.stop)], axis=1)
+    jumps, notes = list[Jumps](), list[str]()
+    for group, span in turned:
+        given, first = table[:, span], group.motion.turn.start
+        if orientation == "angles" and group.kind == "planar":
             turn = np.hstack([np.cos(given[:, first:]), np.sin(given[:, first:])])
-        elif self.orientation == "angles":
+        elif orientation == "angles":
             turn = np.array(Rotation.from_euler("xyz", given[:, first:]).as_quat())
         else:
-            turn = self._unit(group, given[:, first:], rows)
-        last = self.last[group.name] if group.name in self.last else turn[0]
-        turn, jumped = following(group, turn, last)
-        self.last[group.name] = turn[-1].copy()
-        jumped[list(restarts)] = False
+            length = np.linalg.norm(given[:, first:], axis=1, keepdims=True)
+            error = np.abs(length[:, 0] - 1.0)
+            row = int(error.argmax())
+            if error[row] > LARGEST_ERROR:
+                names = ", ".join(group.motion.positions[group.motion.turn])
+                raise DatasetError(
+                    f"{source.path}: the orientation of {group.name!r} ({names}) has the length {length[row, 0]:.4g} "
+                    f"at {source.place(row)}; a turn has length 1. Map its columns, give `orientation` angles if they "
+                    "are roll, pitch and yaw, or repair or remove these rows."
+                )
+            if error[row] > ROUNDED:
+                notes.append(f"orientations divided by their length, which differs from 1 by up to {error[row]:.2g}")
+            turn = given[:, first:] / length
+        turn, jumped = following(group, turn, turn[0])
+        jumped[begins] = False
         seen = f"{group.name!r} turns by more than a quarter of a turn"
         remedy = (
             "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
         )
-        self.jumps += [(rows + int(row), seen, remedy) for row in np.flatnonzero(jumped)[:MOST_JUMPS]]
-        return np.hstack([given[:, :first], turn])
-
-    def _unit(self, group: Group, turn: np.ndarray, rows: int) -> np.ndarray:
-        length = np.linalg.norm(turn, axis=1)
-        error = np.abs(length - 1.0)
-        if (error > LARGEST_ERROR).any():
-            row = int(np.argmax(error > LARGEST_ERROR))
-            names = ", ".join(group.motion.positions[group.motion.turn])
-            raise DatasetError(
-                f"{self.source.path}: the orientation of {group.name!r} ({names}) has the length {length[row]:.4g} at "
-                f"{self.source.place(rows + row)}; a turn has length 1. Map its columns, give `orientation` angles if "
-                "they are roll, pitch and yaw, or repair or remove these rows."
-            )
-        self.worst = max(self.worst, float(error.max(initial=0.0)))
-        return turn / length[:, None]
+        jumps.append((np.flatnonzero(jumped), seen, remedy))
+        q = np.hstack([q[:, : group.place], given[:, :first], turn, q[:, group.place :]])
+    return q, jumps, notes
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the signals stand in the spool, and what is left to do about those of a base.
+    """What is left to do about signals once they are read: those of a base are turned, what lacks is differentiated.
 
     Fields
     ------
-    places: columns of each signal that was logged; q as a Dataset has it.
     space: of the positions.
     bases: joints of several degrees of freedom whose parent is the world.
     axes: of v and a, those of the linear and of the angular part.
     gravity: (3,) [m/s^2], for accelerometers.
     derived: entries of v and a that the log lacks.
-    held: columns of the spool that hold from row to row.
+    held: columns of u that hold from row to row.
     """
 
-    places: Mapping[str, slice]
     space: ConfigurationSpace
     bases: tuple[Group, ...] = ()
     axes: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -178,14 +157,9 @@ class Layout:
     derived: Mapping[str, list[int]] = field(default_factory=dict)
     held: tuple[int, ...] = ()
 
-    @property
-    def width(self) -> int:
-        """Columns of the spool."""
-        return max(place.stop for place in self.places.values())
-
-    def signals(self, table: np.ndarray, time: Float[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
-        """q, v, u and a of rows of the spool, with differences (second order) for what was not logged."""
-        found = {name: table[:, place] for name, place in self.places.items()}
+    def signals(self, logged: Mapping[str, np.ndarray], time: Float[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
+        """q, v, u and a, with differences (second order) for what was not logged."""
+        found = dict(logged)
         if not self.space.is_vector_space:  # a spline through quaternions does not end on the sphere
             found["q"] = self.space.normalized(torch.tensor(found["q"])).numpy()
         for name, source in (("v", "q"), ("a", "v")):
@@ -211,20 +185,12 @@ class Layout:
 
 
 def layout_of(mapping: ColumnMapping, model: Model | None, lacking: Mapping[str, Sequence[bool]], nv: int) -> Layout:
-    """Where everything stands once positions are those of a Dataset.
+    """What is left to do once positions are those of a Dataset.
 
     `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
     there where their axes turn.
     """
     groups = () if model is None else bases(model.robot)
-    sizes = dict.fromkeys(SIGNALS, nv)
-    if model is not None:
-        sizes |= {"q": model.robot.nq, "u": len(model.inputs)}
-    places, end = dict[str, slice](), 0
-    for name in SIGNALS:
-        if sizes[name] == 0 or name in lacking:
-            places[name] = slice(end, end + sizes[name])
-            end += sizes[name]
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
     for name in axes.keys() - lacking.keys():
@@ -237,7 +203,6 @@ def layout_of(mapping: ColumnMapping, model: Model | None, lacking: Mapping[str,
             if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
                 raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
     if model is None:
-        return Layout(places, ConfigurationSpace(nv), derived=derived)
-    switches = range(places["u"].start + len(model.actuators), places["u"].stop)
-    gravity = tuple(model.robot.gravity.tolist())
-    return Layout(places, model.robot.space, groups, axes, gravity, derived, tuple(switches))
+        return Layout(ConfigurationSpace(nv), derived=derived)
+    switches = tuple(range(len(model.actuators), len(model.inputs)))
+    return Layout(model.robot.space, groups, axes, tuple(model.robot.gravity.tolist()), derived, switches)

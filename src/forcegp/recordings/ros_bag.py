@@ -12,7 +12,15 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput, required_extra
-from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, as_column, reading, require_plausible_size
+from forcegp.recordings.source import (
+    LONGEST_VECTOR,
+    ROWS_AT_A_TIME,
+    Columns,
+    Source,
+    as_column,
+    reading,
+    require_plausible_size,
+)
 
 LOG_TIME = "log_time"
 STAMP = "header.stamp"
@@ -131,8 +139,7 @@ class RosBag(Source):
         return next(topic for topic, names in self._topics.items() if name in names)
 
     @override
-    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        self.require(names)
+    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
         topics = sorted({self.topic_of(name) for name in names})
         if len(topics) != 1:
             raise InvalidInput(
@@ -148,7 +155,7 @@ class RosBag(Source):
                 raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
             messages = reader.messages(connections)
             fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
-            while batch := list(islice(messages, rows)):
+            while batch := list(islice(messages, ROWS_AT_A_TIME)):
                 found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
                 table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
                 self._left_out += len(batch) - len(table)

@@ -11,7 +11,7 @@ import forcegp.mechanics
 import forcegp.robots
 from forcegp.data import FrozenDict
 from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, units_for, validated_units
-from forcegp.errors import InvalidInput
+from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.column_names import (
     LinearExpression,
     expanded,
@@ -28,30 +28,29 @@ from forcegp.summary import listed
 LACKING = LinearExpression({}, 0.0)
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
+EPISODE = "episode_index"
+"""Numbers the episodes where nothing else is stated, as in datasets of LeRobot."""
 MOST_NAMES = 40
 """Of columns in a message."""
 
 
 @dataclass(frozen=True)
 class JointSignal:
-    """One signal of one joint: `factor * unit(expression) + offset`, in SI."""
+    """One signal of one joint: `sign * unit(expression)`, in SI."""
 
     signal: str
     joint: str
     expression: LinearExpression
     unit: LogUnit
-    factor: float
-    offset: float
+    sign: float
 
     def __str__(self) -> str:
         return "derive" if self.expression is LACKING else str(self.expression)
 
     def value(self, columns: Columns, rows: int) -> np.ndarray:
-        """(rows,) in SI; a column in SI without factor and offset comes out to the last bit."""
+        """(rows,) in SI; a column in SI comes out to the last bit."""
         values = self.unit.in_si(self.expression.value(columns, rows))
-        if self.factor != 1.0:
-            values = values * self.factor
-        return values if self.offset == 0.0 else values + self.offset
+        return values if self.sign == 1.0 else -values
 
 
 @dataclass(frozen=True)
@@ -162,11 +161,9 @@ def signal_plan(
         for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
     )
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
-    episode = mapping.episode
-    if episode is None and source.suggested_episode in source.columns():
-        episode = source.suggested_episode
+    episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
     if episode is not None:
-        source.require([episode])
+        require_known("column", episode, str(source.path), source.columns(), FileFormatError)
     # stamps of ROS are whole nanoseconds; everything else is taken for seconds
     stamps = time is not None and time.is_column and next(iter(time.weights)).endswith((":header.stamp", ":log_time"))
     [time_unit, *_] = mapping.unit.get("time", ("ns" if stamps else "s",))
@@ -264,7 +261,9 @@ def _signals(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, ())]
-    switches = [name for name in names if signal == "u" and columns[name] == "1"]
+    signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)
+    if driven < len(names) and len(signs) in (1, driven):  # they do not change a switch that stands behind actuators
+        signs = (*signs * (driven // len(signs)), *[1.0] * (len(names) - driven))
     for name in order:
         index, si = names.index(name), columns[name]
         unit = _unit(signal, given, index, columns, by_kind=not plain)
@@ -274,24 +273,8 @@ def _signals(
                 f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}: give a unit of {si}, or one "
                 "per joint."
             )
-        sign, scale, offset = (
-            _factor(mapping, what, signal, index, names, switches)
-            for what in (("sign", 1.0), ("scale", 1.0), ("offset", 0.0))
-        )
-        if name in turned and signal != "u":
-            sign, offset = -sign, -offset
-        yield JointSignal(signal, name, expressions[index], unit, sign * scale, offset)
-
-
-def _factor(
-    mapping: ColumnMapping, what: tuple[str, float], signal: str, index: int, names: list[str], switches: list[str]
-) -> float:
-    """One for all, or one for each; those of all actuators do not change a switch that stands behind them."""
-    name, neutral = what
-    values = getattr(mapping, name).get(signal, (neutral,))
-    if switches and len(values) in (1, len(names) - len(switches)):
-        values = [*values * (1 if len(values) > 1 else len(names) - len(switches)), *[neutral] * len(switches)]
-    return _at(f"{name} of {signal}", values, index, names)
+        sign = _at(f"sign of {signal}", signs, index, names)
+        yield JointSignal(signal, name, expressions[index], unit, -sign if name in turned and signal != "u" else sign)
 
 
 def _unit(

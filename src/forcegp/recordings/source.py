@@ -1,7 +1,5 @@
-"""`Source`: a log file as a table of named columns of numbers, read in pieces; how much a compressed one may hold."""
+"""`Source`: a log file as a table of named columns of numbers; how much a compressed one may hold."""
 
-import gzip
-import io
 import re
 import zlib
 from abc import ABC, abstractmethod
@@ -12,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Bool
-from typing_extensions import override
 
 from forcegp.errors import FileFormatError, ForceGPError, require_known
 
@@ -22,6 +19,10 @@ Columns = dict[str, np.ndarray]
 LONGEST_VECTOR = 4096
 """Columns of a table in one array; wider ones are pictures and the like, not signals of joints."""
 
+MOST_ROWS = 100_000_000
+ROWS_AT_A_TIME = 2**16
+"""Of what libraries give in pieces."""
+
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 
 
@@ -29,7 +30,7 @@ class Source(ABC):
     """One log: a table whose rows come one after the other in time.
 
     A subclass reads one format. `columns` names every column of numbers; an array of `k` numbers per row is `k` columns
-    `name[0] ... name[k-1]`. `chunks` gives chosen columns in pieces, so that a file may be larger than the memory.
+    `name[0] ... name[k-1]`. `read` gives chosen ones, and only these have to fit into memory.
     Nothing in a file is executed and no link to another file is followed.
 
     Raises FileFormatError, with the path and what to do, from the constructor or from any method.
@@ -37,10 +38,6 @@ class Source(ABC):
 
     row_word: ClassVar[str] = "row"
     """What one row is called in messages."""
-    suggested_time: ClassVar[str | None] = None
-    """The column that holds the time wherever this format is used, if there is one."""
-    suggested_episode: ClassVar[str | None] = None
-    """The column that numbers the episodes wherever this format is used, if there is one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -50,11 +47,25 @@ class Source(ABC):
         """The names of all columns, in the order of the file; not empty, no name twice."""
 
     @abstractmethod
-    def chunks(self, names: Sequence[str], rows: int) -> Iterator[Columns]:
-        """The named columns in pieces of at most `rows` rows, in the order of the file; no piece is empty.
+    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
+        """The named columns in the order of the file, in pieces of any length; all of `names` are there.
 
         A value that is missing is NaN. Raises FileFormatError for a value that is no number.
         """
+
+    def read(self, names: Sequence[str], most_rows: int = MOST_ROWS) -> Columns:
+        """The named columns. Raises FileFormatError for names that are no columns, for no rows and for too many."""
+        known, rows, pieces = self.columns(), 0, list[Columns]()
+        for name in names:
+            require_known("column", name, str(self.path), known, FileFormatError)
+        for piece in self.pieces(names):
+            pieces.append(piece)
+            rows += len(next(iter(piece.values())))
+            if rows > most_rows:
+                raise FileFormatError(f"{self.path} has more than {most_rows} rows; allow more with `most_rows`.")
+        if not rows:
+            raise FileFormatError(f"{self.path} has no rows; give a log with rows.")
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     @property
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
@@ -68,14 +79,14 @@ class Source(ABC):
 
     def time_beside(self, names: Sequence[str]) -> str | None:
         """The column that is the time of these columns, if the format itself names it."""
-        return self.suggested_time
+        return None
 
     def files(self) -> tuple[Path, ...]:
         """The files that this log consists of."""
         return (self.path,)
 
     def notes(self) -> tuple[str, ...]:
-        """Remarks on how the file was read; complete after the last piece."""
+        """Remarks on how the file was read; complete once it was."""
         return ()
 
     def place(self, row: int) -> str:
@@ -88,12 +99,6 @@ class Source(ABC):
         None where rows come whole.
         """
         return None
-
-    def require(self, names: Sequence[str]) -> None:
-        """Raises FileFormatError for a name that is no column."""
-        known = self.columns()
-        for name in names:
-            require_known("column", name, str(self.path), known, FileFormatError)
 
 
 def require_distinct(path: Path, names: Sequence[str]) -> None:
@@ -133,21 +138,6 @@ def arrow_numbers(column: Any) -> np.ndarray:
     return values.astype(np.float64) if values.dtype == object or column.null_count else values
 
 
-def exact(pieces: Iterator[Columns], rows: int) -> Iterator[Columns]:
-    """The same rows in pieces of exactly `rows`, but for the last."""
-    waiting: list[Columns] = []
-    count = 0
-    for piece in pieces:
-        waiting.append(piece)
-        count += len(next(iter(piece.values())))
-        while count >= rows:
-            joined = {name: np.concatenate([part[name] for part in waiting]) for name in piece}
-            yield {name: values[:rows] for name, values in joined.items()}
-            waiting, count = [{name: values[rows:] for name, values in joined.items()}], count - rows
-    if count:
-        yield {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
-
-
 @contextmanager
 def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
     """Turn what a library meets in a damaged file into a FileFormatError that names the path.
@@ -183,41 +173,8 @@ def require_plausible_size(path: Path, what: str, declared: int, stored: int) ->
         )
 
 
-class Wrapper(io.RawIOBase):
-    """A stream that is read from another, and closes it."""
-
-    stream: io.BufferedIOBase
-
-    @override
-    def readable(self) -> bool:
-        return True
-
-    @override
-    def close(self) -> None:
-        self.stream.close()
-        super().close()
-
-
-class CountedStream(Wrapper):
-    """What is read from a decompressor, refused as soon as it is implausibly more than the compressed file."""
-
-    def __init__(self, path: Path, stream: io.BufferedIOBase) -> None:
-        self.path = path
-        self.stream = stream
-        self.stored = path.stat().st_size
-        self.expanded = 0
-
-    @override
-    def readinto(self, buffer) -> int:
-        data = self.stream.read(len(buffer))
-        buffer[: len(data)] = data
-        self.expanded += len(data)
-        require_plausible_size(self.path, "what is compressed", self.expanded, self.stored)
-        return len(data)
-
-
-def gzip_stream(path: Path) -> CountedStream:
-    """The content of a .gz file. The size that it declares is checked first, what comes out is counted."""
+def require_plausible_gzip(path: Path) -> None:
+    """Refuse a .gz file that is none, or that states a size that no log shrinks from. Raises FileFormatError."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(2) != b"\x1f\x8b":
@@ -225,4 +182,3 @@ def gzip_stream(path: Path) -> CountedStream:
         file.seek(max(size - 4, 0))
         declared = int.from_bytes(file.read(4), "little")  # RFC 1952: ISIZE, modulo 2^32
     require_plausible_size(path, "what is compressed", declared, size)
-    return CountedStream(path, gzip.open(path, "rb"))

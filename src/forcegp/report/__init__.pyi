@@ -3,9 +3,8 @@ from .page import (
     Finding as Finding, Page as Page, Picture as Picture, Table as Table, is_page as is_page, write_page as write_page,
 )
 from .results import (
-    scene_notes as scene_notes,
-    evaluation_sentence as evaluation_sentence, evaluation_table as evaluation_table, model_page as model_page,
-    validation_pictures as validation_pictures, validation_table as validation_table,
+    model_page as model_page, scene_notes as scene_notes,
+    scores_pictures as scores_pictures, scores_sentence as scores_sentence, scores_table as scores_table,
 )
 from .robot_picture import robot_figure as robot_figure, still_scene as still_scene
 from .scene import recording as recording

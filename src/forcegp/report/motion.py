@@ -9,13 +9,12 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
-from forcegp.evaluation.plots import style
 from forcegp.forces import Actuation, BaseWrench, CoupledRotors, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
-from forcegp.posterior import StructuredPosterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
+from forcegp.scores.figures import style
 
 FRAMES_PER_SECOND = 30.0
 MOST_FRAMES = 450
@@ -109,7 +108,7 @@ def recorded_scene(
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
     drawn, doubts = link_shapes(model.robot, shapes)
     with torch.no_grad():
-        if isinstance(posterior, StructuredPosterior):
+        if isinstance(posterior, Posterior):
             dynamics = posterior.dynamics(q, v, u)
             arrows = learned_forces(posterior, dynamics)
         else:
@@ -121,7 +120,7 @@ def recorded_scene(
     return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, paths, reach(model.robot), doubts)
 
 
-def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
+def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
     """What the model found at these states: joint forces, with the laws of its system, point and contact forces."""
     prior, robot = posterior.trained.unknown, posterior.model.robot
     B, latents = prior.direction(dynamics), posterior.latents(dynamics, True)
@@ -140,7 +139,7 @@ def learned_forces(posterior: StructuredPosterior, dynamics: ConstrainedDynamics
         mean = own.mean + sum(force.force(dynamics.state).expand_as(own.mean) for force in forces)
         title = "learned joint forces" if posterior.carries_known_forces else "friction and other joint forces"
         groups.append(_at_joints(robot, dynamics, title, mean, own.std))
-    if dynamics.contacts and posterior.predicts_forces:
+    if dynamics.contacts:
         map_ = dynamics.contact_force_map()
         matrix, offset = (map_.matrix @ B).unflatten(-2, (-1, 3)), map_.offset.unflatten(-1, (-1, 3))
         points: dict[tuple[object, ...], list[int]] = {}

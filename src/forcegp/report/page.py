@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
-from forcegp.evaluation.plots import style
+from forcegp.scores.figures import style
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import torch
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from forcegp.evaluation.plots import style
 from forcegp.report.motion import RecordedScene
 from forcegp.report.shapes import link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
+from forcegp.scores.figures import style
 
 LINK = "#B9C0C8"
 AXIS = 0.12

@@ -1,0 +1,271 @@
+"""Sentences that belong beside the scores of a model: what a reader would have to find out otherwise."""
+
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.errors import ForceGPError
+from forcegp.model import Model
+from forcegp.posterior.posterior import Posterior
+from forcegp.scores.accuracy import ACCELERATION, TRUE_ACCELERATION, Table
+from forcegp.scores.predicted_rows import stated_noise_level
+from forcegp.summary import listed
+
+WORSE = 1.01
+"""Error of the model over that of its known forces alone, from which it is pointed out."""
+
+WORSE_JOINT, LEAST_WORSE = 1.2, 0.1
+"""The same of one joint, and by how much its error must be larger, in standard deviations of the noise."""
+
+FEWEST_INSIDE = 0.9
+"""Least coverage of 95 % intervals, over all joints, about which nothing is said."""
+
+MISSED, CHANCE = 0.15, 4.0
+"""How much less than 95 % the intervals of one joint may hold: this share, or so many deviations of a count by chance
+if that is more."""
+
+MARGIN, POSTURE = 0.25, 0.1
+"""How far beyond the training range of a joint a value may lie: a fraction of that range, and of the widest range of
+all joints (a joint that is held in its posture moves little, and a little more of it is nothing new).
+"""
+
+MOST_OUTSIDE = 0.01
+"""Share of the rows that may lie further outside."""
+
+NOISE_FACTOR = 1.5
+"""Noise levels of model and Dataset that differ by more than this factor are named."""
+
+
+def unfinished_search(posterior: Posterior) -> Iterator[str]:
+    """A sentence where the search for the parameters did not converge."""
+    if "optimizer" in posterior.settings and not posterior.result.converged:
+        yield (
+            f"the search for the parameters of this model did not converge ({posterior.result.status}); its mean and "
+            "its intervals may be far from those at the optimum"
+        )
+
+
+def rows_outside(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+    """A sentence where many rows lie outside of the range of q and v that the model was trained in."""
+    names = posterior.joint_names
+    found = []
+    outside = np.zeros(len(dataset), dtype=bool)
+    for quantity in ("q", "v"):
+        trained, given = getattr(posterior.training, quantity).cpu().numpy(), getattr(dataset, quantity)
+        low, high = trained.min(axis=0), trained.max(axis=0)
+        room = MARGIN * (high - low) + POSTURE * float((high - low).max())
+        beyond = np.maximum(low - given, given - high) - room
+        outside |= (beyond > 0.0).any(axis=1)
+        for joint, name in enumerate(names):
+            share = float((beyond[:, joint] > 0.0).mean())
+            low_high = f"{low[joint]:.3g} to {high[joint]:.3g}"
+            reached = f"{given[:, joint].min():.3g} to {given[:, joint].max():.3g}"
+            found.append((share, f"{quantity} of {name} is {reached} here and was {low_high} in training"))
+    if outside.mean() > MOST_OUTSIDE:
+        yield (
+            f"{outside.mean():.0%} of the rows lie outside of the range that the model was trained in (worst: "
+            f"{max(found)[1]}); errors may be larger there, and intervals rest on the prior"
+        )
+
+
+def poor_scores(posterior: Posterior, dataset: Dataset, table: Table) -> Iterator[str]:
+    """Sentences about a table of scores: worse than the known forces alone, and intervals that miss.
+
+    On average over the joints, or at some of them, which are named with the worst first.
+    """
+    names, noise = np.array(posterior.joint_names), posterior.noise_std.detach().cpu().numpy()
+    # against the truth where it is known, for noise hides the difference
+    quantity, what = (TRUE_ACCELERATION, "noise-free MAE") if TRUE_ACCELERATION in table else (ACCELERATION, "MAE")
+    mine, alone = (np.array(table[quantity][score], dtype=float) for score in ("mae", "known_physics_mae"))
+    worse = mine > np.maximum(WORSE_JOINT * alone, alone + LEAST_WORSE * noise)
+    places = [
+        f"{names[joint]} {mine[joint]:.3g} against {alone[joint]:.3g}"
+        for joint in sorted(np.flatnonzero(worse), key=lambda joint: alone[joint] / mine[joint])
+    ]
+    if mine.mean() > WORSE * alone.mean():
+        yield (
+            f"the model is worse here than its known forces alone ({what} {mine.mean():.3g} against "
+            f"{alone.mean():.3g}): do not use it for motions like these"
+        )
+    elif places:
+        yield (
+            f"the model is better here than its known forces alone on average, but worse at {len(places)} of "
+            f"{len(names)} joints ({what}: {listed(places)}): do not use it for these"
+        )
+    least = 0.95 - max(MISSED, CHANCE * (0.95 * 0.05 / len(dataset)) ** 0.5)
+    for quantity, what in ((ACCELERATION, "measurements"), (TRUE_ACCELERATION, "true accelerations")):
+        inside = np.array(table.get(quantity, {}).get("coverage_95", [1.0]), dtype=float)
+        if not (inside.mean() < FEWEST_INSIDE or inside.min() < least):
+            continue
+        places = [f"{names[joint]} {inside[joint]:.0%}" for joint in np.argsort(inside) if inside[joint] < least]
+        hidden = inside.mean() >= FEWEST_INSIDE
+        of = f"{', but fewer at some joints' if hidden else ''} ({listed(places)})" if places else ""
+        there = " at these" if hidden else ""
+        yield (
+            f"the 95 % intervals hold {inside.mean():.0%} of the {what}{of}: the model is overconfident{there}; "
+            "a force is missing, the noise is larger than stated, or these motions are new to it"
+        )
+
+
+def doubts(posterior: Posterior, dataset: Dataset, table: Table) -> tuple[str, ...]:
+    """All of them, for the scores of this model on this dataset."""
+    poor = poor_scores(posterior, dataset, table)
+    return (*unfinished_search(posterior), *rows_outside(posterior, dataset), *poor)
+
+
+def noise_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+    """A sentence if model and Dataset disagree about the noise of some joint by more than NOISE_FACTOR."""
+    stated = stated_noise_level(posterior, dataset)
+    if stated is None:
+        return
+    model = posterior.noise_std.detach().cpu().numpy()
+    ratio = np.maximum(model / stated, stated / model)
+    joint = int(ratio.argmax())
+    if ratio[joint] > NOISE_FACTOR:
+        yield (
+            f"the noise std of the model is {model[joint]:.3g}, that of the data {stated[joint]:.3g} "
+            f"(joint {dataset.joint_names[joint]}, where they differ most); coverage and NLPD use the larger one."
+        )
+
+
+STATES = 20
+"""Training states that are looked at; each alone decides."""
+INVISIBLE = 1e-7
+"""Singular values of H B below this, relative to the largest one, are zero: accelerations show nothing there."""
+
+
+def normal_force_rests_on_prior(posterior: Posterior) -> bool:
+    """Whether processes of the model can press on a contact together without moving the robot.
+
+    True where, at some training state, processes of the same inputs have a combination f with H B f = 0 that changes
+    lambda: any function of those inputs may then be added to the normal force, and accelerations show nothing of it.
+    So it is for a free force at every joint, and for a Cartesian force that is not kept to the tangents. Friction
+    curves that each have an input of their own, and constants (a payload), are no such processes: one state does not
+    separate them, but all together do.
+    """
+    if not posterior.trained.contacts:
+        return False
+    training = posterior.training
+    q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
+    with torch.no_grad():
+        dynamics = posterior.trained.dynamics(q, v, u)
+        forces = posterior.trained.unknown
+        B, features = forces.direction(dynamics), forces.features(dynamics)
+        pressing = dynamics.multiplier_map().matrix @ B
+        return any(_presses_unseen((dynamics.H @ B)[..., which], pressing[..., which]) for which in _groups(features))
+
+
+def _groups(features: tuple[Tensor, ...]) -> list[list[int]]:
+    """Numbers of the processes that have the same inputs."""
+    groups: dict[int, list[int]] = {}
+    for index, z in enumerate(features):
+        constant = bool((z == z[:1]).all())  # also without any feature
+        first = next((k for k in groups if not constant and torch.equal(features[k], z)), index)
+        groups.setdefault(first, []).append(index)
+    return list(groups.values())
+
+
+def _presses_unseen(moving: Tensor, pressing: Tensor) -> bool:
+    """Whether the null space of `moving` (rows, nv, k) changes lambda through `pressing` (rows, m, k)."""
+    _, sizes, rows = torch.linalg.svd(moving)
+    largest = sizes[..., :1]
+    padded = torch.cat([sizes, sizes.new_zeros(*sizes.shape[:-1], rows.shape[-1] - sizes.shape[-1])], dim=-1)
+    unseen = (padded <= INVISIBLE * largest)[..., None] * rows
+    effect = pressing @ unseen.mT
+    return bool((effect.abs().amax((-2, -1)) > INVISIBLE * pressing.abs().amax((-2, -1))).any())
+
+
+TRIED_ROWS = 200
+"""Rows on which both systems are tried before one is advised."""
+
+WORTH_MOVING = 0.9
+"""Error in the system of the data over that in the model's own, below which the model is worth carrying over."""
+
+
+def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
+    """Numbers of the rows of `dataset` whose (q, v, u) is exactly that of a training point."""
+    training = posterior.training
+    trained = {row.tobytes() for row in _inputs(*(getattr(training, name).cpu().numpy() for name in ("q", "v", "u")))}
+    rows = _inputs(dataset.q, dataset.v, dataset.u)
+    return np.array([number for number, row in enumerate(rows) if row.tobytes() in trained], dtype=np.int64)
+
+
+def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+    """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
+    repeated = shared_rows(posterior, dataset)
+    if repeated.size:
+        yield (
+            f"{repeated.size} of {len(dataset)} test rows have the very (q, v, u) of training rows (the first: row "
+            f"{repeated[0]}); where they are the same rows, these scores flatter the model: test on another trajectory."
+        )
+    else:
+        source = posterior.settings.get("data") or {}
+        metadata = json.loads(json.dumps(dataset.metadata))
+        shared = sorted(set(source.get("episodes", ())) & set(dataset.episodes))
+        if metadata and shared and json.loads(json.dumps(source.get("metadata"))) == metadata:
+            yield (
+                f"training and test rows come from the same recording (equal metadata, episodes {shared} in both), "
+                "so these scores flatter the model; test on another trajectory."
+            )
+    yield from system_warnings(posterior, dataset)
+
+
+def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
+    """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy.
+
+    A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
+    data more than those of another recording: whether to carry the model over is decided by some rows, not by a rule.
+    """
+    own, model = dataset.model, posterior.model
+    if own is None:
+        return
+    contacts = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
+    # inertias that were identified are meant to differ from those that the data came with
+    robots = not posterior.parameters and not own.robot.tree.equals(model.robot.tree)
+    if not contacts and not robots:
+        return
+    what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
+    are, those = ("are", "those") if contacts else ("is", "that")
+    sentence = f"the {what} of the model {are} not {those} of the data"
+    sentence += f"; the constraint error is measured on {those} of the data" if contacts else ""
+    errors = _errors_here_and_there(posterior, dataset, own)
+    if errors is not None and errors[1] < WORTH_MOVING * errors[0]:
+        sentence += f"; carried over to them, the error of its mean is {errors[1]:.3g} instead of {errors[0]:.3g} on "
+        sentence += "some of these rows: `posterior.with_model(dataset.model)`"
+    elif errors is not None:
+        sentence += f"; it stays as it is, for carried over to them its error would be {errors[1]:.3g} instead of "
+        sentence += f"{errors[0]:.3g}"
+    if contacts or errors is None or errors[1] < WORTH_MOVING * errors[0]:
+        yield sentence  # else a robot that serves these data better than theirs was identified
+
+
+def _errors_here_and_there(posterior: Posterior, dataset: Dataset, model: Model) -> tuple[float, float] | None:
+    """Errors of the mean on some rows as it is and carried over to that model; None where it cannot be."""
+    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")
+            each = posterior, posterior.with_model(moved_model(posterior, model))
+            means = [one.predict(rows.q, rows.v, rows.u, covariance=False).mean for one in each]
+    except ForceGPError:
+        return None
+    here, there = (float(np.abs(mean.cpu().numpy() - rows.a).mean()) for mean in means)
+    return here, there
+
+
+def moved_model(posterior: Posterior, model: Model) -> Model:
+    """The system of other data, with the robot and known forces of a model that has identified them."""
+    if not posterior.parameters:
+        return model
+    return replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
+
+
+def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return np.hstack([q, v, u]) + 0.0  # + 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes

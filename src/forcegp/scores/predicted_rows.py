@@ -1,0 +1,154 @@
+"""Predictions for every row of a Dataset as numpy arrays, made in blocks so that memory stays bounded."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.data import Dataset
+from forcegp.inference.threads import blas_threads
+from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import Prediction
+from forcegp.scores.metrics import negative_log_density
+
+ROWS_PER_BLOCK = 1024
+Block = TypeVar("Block")
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedRows:
+    """What a model predicts for every row, and the mechanics there.
+
+    `mean`, `variance` of the acceleration without noise, `measurement_variance` with the noise of the model, or of
+    the Dataset where it states a larger one or that of every row; `negative_log_density` of the measured rows under
+    that noise; `known_physics` the acceleration of the known forces alone; `unknown_force` Q_U and
+    `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all
+    three None for a model without forces; `A`, `b` and the mass matrix `mass`.
+    """
+
+    mean: Float[np.ndarray, "rows nv"]
+    variance: Float[np.ndarray, "rows nv"]
+    measurement_variance: Float[np.ndarray, "rows nv"]
+    negative_log_density: Float[np.ndarray, " rows"]
+    unknown_force: Float[np.ndarray, "rows nv"] | None
+    unknown_force_variance: Float[np.ndarray, "rows nv"] | None
+    multiplier: Float[np.ndarray, "rows m"] | None
+    multiplier_variance: Float[np.ndarray, "rows m"] | None
+    known_physics: Float[np.ndarray, "rows nv"]
+    carried_known_force: Float[np.ndarray, "rows nv"] | None
+    A: Float[np.ndarray, "rows c nv"]
+    b: Float[np.ndarray, "rows c"]
+    mass: Float[np.ndarray, "rows nv nv"]
+
+    @property
+    def std(self) -> Float[np.ndarray, "rows nv"]:
+        """Standard deviation of the acceleration, without noise."""
+        return np.sqrt(self.variance)
+
+    @property
+    def measurement_std(self) -> Float[np.ndarray, "rows nv"]:
+        """Standard deviation of a measurement."""
+        return np.sqrt(self.measurement_variance)
+
+
+def predict_rows(
+    posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
+) -> PredictedRows:
+    """Predict all rows. `A` and `b` are those of the Dataset's own system if it has one, else the model's."""
+    blocks = in_blocks(posterior, dataset, lambda block: _predict_block(posterior, dataset, block), progress)
+    joined: dict[str, Any] = {}
+    for field in fields(PredictedRows):
+        parts = [getattr(block, field.name) for block in blocks]
+        joined[field.name] = None if parts[0] is None else np.concatenate(parts)
+    return PredictedRows(**joined)
+
+
+def in_blocks(
+    posterior: Posterior,
+    dataset: Dataset,
+    predict: Callable[[slice], Block],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Block]:
+    """What `predict` returns for all rows, some at a time so that memory stays bounded, without gradients."""
+    blocks = []
+    with torch.no_grad(), blas_threads(posterior.training.q.numel()):
+        for start in range(0, len(dataset), ROWS_PER_BLOCK):
+            block = slice(start, min(start + ROWS_PER_BLOCK, len(dataset)))
+            blocks.append(predict(block))
+            if progress is not None:
+                progress(block.stop, len(dataset))
+    return blocks
+
+
+def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> PredictedRows:
+    device = posterior.model.robot.device
+    q, v, u = (torch.tensor(values[block], device=device) for values in (dataset.q, dataset.v, dataset.u))
+    prediction = posterior.predict(q, v, u)
+    dynamics = posterior.dynamics(q, v, u)
+    own = dynamics if dataset.model is None else dataset.model.to(device).dynamics(q, v, u)
+    covariance, force, multiplier = prediction.covariance, prediction.unknown_force, prediction.multiplier
+    assert covariance is not None, "predict computes the covariance unless asked not to"
+    covariance = _array(covariance)
+    measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
+    mean, mass = _array(prediction.mean), _array(dynamics.M)
+    alone = u.clone()
+    alone[:, list(posterior.model.held_inputs)] = 0.0  # what an observer reports is no part of the known physics
+    by_itself = posterior.dynamics(q, v, alone) if posterior.model.held_inputs else dynamics
+    known = _array(by_itself.acceleration_map().offset)
+    carried = own.Q_K if posterior.carries_known_forces else torch.zeros_like(own.Q_K)
+    return PredictedRows(
+        mean=mean,
+        variance=_array(prediction.variance),
+        measurement_variance=np.diagonal(measurement, axis1=-2, axis2=-1),
+        negative_log_density=negative_log_density(mean, measurement, np.asarray(dataset.a[block])),
+        unknown_force=None if force is None else _array(force.mean),
+        unknown_force_variance=None if force is None else _array(force.variance),
+        multiplier=None if multiplier is None else _array(multiplier.mean),
+        multiplier_variance=None if multiplier is None else _array(multiplier.variance),
+        known_physics=known,
+        carried_known_force=None if force is None else _array(carried),
+        A=_array(own.A),
+        b=_array(own.b),
+        mass=mass,
+    )
+
+
+def stated_noise_level(posterior: Posterior, dataset: Dataset) -> Float[np.ndarray, " nv"] | None:
+    """What the noise of the model has to be compared with; None where the Dataset does not state its noise.
+
+    Where it states that of every row, rows of a recording may be quieter on the whole than those of another: the level
+    is then that of the training rows, if they stated theirs as well (windows state that of their own mean).
+    """
+    trained = None if posterior.training.weights is not None else posterior.training.noise_std
+    if dataset.noise_std is None or dataset.noise_std.ndim == 1 or trained is None:
+        return dataset.noise_level
+    return _array(trained.square().mean(0).sqrt())
+
+
+def _noise_covariance(
+    posterior: Posterior, prediction: Prediction, dataset: Dataset, block: slice
+) -> Float[np.ndarray, "*rows nv nv"]:
+    """Of the measurements compared with: the model's, or the Dataset's where that is larger.
+
+    The measurements may be noisier than those learned from; and a model that has learned a level of noise counts to it
+    what it cannot explain otherwise. Where the Dataset states the noise of every row, that is the noise of the
+    acceleration, times what the model's level exceeds the stated one by.
+    """
+    noise = _array(prediction.noise_covariance)
+    if dataset.noise_std is None:
+        return noise
+    identity = np.eye(noise.shape[-1])
+    if dataset.noise_std.ndim == 1:
+        missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
+        return noise + np.maximum(missing, 0.0)[..., None] * identity
+    stated, model = stated_noise_level(posterior, dataset), _array(posterior.noise_std)
+    rows = np.maximum(model / stated, 1.0) * dataset.noise_std[block]
+    return noise + (np.square(rows) - np.square(model))[..., None] * identity
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy()

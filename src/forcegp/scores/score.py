@@ -1,0 +1,233 @@
+"""`score`: models side by side on the same rows of a log, fitted to the rest of it or before."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from forcegp import __version__
+from forcegp.atomic_files import write_json, write_text
+from forcegp.data import Dataset
+from forcegp.data.dataset import require_rows
+from forcegp.errors import InvalidInput, require_type
+from forcegp.integration import integrator_named
+from forcegp.jobs import JobStore, Progress, run_jobs
+from forcegp.jobs.job import machine
+from forcegp.model import Model
+from forcegp.parallel import checked_jobs
+from forcegp.posterior.posterior import Posterior
+from forcegp.scores.candidates import (
+    Candidate,
+    Given,
+    candidates,
+    default_models,
+    fitted_before,
+    identified_model,
+    kind_and_summary,
+)
+from forcegp.scores.experiment import Experiment, fingerprint
+from forcegp.scores.jobs import jobs_of, kept
+from forcegp.scores.leave_out import leave_out
+from forcegp.scores.motions import STARTS, held_out_motions
+from forcegp.scores.one_model import scored
+from forcegp.scores.page import page, preparation_lines
+from forcegp.scores.paired import MARGIN
+from forcegp.scores.scores import Scores
+from forcegp.scores.splits import Split, split_named
+
+KIND = "forcegp score"
+RESULTS, PAGE = "results.json", "report.md"
+LEAVE_OUT = "leave-out"
+
+
+def score(
+    models: Posterior | Mapping[str, Given] | Sequence[str] | None,
+    log: Dataset,
+    *,
+    split: str | Sequence[Split] | None = None,
+    horizons: Sequence[float] | None = None,
+    folder: str | Path | None = None,
+    model: Model | None = None,
+    recording: Dataset | None = None,
+    points: int = 100,
+    seeds: int = 5,
+    starts: int = STARTS,
+    integrator: str = "rk4",
+    identification: str | None = None,
+    restarts: int | None = None,
+    iterations: int | None = None,
+    margin: float = MARGIN,
+    jobs: int | Executor = 1,
+    source: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Scores:
+    """Score models on the same rows: errors, densities, coverage, motions, and paired differences.
+
+    Posteriors alone and no `split`: they are scored on all rows of `log`. Otherwise every model is fitted for every
+    split and seed to one side and scored on the other, `identified` (from all training rows) always among them. Every
+    finished piece is kept in `folder/jobs` at once; the same call goes on after an interruption, and one with more
+    models or seeds computes only these. A model that fails is a row that names the error.
+
+    Parameters
+    ----------
+    models: a posterior; or by name posteriors, models to fit, functions of a `Training` that fit one, and names of
+        models FORCES[@EVIDENCE] (`scores.candidates`), of which a list will do. None takes some of every kind.
+    split: text of `split_named` or its result; None is "auto" where anything is fitted. "leave-out" fits every model
+        once, to all rows, and leaves stretches of time out in closed form: densities alone, of models to fit.
+    horizons: of predicted motions in s; none with (). None takes .1, .2, .5 and 1 s, as far as the log lasts, where
+        anything is fitted, else none.
+    folder: where everything is kept, with the page report.md, its figures and results.json; None keeps nothing.
+    model: the robot as given; None takes the log's.
+    recording: the log at its full rate, for motions.
+    points, seeds: rows that models of many inputs learn from, and how many choices of them.
+    starts, integrator: of the motions of every held-out stretch.
+    identification: what `identified` is, as in "bodies+viscous+coulomb+rotor@torques"; its mass matrix turns errors of
+        accelerations into forces.
+    restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
+    margin: ratios of errors within it of 1 count as no difference.
+    jobs: pieces at once, in as many processes of this machine, or an executor in which they run.
+    source: where the data come from, for the page: "title", and "data", a list of lines.
+    overwrite: compute everything anew, also where the folder holds results.
+
+    Raises
+    ------
+    InvalidInput: an argument is out of range, the log is of another robot, nothing is held out, no stretch lasts for a
+        horizon, the folder holds something else, or another process is at work there.
+    """
+    require_type("log", log, Dataset)
+    wrong = isinstance(models, str) or not isinstance(models, Posterior | Mapping | Sequence)
+    given: Any = {"model": models} if isinstance(models, Posterior) else models
+    if models is not None and wrong:
+        raise InvalidInput(f"models is a {type(given).__name__}; give a Posterior, a mapping from names, or names.")
+    if isinstance(seeds, bool) or seeds < 1:
+        raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
+    if not 0.0 <= margin < 1.0:
+        raise InvalidInput(f"the margin is {margin:g}; it must be at least 0 and below 1, such as {MARGIN}.")
+    named = given if isinstance(given, Mapping) else {}
+    before = {name: each for name, each in named.items() if isinstance(each, Posterior)}
+    about = {"kind": KIND, "machine": machine(), "forcegp": __version__, "source": dict(source or {}), "rows": len(log),
+             "preparation": preparation_lines(log.metadata)}  # fmt: skip
+    horizons = None if horizons is None else tuple(horizons)
+    if before and len(before) == len(given) and split is None:
+        horizons = horizons or ()
+        if folder is not None:
+            digests = {name: fitted_before(each).digest for name, each in before.items()}
+            how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
+            JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
+        scores = _fitted_before(before, log, recording or log, horizons, starts, integrator, margin, about, progress)
+        if folder is not None:
+            write(scores, Path(folder))
+        return scores
+    robot = log.model if model is None else model
+    if robot is None:
+        raise InvalidInput("the log does not carry its robot; give model=Model(robot, contacts).")
+    if split == LEAVE_OUT:
+        return leave_out(given, log, robot, points=points, restarts=restarts, iterations=iterations, about=about)
+    splits = split_named(log, split or "auto") if split is None or isinstance(split, str) else tuple(split)
+    settings: Any = (points, horizons, starts, integrator, identification, restarts, iterations)
+    experiment = Experiment(log, recording or log, robot, splits, *settings)
+    chosen = candidates(default_models(robot) if given is None else given, robot, experiment.identifies)
+    checked_jobs(jobs)
+    with tempfile.TemporaryDirectory() as nowhere:
+        place = Path(nowhere, "scores") if folder is None else Path(folder)
+        store = JobStore.open(place, KIND, experiment.configuration(), overwrite=overwrite)
+        identifications, fits = jobs_of(experiment, chosen, seeds)
+        run_jobs(store, [*identifications, *fits], jobs, progress)
+        runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
+        for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
+            runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]
+        found = [kept(store, job.name) for job in identifications]
+        about |= {
+            "splits": [_split_facts(experiment, each) for each in splits],
+            "configuration": experiment.configuration(),
+            "seeds": list(range(seeds)),
+            "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
+        }
+        kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
+        scores = replace(_scores(log, runs, kinds, margin, about), fit=partial(_on_all_rows, experiment, chosen))
+        if folder is not None:
+            with store.locked():
+                write(scores, store.folder)
+    return scores
+
+
+def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: str) -> Posterior:
+    work, rows = chosen[name], experiment.rows
+    if isinstance(work.fit, Posterior):
+        return work.fit
+    identified = None if work.identification is None else identified_model(work.identification, experiment.model, rows)
+    return work.fit(experiment.training(rows, experiment.recording, identified, 0))
+
+
+def write(scores: Scores, folder: Path) -> None:
+    """The page, its figures and all numbers into a folder."""
+    from forcegp.scores.figures.scores import figures_of
+    from forcegp.scores.figures.style import save_figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = figures_of(scores)
+    for name, figure in figures.items():
+        save_figure(figure, folder / f"{name}.png")
+    write_json(folder / RESULTS, scores.to_dict())
+    write_text(folder / PAGE, page(scores, figures))
+
+
+def _fitted_before(
+    given: Mapping[str, Posterior],
+    log: Dataset,
+    recording: Dataset,
+    horizons: tuple[float, ...] | None,
+    starts: int,
+    integrator: str,
+    margin: float,
+    about: dict[str, Any],
+    progress: Progress | None,
+) -> Scores:
+    runs, models, mass = {}, {}, None
+    motions = held_out_motions(recording, np.ones(len(recording), dtype=bool), horizons, starts)
+    for place, (name, posterior) in enumerate(given.items()):
+        require_rows("log", log, posterior.joint_names, "the model")
+        integrator_named(integrator, posterior.model)
+
+        def report(done: int, total: int, place: int = place, name: str = name) -> None:
+            if progress is not None:
+                progress(done + place * total, len(given) * total, name)
+
+        found = scored(posterior, log, motions, integrator, mass, progress=report)
+        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None, **found}
+        run |= {"mass_matrix": "the model itself", "training_rows": len(posterior.training)}
+        runs[name], models[name] = [run], kind_and_summary(posterior)
+    about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
+    return replace(_scores(log, runs, models, margin, about), posteriors=dict(given))
+
+
+def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
+    (train, test), motions = split.apply(experiment.rows), experiment.motions(split)
+    count = 0 if motions.motions is None else len(motions.motions.q)
+    sides = {"training_rows": len(train), "test_rows": len(test), "motions": count, "notes": list(motions.notes)}
+    return split.to_dict() | sides
+
+
+def _scores(
+    log: Dataset,
+    runs: Mapping[str, Sequence[Mapping[str, Any]]],
+    models: Mapping[str, tuple[str, str]],
+    margin: float,
+    about: Mapping[str, Any],
+) -> Scores:
+    used = sorted({run["mass_matrix"] for each in runs.values() for run in each if run["error"] is None})
+    units = {name: log.units[name] for name in ("q", "v", "u", "a")}
+    return Scores(
+        models={name: {"kind": kind, "summary": summary} for name, (kind, summary) in models.items()},
+        runs=runs,
+        joint_names=tuple(log.joint_names),
+        units={name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
+        margin=margin,
+        about={**about, "mass_matrix": used},
+    )

@@ -1,0 +1,286 @@
+"""`Scores`: what was found of several models on the same rows, by quantity, score, joint, stretch of time and seed."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from typing_extensions import override
+
+from forcegp.errors import FitError, InvalidInput, require_known
+from forcegp.posterior.posterior import Posterior
+from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, over_columns
+from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference, paired_difference
+from forcegp.scores.tables import alike, median_and_range
+from forcegp.summary import Summary, listed
+
+Kind = Literal["given", "identified", "residual", "black box", "force prior"]
+"""Parametric physics as given or identified, a Gaussian process on what it leaves of the acceleration, a model without
+physics, and Gaussian processes on unknown forces.
+"""
+PARAMETRIC, LEARNED = ("given", "identified"), ("force prior", "residual", "black box")
+ORDER = "motion", "force", "acceleration", "density"
+"""Criteria that decide, the first one that there is: where a robot goes is what simulators and controllers need."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Scores(Summary):
+    """One table: model x run (split and seed) x quantity x score x joint, and paired differences of models.
+
+    Fields
+    ------
+    models: name -> "kind" and "summary".
+    runs: name -> one entry per split and seed, with "table" (`accuracy.row_scores`, `motions.motion_scores`),
+        "stretches" and "motions" for differences, "warnings", and "error" where it failed.
+    joint_names, units: of the log.
+    margin: ratios of errors within it of 1 are no difference.
+    about: what was done, for the page.
+    posteriors: models that were fitted only once, and those that were given.
+    fit: how a model by this name is fitted to all rows.
+    """
+
+    models: Mapping[str, Mapping[str, str]]
+    runs: Mapping[str, Sequence[Mapping[str, Any]]]
+    joint_names: tuple[str, ...]
+    units: Mapping[str, Any]
+    margin: float = MARGIN
+    about: Mapping[str, Any] = field(default_factory=dict)
+    posteriors: Mapping[str, Posterior] = field(default_factory=dict)
+    fit: Callable[[str], Posterior] | None = field(default=None, compare=False)
+
+    # ------------------------------------------------------------------ numbers
+
+    def value(self, score: str, quantity: str = ACCELERATION, model: str | None = None) -> float | None:
+        """One number over all joints, the median over runs: `value("mae")`, `value("rmse", "position after 1 s")`.
+
+        None where it is not a number. `model` may be left out where there is one. Raises InvalidInput for what the
+        table does not hold.
+        """
+        found = self.spread(score, quantity, model)
+        return None if found is None else found["median"]
+
+    def columns(self, score: str, quantity: str = ACCELERATION, model: str | None = None) -> list[float | None]:
+        """The same for every joint (contact, axis)."""
+        spreads = [median_and_range(each) for each in zip(*self._each(score, quantity, model), strict=True)]
+        return [None if each is None else each["median"] for each in spreads]
+
+    def spread(self, score: str, quantity: str = ACCELERATION, model: str | None = None) -> dict[str, Any] | None:
+        """Median, least and largest over runs of the number over all joints, and "values" of the runs."""
+        return median_and_range(over_columns(quantity, score, each) for each in self._each(score, quantity, model))
+
+    def quantities(self, model: str | None = None) -> dict[str, list[str]]:
+        """What the table holds in every finished run of a model: quantity -> scores."""
+        tables = [run["table"] for run in self.finished(self._named(model))]
+        first = tables[0] if tables else {}
+        held = {name: scores for name, scores in first.items() if all(name in each for each in tables)}
+        return {name: [score for score in scores if all(score in each[name] for each in tables)]
+                for name, scores in held.items()}  # fmt: skip
+
+    def finished(self, model: str) -> list[Mapping[str, Any]]:
+        """The runs of a model that did not fail."""
+        return [run for run in self.runs[model] if run["error"] is None]
+
+    @property
+    def horizons(self) -> list[float]:
+        """After how many seconds motions were scored."""
+        found = [run["motions"]["horizons"] for name in self.models for run in self.finished(name) if run["motions"]]
+        return [h for h in found[0] if all(h in each for each in found)] if found else []
+
+    def _named(self, model: str | None) -> str:
+        if model is None and len(self.models) > 1:
+            raise InvalidInput(f"`model` is not given; name one of {', '.join(self.models)}.")
+        model = next(iter(self.models)) if model is None else model
+        require_known("model", model, "these scores", self.models)
+        return model
+
+    def _each(self, score: str, quantity: str, model: str | None) -> list[list[float | None]]:
+        name = self._named(model)
+        held = self.quantities(name)
+        if score not in held.get(quantity, ()):
+            words = f"the scores of {name} hold no {score} of {quantity}; they hold {', '.join(held) or 'nothing'}"
+            there = f", and of {quantity} {', '.join(held[quantity])}" if quantity in held else ""
+            raise InvalidInput(f"{words}{there}. Errors of forces need their truth in the log, and motions `horizons`.")
+        return [run["table"][quantity][score] for run in self.finished(name)]
+
+    # ------------------------------------------------------------------ which model
+
+    def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
+        """Squared errors (nats for `density`) by split and seed; one horizon but for motions."""
+        out = {}
+        for run in self.finished(model):
+            if criterion == "motion":
+                values = None if run["motions"] is None else run["motions"]["squared"]
+            else:
+                values = [run["stretches"][criterion]] if criterion in run["stretches"] else None
+            array = np.array([] if values is None else values, dtype=np.float64)
+            if array.size:
+                out[run["split"], run["seed"]] = array
+        return out
+
+    def difference(self, criterion: str, challenger: str, baseline: str) -> PairedDifference | None:
+        """Of two models, over the seeds of which both finished all splits, by one of `CRITERIA`."""
+        one, other = self.errors(criterion, challenger), self.errors(criterion, baseline)
+        shared = [run for run in one if run in other]
+        splits = list(dict.fromkeys(split for split, _ in shared))
+        seeds = [k for k in dict.fromkeys(seed for _, seed in shared) if all((split, k) in shared for split in splits)]
+        if not seeds:
+            return None
+        a, b = (
+            np.concatenate([np.stack([side[split, seed] for seed in seeds]) for split in splits], axis=2)
+            for side in (one, other)
+        )
+        return paired_difference(criterion, challenger, baseline, a, b, self.margin)
+
+    def best_of(self, kinds: Sequence[str], criterion: str, but: str | None = None) -> str | None:
+        """The model of these kinds with the lowest error, among those that failed least and diverged least."""
+        found = []
+        for name, model in self.models.items():
+            errors = self.errors(criterion, name)
+            if model["kind"] not in kinds or not errors or name == but:
+                continue
+            finite = {run: np.where(np.isfinite(each), each, np.nan) for run, each in errors.items()}
+            every = np.concatenate([each.ravel() for each in finite.values()])
+            if np.isfinite(every).any():
+                # the median over runs of the error over stretches; of motions the geometric mean over horizons
+                means = [np.ma.masked_invalid(each).mean(axis=1).filled(np.nan) for each in errors.values()]
+                floor = np.finfo(float).tiny
+                levels = means if criterion == "density" else [np.log(np.maximum(each, floor)) for each in means]
+                level = float(np.median([each.mean() for each in levels]))
+                found.append((len(self.runs[name]) - len(errors), int(np.isnan(every).sum()), level, name))
+        return min(found)[-1] if found else None
+
+    @cached_property
+    def winners(self) -> dict[str, dict[str, str]]:
+        """By criterion the "model" to take, and "why": the best parametric one, unless another is shown to be better.
+
+        The one rule of verdicts. A criterion that no model has is missing.
+        """
+        out = {}
+        for criterion, words in CRITERIA.items():
+            simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
+            if simple is None or other is None:
+                if (only := simple or other) is not None:
+                    second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
+                    found = None if second is None else self.difference(criterion, only, second)
+                    why = f"the lowest {words}{'' if found is None else f': {found.sentence}'}"
+                    out[criterion] = {"model": only, "why": why}
+                continue
+            found = self.difference(criterion, other, simple)
+            if found is not None and found.favours_challenger:
+                sure = "" if found.outcome == "better" else "a third better or more, on too little time to be sure: "
+                out[criterion] = {"model": other, "why": sure + found.sentence}
+            else:
+                shown = "no comparison was possible" if found is None else found.sentence
+                why = f"nothing is shown to be better than the best parametric: {shown}"
+                out[criterion] = {"model": simple, "why": why}
+        return out
+
+    @property
+    def recommended(self) -> str | None:
+        """The model to take, by motions, else forces, else accelerations; None where no model was scored."""
+        return next((self.winners[name]["model"] for name in ORDER if name in self.winners), None)
+
+    def fitted_on_all_rows(self, model: str | None = None) -> Posterior:
+        """The recommended model (or another one by name) from all rows, of which nothing is held out any more.
+
+        Raises FitError where no model was scored, or its fit fails.
+        """
+        name = self.recommended if model is None else self._named(model)
+        if name is None:
+            raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
+        return self.posteriors[name] if self.fit is None else self.fit(name)
+
+    @cached_property
+    def rival(self) -> str | None:
+        """What others must beat: the best identified model, without any the robot as given, else the best of all."""
+        kinds = (("identified",), ("given",), LEARNED)
+        return next((name for each in kinds for by in ORDER if (name := self.best_of(each, by)) is not None), None)
+
+    @cached_property
+    def differences(self) -> dict[str, dict[str, PairedDifference | None]]:
+        """Every other model against the rival, by criterion."""
+        others = [name for name in self.models if name != self.rival and self.finished(name)]
+        return {} if self.rival is None else {
+            name: {criterion: self.difference(criterion, name, self.rival) for criterion in CRITERIA} for name in others
+        }  # fmt: skip
+
+    @property
+    def verdicts(self) -> list[str]:
+        """A sentence for every other model and criterion: is it better than the rival?"""
+        return [each.sentence for found in self.differences.values() for each in found.values() if each is not None]
+
+    # ------------------------------------------------------------------ to show
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader has to know beside the numbers; of several models with their names, alike ones once."""
+        told = [(text, name) for name in self.models for run in self.runs[name] for text in run["warnings"]]
+        if len(self.models) == 1:
+            return tuple(dict.fromkeys(text for text, _ in told))
+        each = [alike((text, name) for text, name in told if name == own) for own in self.models]
+        return tuple(f"{found[0][1]}: {found[0][0]}" for groups in each for found in groups)
+
+    @property
+    def failures(self) -> list[str]:
+        """Which models failed in which runs, and why."""
+        lines = []
+        for name, runs in self.runs.items():
+            failed: dict[str, list[str]] = {}
+            for run in runs:
+                if run["error"] is not None:
+                    failed.setdefault(run["error"], []).append(f"{run['split']}, seed {run['seed']}")
+            lines += [f"{name} failed in {len(where)} of {len(runs)} runs ({'; '.join(where)}): {reason}"
+                      for reason, where in failed.items()]  # fmt: skip
+        return lines
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """The scores that say most; all are in `to_dict()`."""
+        name = next(iter(self.models))
+        facts: dict[str, object] = {}
+        if len(self.models) > 1:
+            facts = {"models": listed(self.models), "recommended": self.recommended or "none"}
+            name = self.recommended or name
+        if self.finished(name):
+            held = self.quantities(name)
+            for title, score, quantity in (
+                ("mae", "mae", ACCELERATION),
+                ("noise floor", "noise_floor", ACCELERATION),
+                ("known physics mae", "known_physics_mae", ACCELERATION),
+                ("mae noise-free", "mae", f"true {ACCELERATION}"),
+                ("coverage 95", "coverage_95", ACCELERATION),
+                ("nats per row", "nlpd", ALL_JOINTS),
+            ):
+                if score in held.get(quantity, ()):
+                    facts[title] = f"{self.value(score, quantity, name):.3g}"
+        return facts | {"warnings": listed(self.warnings, most=1)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the models as plain JSON values."""
+        models: dict[str, Any] = {}
+        for name, model in self.models.items():
+            table = {
+                quantity: {
+                    score: {"all": self.spread(score, quantity, name), "each": self.columns(score, quantity, name)}
+                    for score in scores
+                }
+                for quantity, scores in self.quantities(name).items()
+            }
+            models[name] = {**model, "finished": len(self.finished(name)), "scores": table}
+        against = {name: {key: each and each.to_dict() for key, each in found.items()}
+                   for name, found in self.differences.items()}  # fmt: skip
+        return {
+            **self.about,
+            "joint_names": list(self.joint_names),
+            "units": dict(self.units),
+            "models": models,
+            "recommended": self.recommended,
+            "winners": self.winners,
+            "rival": self.rival,
+            "against_rival": against,
+            "warnings": list(self.warnings),
+            "failures": self.failures,
+            "runs": {name: [dict(run) for run in runs] for name, runs in self.runs.items()},
+        }

@@ -1,0 +1,169 @@
+"""`forcegp score` from end to end: models of a small arm whose truth is known, fitted by it or before."""
+
+import dataclasses
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from tests.cli.one_line import assert_refused
+from tests.posterior.arm import URDF
+from tests.scores.moving_arm import moving_arm
+
+from forcegp import Dataset, load_posterior, score
+
+MODELS = ("given", "gp:joint-friction", "identified,gp:joint-friction")
+FORCES = [word for name in MODELS for word in ("--forces", name)]
+QUICK = ("--points", 40, "--restarts", 1, "--iterations", 15, "--horizon", "0.1,0.3", "--starts", 2)
+
+
+@pytest.fixture(scope="module")
+def folder(forcegp, tmp_path_factory):
+    path = tmp_path_factory.mktemp("score")
+    (path / "arm.urdf").write_text(URDF)
+    log = moving_arm(1.5, 2)
+    log.save(path / "log.h5")
+    log.select_episodes([1]).save(path / "test.h5")
+    log.select_episodes([0]).save(path / "train.h5")
+    dataclasses.replace(log, joint_names=("a", "b", "c"), model=None).save(path / "other.h5")
+    dataclasses.replace(log, model=None, noise_std=None, metadata={"rig": "small"}).save(path / "raw.h5")
+    for name in ("friction", "joint"):
+        words = ("--forces", f"gp:{name.replace('friction', 'joint-friction')}", "--points", 30, "--iterations", 5)
+        done = forcegp("fit", "train.h5", *words, "--restarts", 1, "--out", name, folder=path)
+        assert done.returncode == 0, done.stderr
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(forcegp, folder):
+    words = ("score", "joint", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, *FORCES)
+    done = forcegp(*words, "--out", "results", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_what_is_known_of_the_arm_comes_out(found):
+    """The URDF lacks friction and mass: identifying them helps, and so does a process that learns the friction."""
+    models = found["models"]
+    assert list(models) == ["identified", "joint", *(name.replace(",", "+") for name in MODELS)]
+    each = {name: model["scores"] for name, model in models.items()}
+    for quantity, name in (("acceleration", "nrmse"), ("force", "rmse"), ("position after 0.3 s", "rmse")):
+        median = {model: each[model][quantity][name]["all"]["median"] for model in models}
+        assert median["identified"] < median["given"]
+        assert median["identified+gp:joint-friction"] < median["gp:joint-friction"]
+    assert found["rival"] == "identified"
+    answer = found["against_rival"]["given"]["acceleration"]
+    assert (answer["verdict"], answer["wins"], answer["runs"]) == ("worse", 0, 2)
+    assert found["recommended"] in models
+
+
+def test_the_folder_holds_the_page_the_numbers_and_the_model_from_all_rows(found, folder):
+    page = (folder / "results" / "report.md").read_text()
+    assert "no filter; one of 2 rows." in page
+    assert "the same 40 rows" in page
+    assert re.search(r"^\| error of predicted motions \| \*\*[\w@:+-]+\*\* \| ", page, re.M)
+    for name in found["models"]:
+        assert re.search(rf"^\| {re.escape(name)} \| [*\d]", page, re.M)
+    stored = json.loads((folder / "results" / "results.json").read_text())
+    told = {name: value for name, value in found.items() if name != "warnings"}  # in words of the command
+    assert {name: stored[name] for name in told} == told
+    assert stored["configuration"]["points"] == 40
+    rows, model = Dataset.load(folder / "log.h5"), load_posterior(folder / "results" / "model")
+    error = np.abs(rows.a - model.predict(rows.q, rows.v, rows.u).mean.numpy()).mean()
+    assert error < 0.5 * np.abs(rows.a).mean()
+
+
+def test_the_same_command_resumes_and_another_is_refused(forcegp, found, folder):
+    words = (
+        "score",
+        "joint",
+        "log.h5",
+        "--split",
+        "episodes:1",
+        "--every",
+        2,
+        "--seeds",
+        2,
+        *FORCES,
+        "--out",
+        "results",
+    )
+    (lost,) = (folder / "results" / "jobs").glob("*seed1-given")
+    shutil.rmtree(lost)
+    done = forcegp(*words, *QUICK, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    for name in found["models"]:
+        assert told["models"][name]["scores"] == found["models"][name]["scores"]
+    done = forcegp(*words, *(39 if word == 40 else word for word in QUICK), folder=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "holds results with another points" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder):
+    words = ["score", "raw.h5", "--robot", "arm.urdf", "--out", "raw", "--seeds", 1, *QUICK, "--forces", "given"]
+    words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.01]
+    done = forcegp(*words, folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "--guard 0.01 s is shorter than two time constants of the filter (0.055 s)" in done.stderr
+    assert re.search(r"given\s+\d+\.\d+", done.stdout)
+    page = (folder / "raw" / "report.md").read_text()
+    assert "zero-phase Butterworth low-pass of order 4 at 15 Hz on q and u, v and a from it by central" in page
+    assert "every episode cut into 4 consecutive blocks of equal duration, block 2 held out" in page
+    assert "The filter took" in page
+    stored = json.loads((folder / "raw" / "results.json").read_text())
+    assert stored["runs"]["given"][0]["motions"]["dt"] == pytest.approx(0.01), "at the full rate"
+
+
+def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
+    done = forcegp("score", "friction", "joint", "test.h5", "--horizon", ".1,.3", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^ *friction +\d+\.\d+ .*\n *joint +\d+\.\d+", done.stdout, re.M), done.stdout
+    assert "By the normalised error of the acceleration take" in done.stdout
+    one = forcegp("score", "friction", "test.h5", "--horizon", ".1", "--integrator", "symplectic-euler", folder=folder)
+    assert re.search(r"position after 0\.1 s +– +\d\S* +– +–", one.stdout), one.stdout
+    told = forcegp("score", "friction", "test.h5", "--every", 2, "--json", folder=folder)
+    scores = json.loads(told.stdout)["models"]["friction"]["scores"]
+    rows = Dataset.load(folder / "test.h5").rows(slice(None, None, 2))
+    expected = score(load_posterior(folder / "friction"), rows)
+    np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
+
+
+def test_left_out_stretches_compare_models_to_fit(forcegp, folder):
+    words = ("--split", "leave-out", "--forces", "given", "--forces", "gp:joint-friction", *QUICK, "--out", "left")
+    done = forcegp("score", "train.h5", *words, folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "By the negative log predictive density take gp:joint-friction" in " ".join(done.stdout.split())
+
+
+OUT = "--out never"
+WRONG = [
+    ("score missing.h5", "missing.h5 does not exist"),
+    ("score friction", "friction is a folder; give a dataset (.h5) last"),
+    ("score log.h5", "give --out FOLDER"),
+    ("score friction other.h5", "joints a, b, c; the model was trained on pan, lift, bend"),
+    ("score friction test.h5 --horizon 7", "not predicted: 7 s; held-out stretches last"),
+    ("score friction test.h5 --every 0", "--every is 0"),
+    ("score friction test.h5 --integrator euler", "did you mean 'symplectic-euler'"),
+    ("score friction joint test.h5 --report x.html", "2 runs were given"),
+    (f"score raw.h5 {OUT}", "does not carry its robot; add --robot"),
+    (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"),
+    (f"score log.h5 {OUT} --split episodes:0,1", "leave one to learn from"),
+    (f"score log.h5 {OUT} --every 0", "--every 0 must be an integer of at least 1"),
+    (f"score log.h5 {OUT} --split blocks:5:3 --guard -1", "guard is -1"),
+    (f"score log.h5 {OUT} --points 500", "two thirds"),
+    (f"score log.h5 {OUT} --seeds 0", "number of seeds is 0"),
+    (f"score log.h5 {OUT} --horizon soon", "'soon' is no list of numbers"),
+    (f"score log.h5 {OUT} --forces given --forces given", "named twice"),
+    (f"score log.h5 {OUT} --forces identifed", "did you mean 'identified'"),
+    (f"score log.h5 {OUT} --identification magic", "no force 'magic'"),
+    ("score log.h5 --out log.h5", "log.h5 would be written over log.h5"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG, ids=[words for words, _ in WRONG])
+def test_a_wrong_command_is_one_line_and_exit_code_2(folder, monkeypatch, capfd, words, message):
+    monkeypatch.chdir(folder)
+    assert_refused(words, message, folder, capfd)

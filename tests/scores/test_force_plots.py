@@ -1,0 +1,181 @@
+"""Plots of friction curves and normal forces: what is drawn is what the model and the truth say."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.collections import PolyCollection
+from matplotlib.image import imread
+from tests.posterior.arm import arm_model
+from tests.scores.friction import VISCOUS, fitted, friction_data, joint_law
+
+from forcegp.data import Dataset
+from forcegp.errors import InvalidInput
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointFriction, PeriodicJointForces, ToolForces
+from forcegp.scores import curve_panels, friction_curves_figure, normal_force_figure, save_figure
+
+
+@pytest.fixture(scope="module")
+def data() -> Dataset:
+    return friction_data(80, seed=1)
+
+
+@pytest.fixture(scope="module")
+def friction():
+    return fitted(JointFriction(), ContactFriction(kernel="linear"))
+
+
+@pytest.fixture(scope="module")
+def tool():
+    return fitted(ToolForces(kernel="linear"), iterations=20)
+
+
+def line(axes, label: str) -> tuple[np.ndarray, np.ndarray]:
+    (found,) = [line for line in axes.get_lines() if line.get_label() == label]
+    return np.asarray(found.get_xdata()), np.asarray(found.get_ydata())
+
+
+def band(axes) -> np.ndarray:
+    """Corners (n, 2) of the band over the visited range."""
+    (found,) = [part for part in axes.collections if part.get_label() == "95 % band"]
+    assert isinstance(found, PolyCollection)
+    return found.get_paths()[0].vertices
+
+
+def test_every_curve_has_a_panel_that_names_it_with_its_units(friction, data, tmp_path):
+    figure = friction_curves_figure(friction, data)
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in panels] == [
+        "joint-friction: pan",
+        "joint-friction: lift",
+        "joint-friction: bend",
+        "contact-friction: sliding",
+    ]
+    assert (panels[0].get_xlabel(), panels[0].get_ylabel()) == ("velocity [rad/s]", "torque [Nm]")
+    assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed [m/s]", "force [N]")
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "learned",
+        "95 % band",
+        "beyond the training data",
+        "training velocities",
+        "true",
+    ]
+    save_figure(figure, tmp_path / "forces.png")
+    picture = imread(tmp_path / "forces.png")
+    assert min(picture.shape[:2]) > 300
+    assert picture[..., :3].std() > 0.02
+
+
+def test_a_panel_shows_the_curve_its_band_the_training_velocities_and_the_truth(friction, data):
+    axes = friction_curves_figure(friction, data).axes[1]  # joint lift
+    velocity, mean = line(axes, "learned")
+    curve = friction.curve("joint-friction lift", velocity)
+    np.testing.assert_allclose(mean, curve.mean, atol=1e-9)
+    trained = friction.training.v[:, 1].numpy()
+    np.testing.assert_array_equal(line(axes, "training velocities")[0], trained)
+    assert trained.min() <= velocity.min() < velocity.max() <= trained.max()
+    corners = band(axes)
+    lower, upper = (end.numpy() for end in curve.interval())
+    at = velocity[len(velocity) // 3]
+    drawn = corners[np.isclose(corners[:, 0], at)][:, 1]
+    assert [drawn.min(), drawn.max()] == pytest.approx([lower[len(lower) // 3], upper[len(upper) // 3]], abs=1e-8)
+    everywhere, _ = line(axes, "beyond the training data")
+    assert everywhere.min() < trained.min()
+    assert everywhere.max() > trained.max()
+    at, truth = line(axes, "true")
+    np.testing.assert_allclose(truth, joint_law(at), atol=1e-12)
+    assert len(at) > 60
+
+
+def test_sliding_friction_is_drawn_over_speeds_that_are_never_negative(friction, data):
+    axes = friction_curves_figure(friction, data).axes[3]
+    speed, force = line(axes, "true")
+    np.testing.assert_allclose(force, VISCOUS * speed, rtol=1e-6)
+    assert line(axes, "beyond the training data")[0].min() >= 0.0
+
+
+@pytest.mark.filterwarnings("ignore:the normal forces of load-dependent friction")  # two iterations do not settle them
+@pytest.mark.filterwarnings("ignore:the expected friction nearly jams")  # nor keep the friction that was found small
+def test_a_coefficient_is_the_true_force_per_true_load(data):
+    model = fitted(ContactFriction(load=True), iterations=2)
+    axes = friction_curves_figure(model, data).axes[0]
+    assert axes.get_ylabel() == "force / normal force"
+    _, coefficient = line(axes, "true")
+    dynamics = data.model.dynamics(*(torch.tensor(x[:1]) for x in (data.q, data.v, data.u)))
+    size = torch.linalg.vector_norm(dynamics.normals)
+    load = float(size) * np.abs(data.truth["lambda"][:, 0])
+    expected = np.linalg.norm(data.truth["force.tool-friction"], axis=1) / load
+    assert set(np.round(coefficient, 9)) <= set(np.round(expected, 9))
+
+
+def test_tool_forces_are_slices_that_resist(tool, data):
+    figure = friction_curves_figure(tool, data)
+    for number, axes in enumerate(figure.axes):
+        velocity, mean = line(axes, "learned")
+        features = np.zeros((len(velocity), 2))
+        features[:, number] = velocity
+        np.testing.assert_allclose(mean, -tool.curve(f"force-tangent-{number + 1}", features).mean, atol=1e-9)
+        assert np.polyfit(velocity, mean, 1)[0] > 0.0  # resists
+        at, truth = line(axes, "true")
+        np.testing.assert_allclose(truth, VISCOUS * at, atol=1e-2)
+        assert axes.get_ylabel() == "resisting force [N]"
+
+
+def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, posterior, data):
+    for given in (None, dataclasses.replace(data, truth={})):
+        figure = friction_curves_figure(friction, given)
+        assert all(line.get_label() != "true" for axes in figure.axes for line in axes.get_lines())
+    assert curve_panels(posterior) == []
+    with pytest.raises(InvalidInput, match="no process that is a curve"):
+        friction_curves_figure(posterior)
+
+
+def test_large_models_say_how_many_curves_are_shown_and_others_can_be_chosen(monkeypatch):
+    model = fitted(JointFriction(), PeriodicJointForces(1.0), iterations=1)
+    monkeypatch.setattr("forcegp.scores.figures.friction_curves.LARGEST_GRID", 2)
+    figure = friction_curves_figure(model)
+    assert len(figure.axes) == 2
+    assert "2 of 6 curves" in figure.get_suptitle()
+    chosen = friction_curves_figure(model, latents=["periodic-joint-forces lift"])
+    assert [axes.get_title(loc="left") for axes in chosen.axes] == ["lift"]
+    assert chosen.get_suptitle().startswith("Forces")
+    with pytest.raises(InvalidInput, match="no curve"):
+        friction_curves_figure(model, latents=["nothing"])
+
+
+def test_the_normal_force_is_drawn_with_its_truth(friction, data, tmp_path):
+    figure = normal_force_figure(friction, data, seconds=0.5)
+    (force,) = figure.axes
+    rows = data.rows(data.time <= 0.5)
+    prediction = friction.predict(rows.q, rows.v, rows.u)
+    dynamics = data.model.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u)))
+    size = torch.linalg.vector_norm(dynamics.normals, dim=-1)[:, 0].numpy()
+    time, mean = line(force, "predicted")
+    np.testing.assert_allclose(time, rows.time)
+    np.testing.assert_allclose(mean, size * prediction.multiplier.mean[:, 0].numpy(), rtol=1e-9)
+    np.testing.assert_allclose(line(force, "true")[1], size * rows.truth["lambda"][:, 0], rtol=1e-9)
+    known = dynamics.multiplier(torch.zeros(len(rows), 3, dtype=torch.float64))[:, 0].numpy()
+    np.testing.assert_allclose(line(force, "known physics alone")[1], size * known, rtol=1e-9)
+    assert force.get_ylabel() == "normal force [N]"
+    save_figure(figure, tmp_path / "normal.png")
+    assert imread(tmp_path / "normal.png")[..., :3].std() > 0.02
+
+
+def test_every_contact_has_a_row_and_without_truth_only_the_prediction_is_drawn(friction, data):
+    bare = dataclasses.replace(data, truth={})
+    assert len(normal_force_figure(friction, bare).axes) == 1
+    two = friction.with_contacts(arm_model(contacts=1).contacts * 2)
+    assert len(normal_force_figure(two, bare).axes) == 2
+    axes = normal_force_figure(two, data).axes[0]  # the truth knows one contact only
+    assert "true" not in {line.get_label() for line in axes.get_lines()}
+    assert normal_force_figure(two, bare).axes[1].get_title(loc="left") == "Contact 1: plane at hand"
+
+
+def test_models_without_normal_force_are_refused(without_contact, data):
+    with pytest.raises(InvalidInput, match="no normal force"):
+        normal_force_figure(without_contact, data)
+    with pytest.raises(InvalidInput, match="no normal force"):
+        normal_force_figure(fit(data.model.black_box(), friction_data(10, 0)), data)

@@ -1,0 +1,130 @@
+"""What is learned where nobody says it: friction where there is friction, positions where forces depend on them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.fit.test_motion_fit import bump, recording, slide
+from tests.mechanics.test_thrusters import DRONE
+from tests.posterior.arm import arm_data, arm_model
+from tests.robots.test_moving_bases import LIMBS
+
+from forcegp import JointFriction, Model, Noise, fit
+from forcegp.errors import InvalidInput
+from forcegp.evidence.training_data import TrainingData
+from forcegp.forces import Actuation, RigidBodies, Thrusters
+from forcegp.inference import Inducing
+from forcegp.mechanics import fixed_point
+from forcegp.noise import ACCELERATION
+from forcegp.posterior import load_posterior, save_posterior
+from forcegp.robots import Robot
+from forcegp.scores import choose_forces, named_model, summands, usual_forces
+from forcegp.scores.candidates import candidates, default_models, usual_identification
+from forcegp.scores.learning import allowing_for_correlation, with_force_noise
+
+
+@pytest.fixture(scope="module")
+def log():
+    return recording(bump, 1)
+
+
+@pytest.fixture
+def bare() -> Model:
+    return replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies()))
+
+
+def test_friction_is_found_in_free_motion(log, bare):
+    chosen, why = choose_forces(log, bare)
+    assert chosen == "gp:joint-friction"
+    assert "gp:joint-friction in free motion; left-out stretches of" in why
+    assert "do not show gp:joint, gp:joint+gp:joint-friction to be better" in why
+
+
+def test_a_spring_is_no_friction(log, bare):
+    spring = replace(log, u=log.u + 30.0 * np.sin(4.0 * log.q) + 3.0 * log.v)
+    moved = replace(spring, a=log.a)
+    chosen, why = choose_forces(moved, bare)
+    assert chosen != "gp:joint-friction"
+    assert "better than gp:joint-friction, by" in why
+
+
+def test_an_identified_system_lacks_the_rest_of_its_friction(log):
+    chosen, why = choose_forces(log, slide(1.0, 1.0))
+    assert chosen == "gp:joint-friction"
+    assert "beside the friction laws" in why
+
+
+def test_in_contact_it_is_the_tool_and_too_few_rows_are_no_look():
+    model = arm_model(contacts=1)
+    assert usual_forces(model) == "gp:tool-friction"
+    chosen, why = choose_forces(arm_data(2, 0, model), model)
+    assert chosen == "gp:tool-friction"
+    assert "could not be compared with it" in why
+
+
+def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
+    rotors = Actuation(), Thrusters("body", ((0.2, 0.0, 0.0), (-0.1, 0.2, 0.0), (-0.1, -0.2, 0.0))), RigidBodies()
+    robots = [Robot.from_urdf_text(DRONE, base="floating", locked=locked) for locked in ({"tilt": 0.0}, {})]
+    drones = [Model(robot, (), rotors) for robot in robots]
+    limbs = Robot.from_urdf_text(LIMBS, base="floating")
+    walker = Model(limbs, fixed_point("a_foot", switch="a_stands"))
+    rock = Model(robots[0], (), (RigidBodies(),))
+    models = *drones, walker, rock
+    found = [usual_forces(model) for model in models]
+    assert found == ["gp:aerodynamic", "gp:joint-friction+gp:aerodynamic", "gp:joint-friction", "gp:joint"]
+    for model, name in zip(models, found, strict=True):
+        named_model(model, summands(name))
+        assert "given" in candidates(default_models(model), model, usual_identification(model))
+    with pytest.raises(InvalidInput, match="none but its base; leave it out"):
+        named_model(drones[0], ("gp:aerodynamic", "gp:joint-friction"))
+
+
+def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):
+    model = bare.with_forces(JointFriction(), noise=Noise(0.5))
+    fitted = fit(model, log, restarts=1)
+    assert allowing_for_correlation(fitted, log) == (fitted, None), "white noise"
+    smooth = np.convolve(np.random.default_rng(0).standard_normal(len(log) + 8), np.ones(9) / 3.0, "valid")
+    slow = replace(log, a=log.a + 4.0 * smooth[:, None])
+    wide, note = allowing_for_correlation(fit(model, slow, restarts=1), slow)
+    k = wide.settings["correlated_rows"]
+    assert 3.0 < k < 12.0, "of 9 rows that share their noise"
+    assert f"over {k:.0f} rows" in note
+    # nine rows that share their noise are one: the posterior of rows that are noisier by the root of k
+    noisier = {**wide.hyperparameters, ACCELERATION: wide.hyperparameters[ACCELERATION] + 0.5 * np.log(k)}
+    given = wide.training, noisier, wide.result, {"widening": wide.widening}, wide.engine
+    expected = wide.conditioned(replace(wide.trained, noise=model.noise), *given)
+    state = log.q[:5], log.v[:5], log.u[:5]
+    np.testing.assert_allclose(wide.predict(*state).mean, expected.predict(*state).mean, rtol=1e-12)
+    np.testing.assert_allclose(wide.predict(*state).covariance, expected.predict(*state).covariance, rtol=1e-12)
+    np.testing.assert_allclose(wide.noise_std, [0.5], rtol=1e-12)
+    save_posterior(wide, tmp_path / "run")
+    again = load_posterior(tmp_path / "run")
+    np.testing.assert_array_equal(again.predict(*state).covariance, wide.predict(*state).covariance)
+
+
+def test_many_rows_learn_hyper_parameters_as_the_independent_rows_that_they_are_worth(log, bare):
+    """The bound of rows that are repeated k times, k of which count as one, is that of the rows themselves."""
+    model = bare.with_forces(JointFriction(), noise=Noise(0.5, learn=True))
+    engine = Inducing(points=60, tolerance=0.0, refine=0)
+    fitted = fit(model, log, engine=engine, learning_points=40, restarts=1)
+    points, once = fitted.latent.features, fitted.likelihood
+    rows = (x.repeat_interleave(3, 0) for x in (once.training.q, once.training.v, once.training.u, once.training.a))
+    repeated = TrainingData(*rows, reference=once.training.reference, correlated_rows=3.0)
+    thrice = replace(once, training=repeated)
+    expected = once.bound(fitted.kernels, fitted.hyperparameters, points)
+    torch.testing.assert_close(
+        thrice.bound(fitted.kernels, fitted.hyperparameters, points), expected, rtol=1e-9, atol=0.0
+    )
+
+
+def test_noise_of_forces_is_learned_where_rows_show_it():
+    model = arm_model(contacts=0, baumgarte=None)
+    data = arm_data(60, 0, model)
+    for noise in (None, Noise(0.1), Noise(0.1, 0.2, learn=True)):
+        model = replace(arm_model(contacts=0, baumgarte=None).with_forces(JointFriction()), noise=noise)
+        assert with_force_noise(model, data) is model, "stated, or already there"
+    model = with_force_noise(replace(model, noise=Noise(0.1, learn=True)), data)
+    q, v, a = (torch.tensor(x) for x in (data.q, data.v, data.a))
+    lacking = model.robot.inverse_dynamics(q, v, a).numpy() - data.u
+    np.testing.assert_allclose(model.noise.force, lacking.std(axis=0, ddof=1), rtol=1e-8)

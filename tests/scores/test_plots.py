@@ -1,0 +1,92 @@
+"""Plots hold what they promise, are written whole, and leave matplotlib's global state alone."""
+
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from forcegp.errors import InvalidInput
+from forcegp.scores import prediction_figure, save_figure
+from forcegp.scores.figures.style import new_figure, plain_ticks, short_joint_names, window
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def figures(posterior, test_data):
+    sys.modules.pop("matplotlib.pyplot", None)  # examples that ran before in this process may have imported it
+    return {
+        "prediction": prediction_figure(posterior, test_data),
+    }
+
+
+@pytest.mark.parametrize(("name", "panels"), [("prediction", 2 * 3)])
+def test_every_panel_is_there_and_the_file_is_a_picture(figures, name, panels, tmp_path):
+    assert len(figures[name].axes) == panels
+    path = tmp_path / f"{name}.png"
+    save_figure(figures[name], path)
+    assert path.read_bytes().startswith(PNG)
+    picture = imread(path)
+    assert min(picture.shape[:2]) > 300
+    assert picture[..., :3].std() > 0.02  # not one colour
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_panels_say_what_they_show_and_in_which_unit(figures):
+    prediction = [axes.get_ylabel() for axes in figures["prediction"].axes]
+    assert prediction[0] == "pan\nrad/s²"
+    assert figures["prediction"].axes[-1].get_xlabel() == "time [s]"
+
+
+def test_no_global_state_of_pyplot_is_touched(figures):
+    assert figures
+    assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_a_figure_that_cannot_be_drawn_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "old.png"
+    path.write_bytes(b"old")
+    figure = new_figure(2.0, 2.0)
+    figure.subplots().set_title(r"$\frac{$")
+    with pytest.raises(ValueError, match="frac"):
+        save_figure(figure, path)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(InvalidInput, match="does not exist; create it first"):
+        save_figure(new_figure(1.0, 1.0), tmp_path / "nowhere" / "a.png")
+
+
+def test_a_window_holds_the_rows_of_one_episode_in_order_of_time(test_data):
+    shuffled = test_data.rows(np.random.default_rng(0).permutation(len(test_data)))
+    rows = window(shuffled, 0.1, 0.2)
+    np.testing.assert_allclose(rows.time, test_data.time[(test_data.time >= 0.1) & (test_data.time <= 0.3)])
+    with pytest.raises(InvalidInput, match=r"no rows from 5\.0 s on"):
+        window(test_data, 5.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "short"),
+    [
+        (["lbr_iiwa_joint_1", "lbr_iiwa_joint_2"], ["joint 1", "joint 2"]),
+        (["shoulder_pan", "shoulder_lift"], ["pan", "lift"]),
+        (["pan", "lift"], ["pan", "lift"]),
+        (["panel", "pan"], ["panel", "pan"]),
+        (["only_joint_1"], ["only_joint_1"]),
+    ],
+)
+def test_short_names_drop_what_all_joints_share(names, short):
+    assert short_joint_names(names) == short
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.45, 0.48), (1.0, 4.0), (0.9, 30.0), (1e-4, 10.0)])
+def test_ticks_of_logarithmic_axes_are_few(low, high):
+    axes = new_figure(1.6, 1.0).subplots()
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    plain_ticks(axes.xaxis)
+    shown = [value for value in axes.get_xticks() if low <= value <= high]
+    assert 2 <= len(shown) <= 6

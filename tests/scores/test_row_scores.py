@@ -1,0 +1,290 @@
+"""Scores of one model on the rows of a log: against single predictions, closed forms, and a truth that is changed."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal, norm
+from tests.data import samples
+from tests.posterior.arm import NOISE, arm_data, arm_model
+from tests.scores.friction import fitted, friction_data
+from tests.scores.moving_arm import given_system, moving_arm
+
+from forcegp import score
+from forcegp.errors import InvalidInput
+from forcegp.fit import fit
+from forcegp.forces import ContactFriction, JointForces, JointFriction, Rotor, ToolForces
+from forcegp.model import Model
+from forcegp.posterior import load_posterior, save_posterior
+from forcegp.scores import force_errors, mass_matrices, normal_force_rests_on_prior, predict_rows, row_scores
+from forcegp.scores.accuracy import LEVELS, _errors, over_columns
+from forcegp.scores.predicted_rows import ROWS_PER_BLOCK
+
+TRUE = "true acceleration"
+SIGMA = np.array([3.0, 2.0, 5.0])
+
+
+def scored(posterior, data):
+    return score(posterior, data, horizons=())
+
+
+@pytest.fixture(scope="module")
+def scores(posterior, test_data):
+    return scored(posterior, test_data)
+
+
+def test_scores_are_those_of_single_predictions(posterior, test_data, scores):
+    errors, densities, inside, inside_noise_free = [], [], [], []
+    for row in range(len(test_data)):
+        prediction = posterior.predict(test_data.q[row], test_data.v[row], test_data.u[row])
+        mean, covariance = prediction.mean.numpy(), prediction.covariance.numpy()
+        noisy = covariance + NOISE**2 * np.eye(3)
+        errors.append(mean - test_data.a[row])
+        densities.append(-multivariate_normal(mean, noisy).logpdf(test_data.a[row]))
+        inside.append(np.abs(errors[-1]) <= norm.ppf(0.975) * np.sqrt(np.diag(noisy)))
+        gap = np.abs(mean - test_data.truth["a"][row])
+        inside_noise_free.append(gap <= norm.ppf(0.975) * np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(scores.columns("mae"), np.abs(errors).mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(scores.columns("rmse"), np.sqrt(np.square(errors).mean(axis=0)), rtol=1e-9)
+    assert scores.value("nlpd", "all joints") == pytest.approx(np.mean(densities), rel=1e-8)
+    np.testing.assert_allclose(scores.columns("coverage_95"), np.mean(inside, axis=0))
+    np.testing.assert_allclose(scores.columns("coverage_95", TRUE), np.mean(inside_noise_free, axis=0))
+    assert scores.value("mae") == pytest.approx(np.abs(errors).mean())
+    assert scores.value("noise_floor") == pytest.approx(NOISE * np.sqrt(2 / np.pi))
+    assert json.loads(json.dumps(scores.to_dict(), allow_nan=False)) == scores.to_dict()
+    assert not any("training rows" in each or "noise std" in each for each in scores.warnings)
+
+
+def test_learning_helps_and_the_constraint_holds(scores):
+    assert scores.value("mae", TRUE) < 0.5 * scores.value("known_physics_mae", TRUE)
+    assert scores.value("mae", "constraint") <= scores.value("largest", "constraint") < 1e-10
+
+
+def test_without_truth_only_measurements_are_scored_and_the_rest_is_named(posterior, test_data, scores):
+    bare = scored(posterior, dataclasses.replace(test_data, truth={}, noise_std=None, model=None))
+    assert set(bare.quantities()) == {"acceleration", "all joints", "force", "constraint"}
+    assert bare.value("mae") == scores.value("mae")
+    assert bare.value("mae", "constraint") == scores.value("mae", "constraint")  # of the model's own contact
+    with pytest.raises(InvalidInput, match=r"hold no mae of unknown force; they hold .* need their truth in the log"):
+        bare.value("mae", "unknown force")
+    with pytest.raises(InvalidInput, match=r"no noise_floor of acceleration.*coverage_95"):
+        bare.value("noise_floor")
+
+
+def test_a_stored_model_scores_the_same(posterior, test_data, scores, tmp_path):
+    save_posterior(posterior, tmp_path / "run")
+    again = scored(load_posterior(tmp_path / "run"), test_data)
+    np.testing.assert_allclose(again.columns("mae"), scores.columns("mae"), rtol=1e-9)
+
+
+def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(without_mean, test_data):
+    predicted = predict_rows(without_mean, test_data)
+    known = arm_model().dynamics(*(torch.tensor(x) for x in (test_data.q, test_data.v, test_data.u))).Q_K.numpy()
+    expected = np.abs(predicted.unknown_force - known - test_data.truth["Q_U"]).mean(axis=0)
+    np.testing.assert_allclose(scored(without_mean, test_data).columns("mae", "unknown force"), expected, rtol=1e-9)
+
+
+def test_blocks_of_rows_join_seamlessly(posterior):
+    data = arm_data(ROWS_PER_BLOCK + 3, seed=2)
+    calls = []
+    whole = predict_rows(posterior, data, lambda done, total: calls.append((done, total)))
+    assert calls == [(ROWS_PER_BLOCK, len(data)), (len(data), len(data))]
+    rows = [0, ROWS_PER_BLOCK - 1, ROWS_PER_BLOCK, len(data) - 1]
+    ends = predict_rows(posterior, data.rows(rows))
+    for name in ("mean", "variance", "negative_log_density", "A", "b"):
+        np.testing.assert_allclose(getattr(whole, name)[rows], getattr(ends, name), rtol=1e-8, atol=1e-9)
+
+
+def test_data_of_another_robot_are_refused(posterior):
+    with pytest.raises(InvalidInput, match=r"shoulder, elbow.*pan, lift, bend"):
+        scored(posterior, samples.dataset())
+
+
+# ---------------------------------------------------------------- known physics alone, in closed form
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    return dataclasses.replace(moving_arm(0.4, 1), noise_std=None)
+
+
+@pytest.fixture(scope="module")
+def known(swinging):
+    """Table and stretches of the URDF alone with a given noise."""
+    model = given_system()
+    posterior = fit(model.with_forces(noise=tuple(SIGMA)), swinging, points=5)
+    return row_scores(posterior, swinging, mass_matrices(swinging, model))
+
+
+def off(data) -> np.ndarray:
+    """Errors of its accelerations."""
+    robot = given_system().robot
+    states = zip(*map(torch.tensor, (data.q, data.v)), data.u, strict=True)
+    forces = [(robot.mass_matrix(q).numpy(), u - robot.bias_forces(q, v).numpy()) for q, v, u in states]
+    return np.array([np.linalg.solve(mass, force) for mass, force in forces]) - data.a
+
+
+def test_force_errors_are_the_residuals_of_inverse_dynamics(known, swinging):
+    """M (a_predicted - a) = (u - bias) - M a: what inverse dynamics leaves of the torque, with the model's own M."""
+    robot = given_system().robot
+    q, v, a = map(torch.tensor, (swinging.q, swinging.v, swinging.a))
+    residual = swinging.u - robot.inverse_dynamics(q, v, a).numpy()
+    table, _ = known
+    assert np.allclose(table["force"]["rmse"], np.sqrt((residual**2).mean(0)))
+    assert np.allclose(table["force"]["mae"], np.abs(residual).mean(0))
+    at_rest = swinging.u - residual - robot.bias_forces(q, v).numpy()  # M a
+    assert np.allclose(table["force"]["rmse_at_rest"], np.sqrt((at_rest**2).mean(0)))
+
+
+def test_densities_and_intervals_are_those_of_the_noise(known, swinging):
+    error, density = off(swinging), norm.logpdf(off(swinging), scale=SIGMA)
+    table, _ = known
+    assert table["all joints"]["nlpd"] == pytest.approx([-density.sum(1).mean()])
+    assert np.allclose(table["acceleration"]["nlpd"], -density.mean(0))
+    assert np.allclose(table["acceleration"]["nrmse"], np.sqrt((error**2).mean(0)) / swinging.a.std(0))
+    assert np.allclose(table["acceleration"]["noise_std"], SIGMA)
+    for level in LEVELS:
+        inside = (np.abs(error) <= norm.ppf(0.5 + 0.5 * level) * SIGMA).mean(0)
+        assert np.allclose(table["acceleration"][f"coverage_{100 * level:.0f}"], inside)
+
+
+def test_stretches_of_time_make_up_the_whole(known, swinging):
+    """Equal stretches: means of squares over them are those of all rows, and so are densities."""
+    table, stretches = known
+    number = (swinging.time / (0.39 / 20)).astype(int)
+    rows = np.bincount(number)
+    assert len(stretches["force"]) == len(rows)
+    assert np.average(stretches["force"], weights=rows) == pytest.approx(np.square(table["force"]["rmse"]).mean())
+    nrmse = np.square(table["acceleration"]["nrmse"]).mean()
+    assert np.average(stretches["acceleration"], weights=rows) == pytest.approx(nrmse)
+    assert np.average(stretches["density"], weights=rows) == pytest.approx(table["all joints"]["nlpd"][0])
+    first = (off(swinging) / swinging.a.std(0))[number == 0]
+    assert stretches["acceleration"][0] == pytest.approx((first**2).mean())
+
+
+def test_the_mass_matrix_counts_rotors(swinging):
+    model = given_system()
+    with_rotors = Model(model.robot, (), (*model.forces, Rotor((0.1, 0.2, 0.3))))
+    added = mass_matrices(swinging, with_rotors) - mass_matrices(swinging, model)
+    assert np.allclose(added, np.diag([0.1, 0.2, 0.3]))
+    change = force_errors(np.ones((len(swinging), 3)), np.zeros((len(swinging), 3)), added)
+    assert np.allclose(change, [0.1, 0.2, 0.3])
+
+
+def test_a_joint_that_never_moves_has_no_normalised_error(swinging):
+    a = swinging.a.copy()
+    a[:, 1] = 2.0 + 1e-12 * a[:, 1]  # rounding, as of a cart across its wheels
+    posterior = fit(given_system().with_forces(noise=tuple(SIGMA)), swinging, points=5)
+    scores = scored(posterior, dataclasses.replace(swinging, a=a))
+    assert [each is None for each in scores.columns("nrmse")] == [False, True, False]
+    assert scores.value("nrmse") is not None
+
+
+def test_over_all_joints():
+    assert over_columns("acceleration", "nrmse", [1.0, None, 3.0]) == 2.0
+    assert over_columns("true acceleration", "rmse", [3.0, 4.0]) == 3.5
+    assert over_columns("force", "rmse", [3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
+    assert over_columns("acceleration", "nrmse", [None]) is None
+
+
+# ---------------------------------------------------------------- forces by themselves
+
+
+@pytest.fixture(scope="module")
+def data():
+    return friction_data(50, seed=1)
+
+
+@pytest.fixture(scope="module")
+def friction():
+    return fitted(JointFriction(), ContactFriction(kernel="linear"))
+
+
+def test_errors_of_a_force_done_by_hand():
+    mean, variance = np.array([[1.0, 0.0], [3.0, 0.0], [0.0, 0.0]]), np.array([[1.0, 0.0], [0.01, 0.0], [4.0, 0.0]])
+    found = _errors("f", mean, variance, np.array([[0.0, 0.0], [4.0, 0.0], [3.0, 0.0]]))["f"]
+    assert found["mae"] == [pytest.approx(5.0 / 3.0), 0.0]
+    assert found["rmse"] == [pytest.approx(np.sqrt(11.0 / 3.0)), 0.0]
+    assert found["relative_rmse"] == [pytest.approx(np.sqrt(11.0 / 25.0))]
+    assert found["coverage_95"] == [pytest.approx(2.0 / 3.0), None]  # the second column has no width
+    assert "relative_rmse" not in _errors("f", mean, variance, np.zeros((3, 2)))["f"]
+    assert _errors("f", mean, np.zeros((3, 2)), mean)["f"]["coverage_95"] == [None, None]
+    assert _errors("f", mean, variance, np.zeros((3, 1))) == {}, "of another number of contacts"
+
+
+def test_components_are_scored_against_the_parts_of_the_truth(friction, data):
+    scores = scored(friction, data)
+    components = friction.components(data.q, data.v, data.u)
+    for name, part in (("joint-friction", "joint-friction"), ("contact-friction", "tool-friction")):
+        force, truth, quantity = components[name].joint_force, data.truth[f"Q_U.{part}"], f"{name} at the joints"
+        error = force.mean.numpy() - truth
+        np.testing.assert_allclose(scores.columns("mae", quantity), np.abs(error).mean(0), rtol=1e-9)
+        np.testing.assert_allclose(scores.value("rmse", quantity), np.sqrt((error**2).mean()), rtol=1e-9)
+        relative = np.linalg.norm(error) / np.linalg.norm(truth)
+        assert scores.value("relative_rmse", quantity) == pytest.approx(relative, rel=1e-9)
+        inside = np.abs(error) <= norm.ppf(0.975) * force.std.numpy()
+        np.testing.assert_allclose(scores.columns("coverage_95", quantity), inside.mean(0), atol=1e-12)
+        assert relative < 0.1, "the right prior knows these forces, each by itself"
+    error = components["contact-friction"].point_force.mean.numpy() - data.truth["force.tool-friction"]
+    at = "contact-friction at its point"
+    np.testing.assert_allclose(scores.columns("mae", at), np.abs(error).mean(0), rtol=1e-9)
+    assert "joint-friction at its point" not in scores.quantities()
+    assert scores.value("relative_rmse", "contact force") < 0.05
+    # twice the true tool friction and the prediction is half of it
+    doubled = {name: values * (2.0 if name.endswith("tool-friction") else 1.0) for name, values in data.truth.items()}
+    wrong = scored(friction, dataclasses.replace(data, truth=doubled))
+    assert wrong.value("relative_rmse", at) == pytest.approx(0.5, abs=0.05)
+    assert wrong.value("coverage_95", at) < 0.2
+
+
+def test_what_the_truth_does_not_know_is_not_scored(friction, data):
+    only = {name: data.truth[name] for name in ("Q_U.joint-friction", "lambda")}
+    found = scored(friction, dataclasses.replace(data, truth=only)).quantities()
+    assert "joint-friction at the joints" in found
+    assert "contact force" in found
+    assert not any(name.startswith("contact-friction") for name in found)
+
+
+@pytest.mark.filterwarnings("ignore:the accelerations show no force")  # one iteration finds none
+@pytest.mark.parametrize(
+    ("forces", "how"),
+    [((ContactFriction(kernel="linear"), ToolForces(inputs=("position",))), {}), ((JointFriction(),), {"mean": False})],
+    ids=["two that claim one truth", "without a mean friction is not alone"],
+)
+def test_components_whose_truth_is_not_their_own_are_not_scored(data, forces, how):
+    found = scored(fitted(*forces, iterations=1, **how), data).quantities()
+    assert not any(name.endswith((" the joints", " its point")) for name in found if name != "all joints")
+    assert "contact force" in found
+
+
+def test_a_model_of_accelerations_has_no_forces_to_score(data):
+    found = scored(fit(data.model.black_box(), friction_data(10, 0)), data).quantities()
+    assert not {"unknown force", "contact force"} & set(found)
+
+
+@pytest.mark.parametrize(
+    ("forces", "rests"),
+    [
+        ((JointForces(), JointFriction()), True),
+        ((ToolForces(frame="hand", point=(0.0, 0.0, 0.2), axes="world"),), True),
+        ((ToolForces(),), False),
+        ((JointFriction(), ContactFriction()), False),
+        ((), False),
+    ],
+    ids=str,
+)
+def test_only_a_force_that_is_free_along_the_normal_rests_on_the_prior(forces, rests):
+    assert normal_force_rests_on_prior(fitted(*forces, points=15, iterations=1)) is rests
+
+
+def test_a_force_that_rests_on_the_prior_may_be_anything_and_accelerations_stay(data, without_contact):
+    """The criterion against its meaning: add a function times A^T to the joint forces, and only lambda changes."""
+    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
+    dynamics = data.model.dynamics(*states)
+    pressing = 7.0 * torch.cos(states[0][:, :1]) * dynamics.A[:, 0]
+    zero = torch.zeros_like(pressing)
+    torch.testing.assert_close(dynamics.acceleration(pressing), dynamics.acceleration(zero), rtol=0.0, atol=1e-9)
+    assert (dynamics.multiplier(pressing) - dynamics.multiplier(zero)).abs().min() > 1.0
+    assert not normal_force_rests_on_prior(without_contact), "without contacts there is none"

@@ -1,0 +1,166 @@
+"""What is held out: no row is on both sides, and none within the guard is learned from."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.posterior.arm import arm_data
+
+from forcegp.data import Dataset
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.scores import Split, Stretch, split_named
+from forcegp.scores.experiment import training_subset
+
+
+def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Dataset:
+    generator = np.random.default_rng(seed)
+    values = {name: generator.normal(size=(rows, 1)) for name in "qvua"}
+    episode = np.repeat(np.arange(episodes), rows // episodes)
+    time = np.concatenate([np.cumsum(generator.uniform(0.005, 0.03, rows // episodes)) for _ in range(episodes)])
+    units = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2", "time": "s"}
+    return Dataset(**{**values, "time": time, "episode": episode, "joint_names": ("j",), "units": units, **changes})
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    blocks=st.integers(2, 7),
+    wanted=st.sets(st.integers(1, 7), min_size=1),
+    guard=st.floats(0.0, 0.2),
+    episodes=st.integers(1, 3),
+    seed=st.integers(0, 50),
+)
+def test_blocks_share_no_row_and_keep_their_distance(blocks, wanted, guard, episodes, seed):
+    data = recording(60, episodes, seed)
+    wanted = sorted(number for number in wanted if number <= blocks)
+    if not wanted or len(wanted) == blocks:
+        return
+    split = split_named(data, f"blocks:{blocks}:{','.join(map(str, wanted))}", guard)[0]
+    train, test = split.training_rows(data), split.test_rows(data)
+    assert not (train & test).any()
+    for episode in data.episodes:
+        here = data.episode == episode
+        length = np.ptp(data.time[here])
+        place = (data.time - data.time[here].min()) / length * blocks
+        number = np.minimum(np.floor(place).astype(int), blocks - 1) + 1
+        inside = np.abs(place - np.round(place)) > 1e-9  # on a border rounding decides
+        assert (test[here & inside] == np.isin(number, wanted)[here & inside]).all()
+        if train[here].any() and test[here].any():
+            apart = np.abs(data.time[here & train][:, None] - data.time[here & test]).min()
+            assert apart >= guard * (1 - 1e-12)
+        # a row that is on neither side lies within the guard of a held-out block, and so of its border
+        for row in np.flatnonzero(here & ~train & ~test):
+            borders = [number for number in range(1, blocks) if (number in wanted) != (number + 1 in wanted)]
+            distance = min(abs(place[row] - border) for border in borders) * length / blocks
+            assert distance <= guard + 1e-12
+
+
+def test_a_decimated_recording_is_divided_at_the_same_moments():
+    full = recording(300, 1)
+    few = full.rows(slice(None, None, 7))
+    split = split_named(few, "blocks:5:3,5", 0.05)[0]
+    assert (split.test_rows(full)[::7] == split.test_rows(few)).all()
+    assert (split.training_rows(full)[::7] == split.training_rows(few)).all()
+    assert split.test_rows(full)[-1], "rows after the last of the few belong to the last block"
+
+
+def test_whole_episodes_are_held_out_and_left_one_by_one():
+    data = recording()
+    split = split_named(data, "episodes:2,0")[0]
+    train, test = split.apply(data)
+    assert (train.episodes, test.episodes) == ((1,), (0, 2))
+    assert len(train) + len(test) == len(data)
+    folds = split_named(data, "leave-one-out")
+    assert [fold.apply(data)[1].episodes for fold in folds] == [(0,), (1,), (2,)]
+    assert len({fold.name for fold in folds}) == 3
+
+
+def test_splits_by_name():
+    data = recording()
+    assert split_named(data, "episodes:0,2")[0].held_out == (Stretch(0), Stretch(2))
+    assert len(split_named(data, "leave-one-out")) == 3
+    assert len(split_named(data, "fraction:0.6")[0].held_out) == 2
+    assert split_named(data, "fraction:0.34:5") == split_named(data, "fraction:0.34:5")
+    drawn = {split_named(data, f"fraction:0.34:{seed}")[0].held_out for seed in range(20)}
+    assert drawn == {(Stretch(0),), (Stretch(1),), (Stretch(2),)}
+    assert len(split_named(data, "auto")[0].held_out) == 1
+    one = recording(60, 1)
+    (split,) = split_named(one, "auto", guard=0.1)
+    assert (len(split.held_out), split.guard) == (2, 0.1)
+    assert "5 consecutive blocks of equal duration, blocks 3 and 5 held out" in split.words
+    assert "0.1 s" in split.words
+
+
+def test_imported_episodes_answer_to_the_names_of_their_logs():
+    listed = [{"recording": f"/logs/{name}.csv"} for name in ("run-143339", "run-143524", "run-143524")]
+    data = recording(metadata={"import": {"episodes": listed}})
+    assert split_named(data, "episodes:143339")[0].held_out == (Stretch(0),)
+    assert split_named(data, "episodes:143524")[0].held_out == (Stretch(1), Stretch(2))
+    assert "run-143339.csv" in split_named(data, "episodes:0")[0].words
+    with pytest.raises(InvalidInput, match=r"run-143339\.csv, run-143524\.csv"):
+        split_named(data, "episodes:run")
+
+
+WRONG = [
+    ("episodes:7", r"no episode or log is called so; the dataset has episodes \[0, 1, 2\]"),
+    ("episodes:0,0", "name one twice"),
+    ("episodes:0,1,2", "leave one to learn from"),
+    ("episodes:", "no episode or log"),
+    ("fraction:0", "between 0 and 1"),
+    ("fraction:half", "give auto, episodes:N"),
+    ("fraction:0.5:-1", "0 or more"),
+    ("blocks:1:1", "leave one to learn from"),
+    ("blocks:5:6", "name some of 1 to 5"),
+    ("blocks:5:3,3", "each once"),
+    ("blocks:2:1,2", "leave one to learn from"),
+    ("blocks:5", "give auto, episodes:N"),
+    ("thirds", "give auto, episodes:N"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG, ids=[text for text, _ in WRONG])
+def test_what_makes_no_split_is_refused(text, message):
+    with pytest.raises(InvalidInput, match=message):
+        split_named(recording(), text)
+
+
+def test_overlap_is_refused():
+    with pytest.raises(InvalidInput, match="end it later"):
+        Split("s", "", (Stretch(0, 2.0, 2.0),))
+    with pytest.raises(InvalidInput, match="guard is -1"):
+        Split("s", "", (Stretch(0),), guard=-1.0)
+    data = recording()
+    with pytest.raises(InvalidInput, match="leaves no row to learn from"):
+        split_named(data, "blocks:2:1", 10.0)[0].apply(data)
+    again = {name: getattr(data, name).copy() for name in ("q", "v", "u")}
+    for values in again.values():
+        values[20:40] = values[:20]  # episode 1 repeats episode 0
+    with pytest.raises(DatasetError, match="20 of 20 test rows are also training rows"):
+        split_named(data, "episodes:1")[0].apply(dataclasses.replace(data, **again))
+    with pytest.raises(InvalidInput, match="one episode"):
+        split_named(recording(60, 1), "leave-one-out")
+
+
+def rows_of(data) -> set[float]:
+    return set(data.time.tolist())
+
+
+def test_seeds_choose_other_training_rows_that_lie_far_apart():
+    train = arm_data(300, seed=1)
+    chosen = [training_subset(train, 40, seed) for seed in range(3)]
+    assert all(len(subset) == 40 and rows_of(subset) <= rows_of(train) for subset in chosen)
+    assert rows_of(training_subset(train, 40, 2)) == rows_of(chosen[2])
+    shared = [len(rows_of(a) & rows_of(b)) for i, a in enumerate(chosen) for b in chosen[:i]]
+    assert max(shared) < 36, "seeds would hardly differ"
+
+    def nearest(data) -> float:
+        x = np.hstack([data.q, data.v, data.u]) / np.hstack([train.q, train.v, train.u]).std(0)
+        distance = np.linalg.norm(x[:, None] - x, axis=-1) + 1e9 * np.eye(len(x))
+        return float(distance.min(axis=1).mean())
+
+    random = train.rows(np.random.default_rng(0).choice(300, 40, replace=False))
+    assert nearest(chosen[0]) > 1.2 * nearest(random)
+    for points in (1, 201):
+        with pytest.raises(InvalidInput, match="from 2 to 200, two thirds"):
+            training_subset(train, points, 0)
