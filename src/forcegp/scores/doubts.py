@@ -224,7 +224,7 @@ def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     data more than those of another recording: whether to carry the model over is decided by some rows, not by a rule.
     """
     own, model = dataset.model, posterior.model
-    if own is None:
+    if own is None or posterior.is_black_box:  # which has no contacts, and can be carried nowhere
         return
     contacts = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
     # inertias that were identified are meant to differ from those that the data came with
