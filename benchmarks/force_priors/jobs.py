@@ -40,7 +40,7 @@ def true_curves(posterior: Any) -> dict[str, Law]:
 
     Those are priors that differ from the simulation, for example a friction that does not grow with the load.
     """
-    if not posterior.predicts_forces:
+    if posterior.is_black_box:
         return {}
     model = posterior.model
     given: Mapping[str, Any] = posterior.settings["data"]["metadata"]["config"]
@@ -151,7 +151,7 @@ def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:
 def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     """Errors of the acceleration and, where the model has them, of the forces; plain JSON values."""
     assert test.model is not None, "simulated data carry their model"
-    if posterior.predicts_forces:
+    if not posterior.is_black_box:
         posterior = posterior.with_contacts(test.model.contacts)  # what was identified stays
     out = scores_of(posterior, test)
     names = ("mae", "mae_noise_free", "nlpd", "coverage_95", "coverage_95_noise_free", "known_physics_mae")
@@ -163,7 +163,7 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
         for name, where in (("touching", open_contacts == 0), ("in_the_air", open_contacts > 0)):
             chosen = np.flatnonzero(where)
             kept[f"mae_{name}"] = scores_of(posterior, test.rows(chosen))["mae"] if chosen.size else None
-    if not posterior.predicts_forces:
+    if posterior.is_black_box:
         return kept
     kept |= {name: value for name, value in out.items() if name.startswith(("force_mae.", "normal_force"))}
     found = posterior.components(test.q, test.v, test.u, covariance=False)
