@@ -90,7 +90,6 @@ def test_the_times_of_the_features_are_those_of_the_benchmarks(repository: Path)
         "{nll_speedup_n400_tool_friction:.0f} times with the prior",
         "deflation is {nll_vs_cholesky_n400:.1f} times faster with one contact",
         "{compiled_mass_bias_vs_pinocchio_b10000:.2f} times as long as a C++ Pinocchio loop",
-        "inertial parameters take {compiled_inertial_gradient_vs_pinocchio_b10000:.2f} times",
         "of 1000 states take {mass_bias_vs_pinocchio_b1000:.1f} times",
         "takes {friction_predict_mean_ms:.2f} ms for the mean",
         "{friction_predict_cov_ms:.2f} ms, with derivatives {friction_linearize_ms:.2f} ms",

@@ -95,12 +95,15 @@ class Model(Summary):
             self.unknown  # noqa: B018  # refuses two that are equal
 
     def with_forces(self, *forces: Force | Sequence[Force], noise: Any = None) -> "Model":
-        """The same with these forces as well, in the place of laws of the same class; and with this noise, if given."""
+        """The same with these forces as well, in the place of laws of the same part; and with this noise, if given.
+
+        All laws of dry friction are of one part: that of the robot's file goes where another one is added.
+        """
         added = tuple(
             each for several in forces for each in (several if isinstance(several, tuple | list) else (several,))
         )
-        kinds = {type(force) for force in added if isinstance(force, Law)}
-        kept = tuple(force for force in self.forces if type(force) not in kinds)
+        laws = [force for force in added if isinstance(force, Law)]
+        kept = tuple(force for force in self.forces if not any(law.takes_the_place_of(force) for law in laws))
         return replace(self, forces=(*kept, *added), noise=self.noise if noise is None else noise)
 
     def without_mean(self) -> "Model":

@@ -74,7 +74,7 @@ WRONG = [
     ("simulate kuka-surface --out arm.h5", "arm.h5 exists already"),
     ("simulate kuka-surface --out mine", "mine is a folder"),
     ("simulate kuka-surface --out nowhere/a.h5", "folder nowhere does not exist"),
-    ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be from"),
+    ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be one number, from"),
     ("simulate mars --out a.h5", "'mars'"),
     ("demo --out mine", "was not written by `forcegp demo`"),
     ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),

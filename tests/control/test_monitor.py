@@ -205,8 +205,8 @@ def workshop(posterior, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("log", [("log.h5",), ("log.csv", "--mapping", "map.yaml")])
-def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, capsys, log):
+def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, capsys):
+    log = ("log.csv", "--mapping", "map.yaml")
     monkeypatch.chdir(workshop)
     out = tmp_path / "contacts"
     assert main(["monitor", "run", *log, "--free", "free.h5", "--out", str(out)]) == 0

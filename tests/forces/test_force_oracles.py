@@ -11,7 +11,20 @@ from tests.mechanics.systems import model_with as model_of
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import FRAMES, MODELS
 
-from forcegp.forces import ContactFriction, JointForces, JointFriction, Payload, PeriodicJointForces, ToolForces
+from forcegp.forces import (
+    Actuation,
+    ContactFriction,
+    Coulomb,
+    JointForces,
+    JointFriction,
+    LoadFriction,
+    Payload,
+    PeriodicJointForces,
+    RigidBodies,
+    Stribeck,
+    ToolForces,
+    Viscous,
+)
 from forcegp.inference import LatentKernels
 from forcegp.mechanics import Contact, ImplicitSurface, Plane
 from forcegp.model import Model
@@ -281,3 +294,13 @@ def test_sines_and_cosines_do_not_see_a_full_turn_and_keep_sliding_joints(model,
     found = {name.split(" [")[0]: here[:, k] for k, name in enumerate(names)}
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_dry_friction_of_a_file_goes_where_another_law_of_it_is_added():
+    """A robot's file states Coulomb's; Stribeck's beside it would push twice."""
+    model = Model(model_of(MODEL).robot, forces=(Actuation(), RigidBodies(), Coulomb(0.4), Viscous(0.1)))
+    for law in (Stribeck(), LoadFriction(0.2, 0.1), Coulomb()):
+        found = [type(each).__name__ for each in model.with_forces(law).laws]
+        assert found == ["Actuation", "RigidBodies", "Viscous", type(law).__name__]
+    both = model.with_forces(Coulomb(), LoadFriction(0.0, 0.1))
+    assert sum(each.part == "dry friction" for each in both.laws) == 2

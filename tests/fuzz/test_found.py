@@ -64,7 +64,7 @@ def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, wh
     assert require_ended_well(words, place) == 2
 
 
-CASES = [(name, other) for name in ("check", "import", "fit") for other in OTHERS[:: 6 if name == "fit" else 1]]
+CASES = [(name, other) for name in ("check", "import", "fit") for other in OTHERS[:: 9 if name == "fit" else 1]]
 
 
 @pytest.mark.parametrize(("command", "stated"), CASES, ids=json.dumps)

@@ -94,7 +94,7 @@ def test_dynamics_are_those_of_the_projected_model(case):
     robot, oracle, q, v, a = case
     states = [torch.from_numpy(x) for x in (q, v, a)]
     expected = [np.stack(parts) for parts in zip(*map(oracle.dynamics, q, v, a), strict=True)]
-    for of in (robot, robot.compile()):
+    for of in (robot, robot.compile()) if robot.locked or robot.armature.any() else (robot,):
         close(of.mass_matrix(states[0]), expected[0])
         close(of.bias_forces(*states[:2]), expected[1])
         close(of.gravity_forces(states[0]), expected[2])

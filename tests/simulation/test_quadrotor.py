@@ -83,8 +83,7 @@ def test_the_lag_of_actuators_that_push_a_base_is_found(train):
     assert found == pytest.approx(0.06, rel=0.25)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.06])
-def test_a_load_on_an_arm_beneath_is_no_lag(lag):
+def test_a_load_on_an_arm_beneath_is_no_lag():
     """Six thrusters make the wrench that a robot with a loaded arm needs; the file lacks the load."""
     body = (
         '<inertial><origin xyz="0 0 {}"/><mass value="{}"/>'
@@ -109,11 +108,11 @@ def test_a_load_on_an_arm_beneath_is_no_lag(lag):
     for step in torch.tensor(0.005 * (v + 0.0025 * a)).mT[:-1]:
         q.append(known.integrate(q[-1], step))
     late = loaded.inverse_dynamics(torch.stack(q), torch.tensor(v.T), torch.tensor(a.T)).numpy()
-    u = late + lag * np.gradient(late, time, axis=0)
+    u = late + 0.06 * np.gradient(late, time, axis=0)
     model = Model(known, (), (Actuation(np.eye(7), tuple("abcdefg")), RigidBodies()))
     rows = {"q": torch.stack(q).numpy(), "v": v.T, "a": a.T, "u": u, "time": time}
     found, _ = estimate_thruster_lag(Dataset(**rows, model=model))
-    assert found == pytest.approx(lag, abs=0.01)
+    assert found == pytest.approx(0.06, abs=0.01)
 
 
 def test_a_lag_needs_thrusters(train):

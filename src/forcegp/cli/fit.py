@@ -16,6 +16,7 @@ import forcegp
 import forcegp.checks
 import forcegp.data
 import forcegp.evidence
+import forcegp.parallel
 import forcegp.posterior
 import forcegp.robots
 import forcegp.scores

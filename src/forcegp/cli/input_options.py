@@ -113,8 +113,10 @@ class RobotOptions(RobotFileOptions):
             robot = robot.with_armature(rotors | changes.get("armature", {}))
         model = recorded.with_robot(robot)
         if self.robot is not None:  # its damping, dry friction and springs
-            kinds = {type(law) for law in model.laws}
-            model = model.with_forces(*(law for law in own.laws if type(law) not in kinds))
+            there = model.laws
+            model = model.with_forces(
+                *(law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
+            )
         return model.with_contacts((*model.touching, *own.loops)) if own.loops else model
 
     def chosen_model(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model:

@@ -61,7 +61,7 @@ def new_file(path: Path) -> Iterator[h5py.File]:
     Until then it is in memory: HDF5 that cannot write cannot close its file either, and crashes the process at its end
     (2.0.0, segmentation fault).
     """
-    with h5py.File("new", "w", driver="core", backing_store=False) as file:
+    with h5py.File("new", "w", driver="core", backing_store=False, block_size=2**24) as file:
         yield file
         file.flush()
         image = file.id.get_file_image()

@@ -12,6 +12,7 @@ from forcegp.forces.force import JointLaw, Number
 from forcegp.forces.parameters import Coefficient
 from forcegp.mechanics.gauss_principle import State
 
+DRY = "dry friction"
 VELOCITY_SCALE = Coefficient("velocity", 0.01, 0.1, 0.03, 20.0, logarithm=True)
 
 
@@ -21,6 +22,7 @@ class Coulomb(JointLaw):
 
     level: Number = None
     velocity_scale: Number = None
+    part: ClassVar[str] = DRY
     coefficients: ClassVar[Mapping[str, Coefficient]] = {"level": Coefficient(), "velocity_scale": VELOCITY_SCALE}
 
     @override
@@ -41,6 +43,7 @@ class Stribeck(JointLaw):
     breakaway: Number = None
     stribeck_velocity: Number = None
     velocity_scale: Number = None
+    part: ClassVar[str] = DRY
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
         "breakaway": Coefficient(),
@@ -66,6 +69,7 @@ class LoadFriction(JointLaw):
     level: Number = None
     factor: Number = None
     velocity_scale: Number = None
+    part: ClassVar[str] = DRY
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
         "factor": Coefficient("1", highest=0.9),

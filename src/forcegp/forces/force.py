@@ -82,6 +82,13 @@ class Law(Force):
     """Its numbers by the names of their fields."""
     under_load: ClassVar[bool] = False
     """Whether it depends on the torque of the actuators, `State.delivered`, and grows in proportion to its size."""
+    part: ClassVar[str] = ""
+    """What of the robot it is a law of: those of one part take the place of each other, "" is that of its class."""
+
+    @classmethod
+    def takes_the_place_of(cls, other: Force) -> bool:
+        """Whether a model that gets this law loses the other one."""
+        return isinstance(other, Law) and (type(other) is cls or cls.part == other.part != "")
 
     def direction(self, state: State) -> Float[Tensor, "*#batch nv k"] | None:
         """B: joint force (Nm or N) per unit of each amplitude; None where the amplitudes are the joint forces."""

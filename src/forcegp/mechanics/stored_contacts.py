@@ -26,6 +26,6 @@ def contact_to_dict(contact: Contact) -> dict[str, Any]:
 
 def contact_from_dict(entry: Mapping[str, Any]) -> Contact:
     """The contact that `contact_to_dict` stored. Raises KeyError or TypeError for anything else."""
-    given = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
+    given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
     given["surface"] = object_from_dict("surface", SURFACES, given["surface"])
     return CONTACTS[given.pop("type")](**given)

@@ -62,9 +62,10 @@ class ImportOptions:
 
     @usable_arguments("ImportOptions")
     def __post_init__(self) -> None:
-        for name, value in (("gap", self.gap), ("rate", self.rate)):
-            if value is not None and value not in ("auto", "log") and not 0.0 < value < float("inf"):
-                raise InvalidInput(f"{name} is {value}; it must be positive and finite.")
+        if self.gap is not None and not 0.0 < self.gap < float("inf"):
+            raise InvalidInput(f"gap is {self.gap}; it must be positive and finite.")
+        if self.rate not in ("auto", "log") and not (isinstance(self.rate, int | float) and 0.0 < self.rate < 1e9):
+            raise InvalidInput(f"rate is {self.rate!r}; give rows per second, 'auto' or 'log'.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
         if self.stance not in ("log", "auto"):

@@ -123,7 +123,7 @@ class UnrolledKinematics:
     zero is 0.0.
     """
 
-    def __init__(self, unrolled: UnrolledRobot, q: Sequence[Any], v: Sequence[Any] | None = None) -> None:
+    def __init__(self, unrolled: UnrolledRobot, q: _Values, v: _Values | None = None) -> None:
         self.unrolled = unrolled
         self.v = None if v is None else self._of_bodies(v)
         self.rotations: list[Scalars] = []  # body axes -> parent's axes
@@ -264,7 +264,7 @@ class UnrolledKinematics:
         return symmetric(np.block([[second, column], [column.T, mass]]))
 
 
-def _pose(kind: str, q: Sequence[Expression]) -> tuple[Scalars, Scalars]:
+def _pose(kind: str, q: Any) -> tuple[Scalars, Scalars]:
     """Rotation (3, 3) and translation (3,) of a joint of several degrees of freedom, by the code of the robot's."""
     example = torch.tensor(MOTIONS[kind].neutral, dtype=torch.float64)
     _, (rotation, origin) = trace(lambda x: pose(kind, x), [example], q[0].graph, q)

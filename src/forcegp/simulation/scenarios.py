@@ -145,22 +145,22 @@ class KukaSurfaceConfig(CommonConfig):
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
     base_height: ClassVar[float] = 0.05  # of the robot above the origin
-    tool_point: ClassVar[Numbers] = (0.0, 0.0, 0.1)  # that touches the surface, in the link-7 frame
+    tool_point: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.1)  # that touches the surface, in the link-7 frame
     tool_center_of_mass: ClassVar[Numbers] = (0.0, 0.0, 0.02)  # of link 7
     tool_inertia: ClassVar[Numbers] = (0.005, 0.0036, 0.0047)  # its principal moments about that
     joint_damping: ClassVar[float] = 0.5  # of every joint; subtracted from the commanded torque in the recorded u
     surface_height: ClassVar[float] = 0.055  # in the middle of the way-points' region
     tilt_degrees: ClassVar[float] = 10.0  # of the tilted plane, about a horizontal axis (x, y)
-    tilt_axis: ClassVar[Numbers] = (0.0, 1.0)
+    tilt_axis: ClassVar[tuple[float, float]] = (0.0, 1.0)
     sphere_radius: ClassVar[float] = 1.2
-    patch_x: ClassVar[Numbers] = (0.0, 0.25)  # the strip of the surface where the patch is
+    patch_x: ClassVar[tuple[float, float]] = (0.0, 0.25)  # the strip of the surface where the patch is
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
     joint_asymmetry: ClassVar[float] = 0.7  # Coulomb friction backwards over that forwards
-    joint_load: ClassVar[Numbers] = (0.04, 0.015)  # friction per torque of a joint that drives, and is driven back
+    joint_load: ClassVar[tuple[float, float]] = (0.04, 0.015)  # per torque of a joint that drives, that is driven back
     joint_presliding: ClassVar[float] = 0.01  # how far a joint gives before it slides (lugre)
-    joint_drift: ClassVar[Numbers] = (0.3, 60.0)  # share of Coulomb friction lost as gears warm up, and the time
+    joint_drift: ClassVar[tuple[float, float]] = (0.3, 60.0)  # of Coulomb friction lost as gears warm up; in s
     baumgarte_omega: ClassVar[float] = 10.0
     baumgarte_zeta: ClassVar[float] = 1.0
     start_degrees: ClassVar[Numbers] = (85, 50, -10, -100, -170, -25, -100)  # also the posture of the null space
