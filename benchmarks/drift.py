@@ -29,7 +29,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
-from forcegp.posterior.structured import Posterior
 
 from benchmarks.tracking import (
     CONFIG,
@@ -46,6 +45,7 @@ from benchmarks.tracking import (
 )
 from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, Model, PDGravity, fit
 from forcegp.data import farthest_rows
+from forcegp.posterior import Posterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SECONDS, LOST = 600, 0.3

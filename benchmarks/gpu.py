@@ -23,7 +23,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from forcegp.posterior.structured import Posterior
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
@@ -36,6 +35,7 @@ from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
 from forcegp.jobs.job import machine
 from forcegp.noise import Noise
+from forcegp.posterior import Posterior
 from forcegp.robots.arguments import usable_device
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 

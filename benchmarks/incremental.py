@@ -25,7 +25,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from forcegp.posterior.structured import Posterior
 
 from forcegp.data import Dataset, farthest_point_sampling, farthest_rows
 from forcegp.evidence import MarginalLikelihood, TrainingData
@@ -34,6 +33,7 @@ from forcegp.forces import JointForces
 from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptions
 from forcegp.inference.cholesky_update import rows_to_keep, with_only
 from forcegp.noise import Noise
+from forcegp.posterior import Posterior
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 SEEDS = (1, 2, 3)

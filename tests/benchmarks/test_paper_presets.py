@@ -4,11 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from benchmarks.paper.fits import MODELS
-from benchmarks.paper.published import FIG2B_MAE
 from benchmarks.paper.reproduction import PAPER_PAGE, PRESETS, as_csv, experiments_of, report
 
-from forcegp.cli.demo import PUBLISHED_MAE
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job
 from forcegp.scores.tables import formatted, markdown_table, median_and_range, number
@@ -60,10 +57,6 @@ def test_the_committed_page_is_made_of_the_committed_numbers():
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
         assert all((folder / f"{name}.png").exists() for name in document["figures"])
-
-
-def test_the_demo_states_the_same_published_errors():
-    assert {MODELS[name].label: FIG2B_MAE[name] for name in ("s-gp", "s-gp-mean")} == PUBLISHED_MAE
 
 
 def test_spreads_and_tables():

@@ -20,6 +20,7 @@ from forcegp import (
     fit,
     load_posterior,
     save_posterior,
+    score,
 )
 from forcegp.data import Dataset
 from forcegp.errors import FileFormatError, InvalidInput, NotEnoughMemory
