@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,17 +23,16 @@ SAMPLES = 16
 STEP = 0.005  # s, the longest; of several rows where the recording has shorter ones
 STARTS = 4  # motions that begin within one longest horizon
 LEVEL = 0.95
-AnyPosterior = TypeVar("AnyPosterior", bound=Posterior)
 
 
 def calibrated(
-    posterior: AnyPosterior,
+    posterior: Posterior,
     dataset: Dataset,
     horizons: Sequence[float] = HORIZONS,
     *,
     integrator: str = "rk4",
     report: Callable[[int, int], None] | None = None,
-) -> AnyPosterior:
+) -> Posterior:
     """The same model with intervals of motions that hold: of stretches of the training time, left out in turn.
 
     For each of four stretches the model is made again from the other rows at the same hyper-parameters (refined on
