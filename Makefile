@@ -14,7 +14,7 @@ ARGS ?=
 .NOTPARALLEL:
 .PHONY: demo test test-all test-processors mutants test-browser check docs format bench clean help
 
-demo: $(VENV)/.demo  ## simulate, learn and evaluate; prints the table and writes the pictures
+demo: $(VENV)/.demo  ## simulate, learn and score; prints the table and writes a report
 	$(BIN)/forcegp demo $(ARGS)
 
 # Files stay together, so that what a module shares is computed once.

@@ -66,7 +66,7 @@ def test_score_prints_exactly_one_json_object(workshop, forcegp):
 
 
 def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
-    words = ("score", "run", "test.h5", "--out", tmp_path / "out", "--report", tmp_path / "report.html")
+    words = ("score", "run", "test.h5", "--every", 8, "--out", tmp_path / "out", "--report", tmp_path / "report.html")
     done = forcegp(*words, folder=workshop)
     assert done.returncode == 0, done.stderr
     lines = re.findall(r"^\s*lbr_iiwa_joint_\d\s.*$", done.stdout, re.M)
@@ -77,7 +77,7 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert "contact normal rest on the prior alone" in told
     for name in ("prediction.png", "normal_force.png", "errors.png", "calibration.png"):
         assert (tmp_path / "out" / name).read_bytes().startswith(PNG)
-    assert json.loads((tmp_path / "out" / "results.json").read_text())["rows"] == 480
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["rows"] == 60
     assert "95 % intervals contain" in (tmp_path / "report.html").read_text()
     again = forcegp(*words, folder=workshop)
     assert (again.returncode, again.stdout) == (2, "")
@@ -104,7 +104,7 @@ def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch, capfd):
         assert any(warning.startswith(f"{name}: the search") for warning in warnings)
         assert 0 < model["fit"]["wall_seconds"] < results["wall_seconds"]
         assert len(load_posterior(tmp_path / model["run"]).likelihood.training.q) == 12
-    assert (tmp_path / "demo" / "prediction.png").read_bytes().startswith(PNG)
+    assert "95 % intervals contain" in (tmp_path / "demo" / "report.html").read_text()
     assert [entry.name for entry in tmp_path.iterdir()] == ["demo"]
 
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""`forcegp demo`: simulate, learn, score and draw, in one go."""
+"""`forcegp demo`: simulate, learn, score and report, in one go."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import forcegp.simulation
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import Command
 from forcegp.cli.fit import fit_summary
-from forcegp.cli.score import NORMAL_FORCES, comparison, draw
+from forcegp.cli.score import NORMAL_FORCES, comparison
 from forcegp.cli.simulate import simulate_with_progress
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
@@ -37,7 +37,7 @@ class Demo(Command):
     """A robot arm slides its tool on a surface, and a model learns the friction of the tool.
 
     Simulates a training and a test trajectory, and fits the model of the paper (Rath, Geist, Trimpe 2021) without and
-    with its analytical mean. Scores both on the other trajectory, draws pictures, and keeps everything in one folder.
+    with its analytical mean. Scores both on the other trajectory, writes a report, and keeps everything in one folder.
 
     For example:
       forcegp demo --out demo --points 100
@@ -81,7 +81,6 @@ class Demo(Command):
             for warning in scores.warnings:
                 terminal.warn(warning)
             best = models["S-GP + analytical mean"]
-            terminal.note(f"drew {', '.join(draw(terminal, folder, best, test))}")
             results: dict[str, Any] = {
                 "out": str(self.out),
                 "seeds": seeds,
@@ -98,7 +97,7 @@ class Demo(Command):
         terminal.show(
             *comparison(scores, title),
             f"Contact force: {NORMAL_FORCES}.",
-            f"Models, data, pictures and results.json are in {self.out}. Open the report:",
+            f"Models, data and results.json are in {self.out}. Open the report:",
             f"  {self.out}/report.html",
             sentence,
         )

@@ -40,7 +40,7 @@ Every command has --help, --json and --debug, and writes its lists with commas, 
 
 COMMANDS: Mapping[str, str] = {
     "auto": "go from logs and a URDF to a validated model, in one command",
-    "demo": "simulate, learn, score and draw, in a minute",
+    "demo": "simulate, learn, score and report, in a minute",
     "simulate": "make a dataset with ground truth",
     "import": "make a dataset from logs (CSV, ROS bags, ...), and filter it",
     "robot": "show a robot file: tree, limits, masses, repairs, and a picture",
