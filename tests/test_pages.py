@@ -204,6 +204,7 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+@pytest.mark.nightly
 def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -25,6 +25,7 @@ def real_logs(repository: Path) -> Path:
     return folder
 
 
+@pytest.mark.nightly
 def test_raw_positions_of_a_real_pendulum_teach_its_dynamics(real_logs):
     rig = multiarm(real_logs)
     few = replace(rig, test=rig.test.select_episodes(rig.test.episodes[:3]))

@@ -17,6 +17,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.nightly
 def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
     for jobs in ("1", "2"):
         done = forcegp(*FIT, "--jobs", jobs, "--out", jobs, "--json", folder=folder)

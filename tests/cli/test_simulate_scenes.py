@@ -26,6 +26,7 @@ def test_free_arms_need_no_other_library(forcegp, tmp_path, arm):
     assert "lugre" in refused.stderr
 
 
+@pytest.mark.nightly
 def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     made = forcegp("simulate", "quadruped", "--seconds", 0.5, "--seed", 3, "--out", "log.h5", "--json", folder=tmp_path)
     assert made.returncode == 0, made.stderr

@@ -89,6 +89,7 @@ def test_a_law_comes_back_from_plain_numbers():
     assert AirLaw.from_dict(law.to_dict()) == law
 
 
+@pytest.mark.nightly
 def test_the_mean_wind_of_a_simulated_flight_in_gusts():
     dataset = simulate_quadrotor(QuadrotorConfig(seconds=10.0, seed=3, episodes=2, wind=6.0, lag=0.04))
     _, found = find_wind(dataset)

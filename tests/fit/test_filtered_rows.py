@@ -27,7 +27,7 @@ def filtered(rows: int = 480, seed: int = 0, cutoff: float | None = CUTOFF) -> D
     q, v, u = (gaussian_filter1d(draw.normal(size=(rows, 3)), 12.0, axis=0) * size for size in (3.0, 4.0, 8.0))
     a = model.dynamics(tensor(q), tensor(v), tensor(u)).acceleration(tensor(0.0 * q)).numpy()
     errors = gaussian_filter1d(draw.normal(size=(rows, 3)), 5.0, axis=0)
-    metadata = {} if cutoff is None else {"preparation": {"cutoff": cutoff}}
+    metadata = {} if cutoff is None else {"preparation": {"cutoff": cutoff, "why": {}, "rows": {}}}
     return Dataset(q=q, v=v, u=u, a=a + 0.5 * errors / errors.std(axis=0), time=time, model=model, metadata=metadata)
 
 

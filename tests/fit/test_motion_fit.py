@@ -11,11 +11,11 @@ from tests.posterior.arm import arm_data, arm_model
 from forcegp import Dataset, JointFriction, Model, Robot, load_posterior, save_posterior
 from forcegp.data.motion_records import all_motions, recorded_motions
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.evidence import Motions
+from forcegp.evidence import Motions, Torques
 from forcegp.fit import fit as fit_model
 from forcegp.fit.motion_fit import MotionFit
 from forcegp.fit.motion_unknowns import Unknowns
-from forcegp.forces import Actuation, Coulomb, JointForces, RigidBodies, Rotor, Viscous
+from forcegp.forces import Actuation, Coulomb, JointForces, Normal, RigidBodies, Rotor, Viscous
 from forcegp.noise import Noise
 
 URDF = """<robot name="slide"><link name="base"/><link name="cart"><inertial><mass value="5"/>
@@ -106,6 +106,16 @@ def test_friction_is_recovered_from_positions(along_the_law):
     assert float(named[Viscous].damping) == found["viscous.x"].value
     assert after.model.robot.link("cart").mass == 5.0
     assert float(before.model.forces[2].damping) == 1.0  # the one that was given stays as it is
+
+
+def test_a_number_that_a_prior_knows_stays(along_the_law):
+    """Both evidence in one fit: a standard deviation of 0 holds a number in all of it."""
+    model = slide(1.0, 1.0).with_forces(Viscous(Normal(2.0, 0.0)), Coulomb())
+    found = fit_model(model, along_the_law, (Torques(), Motions(1.0, bodies=False)))
+    named = {type(force): force for force in found.model.forces}
+    assert float(named[Viscous].values["damping"]) == 2.0
+    assert "viscous.x" not in found.parameters
+    assert found.parameters["coulomb.level.x"].value > 4.0
 
 
 def test_inertias_are_found_as_well(along_the_law):

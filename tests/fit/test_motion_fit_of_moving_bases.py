@@ -58,6 +58,7 @@ def test_derivatives_in_every_unknown_and_start(switched):
         torch.testing.assert_close(in_x[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
 
 
+@pytest.mark.nightly
 def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
     given = floating_arm.satellite(0.1, 0.2, mass=7.0)
     log = floating_arm.recording(1, 2.0, given, bump=0.0)

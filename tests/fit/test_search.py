@@ -34,6 +34,7 @@ def from_place(index, before=(), progress=None, *, options, places=(0.5, 4.5, 5.
 @pytest.mark.parametrize(
     ("model", "fraction"), [(lambda model: model.with_forces(JointForces()), 0.8), (Model.black_box, 0.7)]
 )
+@pytest.mark.nightly
 def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
     """With 154 parameters of seven joints less than half (docs/benchmarks/performance.md); here there are 30."""
     fast = fit(model(train.model), train, seed=1)

@@ -113,12 +113,19 @@ def test_ctrl_c_ends_the_run_and_its_processes(tmp_path):
     (tmp_path / "script.py").write_text(script)  # without a guard of __main__, as users write it
     paths = [str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    run = subprocess.Popen([sys.executable, tmp_path / "script.py"], env=environment, stderr=subprocess.PIPE, text=True)
+    run = subprocess.Popen(
+        [sys.executable, tmp_path / "script.py"],
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        # where the tests run in the background, their children inherit that Ctrl-C is ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     while len(begun := [file for file in tmp_path.glob("[0-9]") if file.read_text()]) < 2:
         assert run.poll() is None
         time.sleep(0.05)
     run.send_signal(signal.SIGINT)
-    _, told = run.communicate(timeout=300)
+    _, told = run.communicate(timeout=60)
     assert told.splitlines()[-1] == "KeyboardInterrupt"
     assert "Exception in thread" not in told
     assert not any(psutil.pid_exists(int(file.read_text())) for file in begun)

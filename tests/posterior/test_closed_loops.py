@@ -78,6 +78,7 @@ def test_motions_stay_closed_and_stored_models_are_the_same(model, dataset, post
 
 
 @pytest.mark.parametrize("kind", ["point", "frame"])
+@pytest.mark.nightly
 def test_compiled_predictions_are_the_same(posterior, dataset, kind):
     """With the frames of one link and the world held, six rows are more than the three joints."""
     if kind == "frame":

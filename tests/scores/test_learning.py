@@ -80,6 +80,7 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
         named_model(drones[0], ("gp:aerodynamic", "gp:joint-friction"))
 
 
+@pytest.mark.nightly
 def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):
     model = bare.with_forces(JointFriction(), noise=Noise(0.5))
     fitted = fit(model, log, restarts=1)

@@ -369,10 +369,12 @@ def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
                     low, high = low / size, high / size
                 else:
                     low, high = low / coefficient.factor, high / coefficient.factor
-                center, start, spread = np.zeros_like(size), np.ones_like(size), np.full_like(size, LINEAR_SPREAD)
+                center, spread = np.zeros_like(size), np.full_like(size, LINEAR_SPREAD)
+                start = of(coefficient.default) / size if coefficient.default else np.ones_like(size)
                 if isinstance(given, Normal):
                     center = start = of(given.mean) / size
-                    spread = spread if given.std is None else of(given.std) / size
+                    std = of(np.nan if given.std is None else given.std) / size
+                    spread = np.where(np.isnan(std), spread, std)
             open_ = spread > 0.0
             start = np.clip(start, low, high)
             size, start, center, spread, low, high = (x[open_] for x in (size, start, center, spread, low, high))

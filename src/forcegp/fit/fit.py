@@ -155,7 +155,7 @@ def fit(
     if refinement is None:
         return posterior
     report = None if progress is None else partial(progress, ALL_ROWS)
-    return refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, report)
+    return refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, report, model)
 
 
 def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start: Any) -> tuple[Any, Motions | None]:

@@ -37,6 +37,7 @@ from forcegp.fit.motion_unknowns import SCALES, Unknowns
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.engines import InducingWeights
 from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
+from forcegp.model import Model
 from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 from forcegp.posterior.observed_wrench import in_own_air, require_unobserved, unobserved
@@ -261,10 +262,16 @@ class MotionFit:
 
 @torch.no_grad()
 def refine_on_motions(
-    posterior: Posterior, dataset: Dataset, seconds: float, bodies: bool, report: Report | None = None
+    posterior: Posterior,
+    dataset: Dataset,
+    seconds: float,
+    bodies: bool,
+    report: Report | None = None,
+    stated: Model | None = None,
 ) -> Posterior:
     """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
 
+    Numbers that the laws of a model that is `stated` know by a standard deviation of 0 stay.
     `report(step, rms of q in rad or m)` is called after each step. Where a base moves, errors of positions are steps in
     its axes. Observed wind counts as known. Raises InvalidInput for models without physics, windows that no episode has
     room for and uneven steps, NumericalError where no motion is found near the recorded one.
@@ -280,7 +287,7 @@ def refine_on_motions(
         assert seen.model is not None, "it was given one"
         posterior = posterior.with_model(seen.model)
     recorded, stride = all_motions(seen, seconds, STEP)
-    unknowns = Unknowns.of(posterior, seen, bodies)
+    unknowns = Unknowns.of(posterior, seen, bodies, stated)
     done = 0
 
     def say(rms: float) -> None:

@@ -41,12 +41,16 @@ class Unknowns:
     """Standard deviation of the weights of each latent a priori, over that of its kernel."""
 
     @classmethod
-    def of(cls, posterior: Posterior, dataset: Dataset, bodies: bool) -> "Unknowns":
-        """Laws of the joints that the model lists, bodies where asked for, inducing points of its functions."""
+    def of(cls, posterior: Posterior, dataset: Dataset, bodies: bool, stated: Model | None = None) -> "Unknowns":
+        """Laws of the joints that the model lists, bodies where asked for, inducing points of its functions.
+
+        Numbers that the laws of `stated` know by a standard deviation of 0 stay.
+        """
+        given = {} if stated is None else {type(law): law for law in stated.laws}
         robot, _ = thickened(posterior.model.robot)
         model = posterior.model.with_robot(robot) if bodies else posterior.model
         forces = [
-            force.open() if isinstance(force, JointLaw)
+            force.open(given.get(type(force))) if isinstance(force, JointLaw)
             else replace(force, learn="all" if bodies else ()) if isinstance(force, RigidBodies)
             else force
             for force in model.forces

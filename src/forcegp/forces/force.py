@@ -174,9 +174,20 @@ class Law(Force):
         """The same law with these coefficients, which are known then."""
         return replace(self, **values)  # type: ignore[type-var]  # laws are dataclasses
 
-    def open(self: AnyLaw) -> AnyLaw:
-        """The same law with all coefficients to be estimated, from the values that they have."""
-        return self.with_values({name: Normal(value) for name, value in self.values.items()})  # type: ignore[arg-type]
+    def open(self: AnyLaw, stated: AnyLaw | None = None) -> AnyLaw:
+        """The same law with all coefficients to be estimated, from the values that they have.
+
+        But those which a law that was `stated` knows by a standard deviation of 0.
+        """
+        opened = {}
+        for name, value in self.values.items():
+            given = None if stated is None else getattr(stated, name)
+            std = None
+            if isinstance(given, Normal) and given.std is not None:
+                std = torch.as_tensor(given.std, dtype=torch.float64)
+                std = torch.where(std == 0.0, 0.0, torch.nan)
+            opened[name] = Normal(value, std)
+        return self.with_values(opened)
 
     def unit(self, name: str, joint: str, robot: Robot) -> str:
         """Of a coefficient, at a joint that turns or slides."""

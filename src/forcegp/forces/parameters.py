@@ -61,7 +61,7 @@ def joint_unit(unit: str, slides: bool) -> str:
 class Normal:
     """A number to be estimated, around `mean`; `std` of None is a weak prior: ten times its typical size in a log.
 
-    Both are one number, one per joint, or by joint name. Where std is 0 the number is known.
+    Both are one number, one per joint, or by joint name. Where std is 0 the number is known, where nan the prior weak.
     """
 
     mean: Any = 0.0
