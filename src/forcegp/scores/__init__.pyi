@@ -9,10 +9,7 @@ from .doubts import (
 from .figures.contacts import contacts_figure as contacts_figure
 from .figures.excitation import excitation_figure as excitation_figure
 from .figures.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
-from .figures.friction_margins import (
-    friction_margins_figure as friction_margins_figure, slip_scores as slip_scores,
-)
-from .figures.log import check_figure as check_figure, preparation_figure as preparation_figure
+from .figures.log import check_figure as check_figure
 from .figures.motion_bands import motion_bands_figure as motion_bands_figure
 from .figures.of_model import model_figures as model_figures
 from .figures.prediction import (
