@@ -1,17 +1,14 @@
 """Sentences that belong beside the scores of a model: what a reader would have to find out otherwise."""
 
 import json
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Int
-from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, TRUE_ACCELERATION, Table
@@ -158,35 +155,16 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
         dynamics = posterior.trained.dynamics(q, v, u)
         forces = posterior.trained.unknown
         B, features = forces.direction(dynamics), forces.features(dynamics)
-        pressing = dynamics.multiplier_map().matrix @ B
-        return any(_presses_unseen((dynamics.H @ B)[..., which], pressing[..., which]) for which in _groups(features))
-
-
-def _groups(features: tuple[Tensor, ...]) -> list[list[int]]:
-    """Numbers of the processes that have the same inputs."""
-    groups: dict[int, list[int]] = {}
-    for index, z in enumerate(features):
-        constant = bool((z == z[:1]).all())  # also without any feature
-        first = next((k for k in groups if not constant and torch.equal(features[k], z)), index)
-        groups.setdefault(first, []).append(index)
-    return list(groups.values())
-
-
-def _presses_unseen(moving: Tensor, pressing: Tensor) -> bool:
-    """Whether the null space of `moving` (rows, nv, k) changes lambda through `pressing` (rows, m, k)."""
-    _, sizes, rows = torch.linalg.svd(moving)
-    largest = sizes[..., :1]
-    padded = torch.cat([sizes, sizes.new_zeros(*sizes.shape[:-1], rows.shape[-1] - sizes.shape[-1])], dim=-1)
-    unseen = (padded <= INVISIBLE * largest)[..., None] * rows
-    effect = pressing @ unseen.mT
-    return bool((effect.abs().amax((-2, -1)) > INVISIBLE * pressing.abs().amax((-2, -1))).any())
-
-
-TRIED_ROWS = 200
-"""Rows on which both systems are tried before one is advised."""
-
-WORTH_MOVING = 0.9
-"""Error in the system of the data over that in the model's own, below which the model is worth carrying over."""
+        moving, pressing = dynamics.H @ B, dynamics.multiplier_map().matrix @ B
+        for z in features:
+            alike = [k for k, other in enumerate(features) if torch.equal(z, other)]
+            if (z == z[:1]).all():  # constant, also without any feature
+                alike = alike[:1]
+            here, there = moving[..., alike], pressing[..., alike]
+            unseen = torch.eye(len(alike)).to(B) - torch.linalg.pinv(here, rtol=INVISIBLE) @ here
+            if ((there @ unseen).abs().amax((-2, -1)) > INVISIBLE * there.abs().amax((-2, -1))).any():
+                return True
+    return False
 
 
 def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
@@ -214,50 +192,13 @@ def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
                 f"training and test rows come from the same recording (equal metadata, episodes {shared} in both), "
                 "so these scores flatter the model; test on another trajectory."
             )
-    yield from system_warnings(posterior, dataset)
-
-
-def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
-    """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy.
-
-    A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
-    data more than those of another recording: whether to carry the model over is decided by some rows, not by a rule.
-    """
     own, model = dataset.model, posterior.model
-    if own is None or posterior.is_black_box:  # which has no contacts, and can be carried nowhere
-        return
-    contacts = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
-    # inertias that were identified are meant to differ from those that the data came with
-    robots = not posterior.parameters and not own.robot.tree.equals(model.robot.tree)
-    if not contacts and not robots:
-        return
-    what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
-    are, those = ("are", "those") if contacts else ("is", "that")
-    sentence = f"the {what} of the model {are} not {those} of the data"
-    sentence += f"; the constraint error is measured on {those} of the data" if contacts else ""
-    errors = _errors_here_and_there(posterior, dataset, own)
-    if errors is not None and errors[1] < WORTH_MOVING * errors[0]:
-        sentence += f"; carried over to them, the error of its mean is {errors[1]:.3g} instead of {errors[0]:.3g} on "
-        sentence += "some of these rows: `posterior.with_model(dataset.model)`"
-    elif errors is not None:
-        sentence += f"; it stays as it is, for carried over to them its error would be {errors[1]:.3g} instead of "
-        sentence += f"{errors[0]:.3g}"
-    if contacts or errors is None or errors[1] < WORTH_MOVING * errors[0]:
-        yield sentence  # else a robot that serves these data better than theirs was identified
-
-
-def _errors_here_and_there(posterior: Posterior, dataset: Dataset, model: Model) -> tuple[float, float] | None:
-    """Errors of the mean on some rows as it is and carried over to that model; None where it cannot be."""
-    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
-    try:
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            each = posterior, posterior.with_model(moved_model(posterior, model))
-            means = [one.predict(rows.q, rows.v, rows.u, covariance=False).mean for one in each]
-    except ForceGPError:
-        return None
-    here, there = (float(np.abs(mean.cpu().numpy() - rows.a).mean()) for mean in means)
-    return here, there
+    differ = own is not None and (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
+    if differ and not posterior.is_black_box:  # which has no contacts, and can be carried nowhere
+        yield (
+            "the contacts of the model are not those of the data, on which the constraint error is measured; predict "
+            "under them with `posterior.with_model(dataset.model)`"
+        )
 
 
 def moved_model(posterior: Posterior, model: Model) -> Model:

@@ -60,10 +60,3 @@ def interval_coverage(mean: Columns, variance: Columns, target: Columns, level: 
     if not 0.0 < level < 1.0:
         raise InvalidInput(f"level is {level}; it must be between 0 and 1, for example 0.95.")
     return (np.abs(target - mean) <= ndtri(0.5 + 0.5 * level) * np.sqrt(variance)).mean(axis=0)
-
-
-def constraint_residual(
-    A: Float[np.ndarray, "rows m nv"], b: Float[np.ndarray, "rows m"], a: Float[np.ndarray, "rows nv"]
-) -> Float[np.ndarray, "rows m"]:
-    """A a - b of every row and contact [m/s^2 for surfaces that are signed distances]."""
-    return (A @ a[..., None])[..., 0] - b
