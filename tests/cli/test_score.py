@@ -156,7 +156,7 @@ WRONG = [
     (f"score log.h5 {OUT} --seeds 0", "number of seeds is 0"),
     (f"score log.h5 {OUT} --horizon soon", "'soon' is no list of numbers"),
     (f"score log.h5 {OUT} --forces given --forces given", "named twice"),
-    (f"score log.h5 {OUT} --forces identifed", "did you mean 'identified'"),
+    (f"score log.h5 {OUT} --forces identifed", "give given, identified or FORCES"),
     (f"score log.h5 {OUT} --identification magic", "no force 'magic'"),
     ("score log.h5 --out log.h5", "log.h5 would be written over log.h5"),
 ]

@@ -172,13 +172,12 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
         ((), {}, "no model is named"),
         (("given", "given"), {}, "named twice"),
         ("given", {}, "models is a str"),
-        (("identifed",), {}, "did you mean 'identified'"),
+        (("identifed",), {}, "give given, identified or"),
         (("gp:joint@measured",), {}, "no evidence 'measured'"),
         (("gp:joint:colour=red",), {}, "cannot take 'colour=red'"),
         (("identified+viscous",), {}, "`identified` has its laws already"),
         (("given@motions:1",), {}, "nothing to refine on motions"),
         (("given",), {"seeds": 0}, "number of seeds is 0"),
-        (("given",), {"margin": 1.0}, "the margin is 1"),
         (("given",), {"points": 1000}, "two thirds"),
         (("given",), {"horizons": (0.0,)}, "horizons are"),
         (("given",), {"horizons": (7.0,)}, "Give shorter ones"),
@@ -188,7 +187,7 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
         (("given",), {"identification": "guessing"}, "no force 'guessing'"),
         (("given",), {"identification": "gp:joint"}, "nothing to identify, or unknown forces"),
         (("given",), {"identification": "viscous@windows:.1"}, "from windows; give accelerations or torques"),
-        (("given",), {"split": "episodes:7"}, "no episode or log is called so"),
+        (("given",), {"split": "episodes:7"}, "held-out episodes are"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_is_written(data, tmp_path, models, changes, message):

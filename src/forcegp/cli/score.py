@@ -81,8 +81,6 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
     """How motions are predicted: rk4, symplectic-euler (as PyBullet), implicit-midpoint (stiff friction), projected
     (contacts hold exactly)."""
-    margin: Annotated[float, arg(metavar="RATIO")] = 0.02
-    """Models whose errors differ by less count as equal."""
     restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
     """Starts of every search for hyper-parameters; the best is kept."""
     iterations: Annotated[int | None, unless_given("N", "200", int)] = None
@@ -137,7 +135,6 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
                 model=model,
                 recording=recording,
                 seeds=self.seeds,
-                margin=self.margin,
                 jobs=self.jobs,
                 source=source,
                 overwrite=self.overwrite,

@@ -1,6 +1,6 @@
 from .row_selection import (
     time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
-    require_disjoint as require_disjoint,
+    repeated_rows as repeated_rows, require_disjoint as require_disjoint,
 )
 from .contact_evidence import (
     contact_rows as contact_rows, rows_in_contact as rows_in_contact, contact_doubts as contact_doubts,

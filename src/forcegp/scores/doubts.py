@@ -2,17 +2,13 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Int
 
-from forcegp.data import Dataset
-from forcegp.model import Model
+from forcegp.data import Dataset, repeated_rows
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, TRUE_ACCELERATION, Table
-from forcegp.scores.predicted_rows import stated_noise_level
 from forcegp.summary import listed
 
 WORSE = 1.01
@@ -35,9 +31,6 @@ all joints (a joint that is held in its posture moves little, and a little more 
 
 MOST_OUTSIDE = 0.01
 """Share of the rows that may lie further outside."""
-
-NOISE_FACTOR = 1.5
-"""Noise levels of model and Dataset that differ by more than this factor are named."""
 
 
 def unfinished_search(posterior: Posterior) -> Iterator[str]:
@@ -86,15 +79,11 @@ def poor_scores(posterior: Posterior, dataset: Dataset, table: Table) -> Iterato
         f"{names[joint]} {mine[joint]:.3g} against {alone[joint]:.3g}"
         for joint in sorted(np.flatnonzero(worse), key=lambda joint: alone[joint] / mine[joint])
     ]
-    if mine.mean() > WORSE * alone.mean():
+    if places or mine.mean() > WORSE * alone.mean():
+        where = f" at {len(places)} of {len(names)} joints, {listed(places)}" if places else ""
         yield (
-            f"the model is worse here than its known forces alone ({what} {mine.mean():.3g} against "
-            f"{alone.mean():.3g}): do not use it for motions like these"
-        )
-    elif places:
-        yield (
-            f"the model is better here than its known forces alone on average, but worse at {len(places)} of "
-            f"{len(names)} joints ({what}: {listed(places)}): do not use it for these"
+            f"the model is worse here than its known forces alone{where} ({what} {mine.mean():.3g} against "
+            f"{alone.mean():.3g} on average): do not use it for motions like these"
         )
     least = 0.95 - max(MISSED, CHANCE * (0.95 * 0.05 / len(dataset)) ** 0.5)
     for quantity, what in ((ACCELERATION, "measurements"), (TRUE_ACCELERATION, "true accelerations")):
@@ -115,21 +104,6 @@ def doubts(posterior: Posterior, dataset: Dataset, table: Table) -> tuple[str, .
     """All of them, for the scores of this model on this dataset."""
     poor = poor_scores(posterior, dataset, table)
     return (*unfinished_search(posterior), *rows_outside(posterior, dataset), *poor)
-
-
-def noise_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
-    """A sentence if model and Dataset disagree about the noise of some joint by more than NOISE_FACTOR."""
-    stated = stated_noise_level(posterior, dataset)
-    if stated is None:
-        return
-    model = posterior.noise_std.detach().cpu().numpy()
-    ratio = np.maximum(model / stated, stated / model)
-    joint = int(ratio.argmax())
-    if ratio[joint] > NOISE_FACTOR:
-        yield (
-            f"the noise std of the model is {model[joint]:.3g}, that of the data {stated[joint]:.3g} "
-            f"(joint {dataset.joint_names[joint]}, where they differ most); coverage and NLPD use the larger one."
-        )
 
 
 STATES = 20
@@ -167,17 +141,10 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
     return False
 
 
-def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
-    """Numbers of the rows of `dataset` whose (q, v, u) is exactly that of a training point."""
-    training = posterior.training
-    trained = {row.tobytes() for row in _inputs(*(getattr(training, name).cpu().numpy() for name in ("q", "v", "u")))}
-    rows = _inputs(dataset.q, dataset.v, dataset.u)
-    return np.array([number for number, row in enumerate(rows) if row.tobytes() in trained], dtype=np.int64)
-
-
 def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
-    repeated = shared_rows(posterior, dataset)
+    q, v, u = (getattr(posterior.training, name).cpu().numpy() for name in "qvu")
+    repeated = repeated_rows((q, v, u), dataset)
     if repeated.size:
         yield (
             f"{repeated.size} of {len(dataset)} test rows have the very (q, v, u) of training rows (the first: row "
@@ -199,14 +166,3 @@ def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
             "the contacts of the model are not those of the data, on which the constraint error is measured; predict "
             "under them with `posterior.with_model(dataset.model)`"
         )
-
-
-def moved_model(posterior: Posterior, model: Model) -> Model:
-    """The system of other data, with the robot and known forces of a model that has identified them."""
-    if not posterior.parameters:
-        return model
-    return replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
-
-
-def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.hstack([q, v, u]) + 0.0  # + 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes

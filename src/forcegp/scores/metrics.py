@@ -13,16 +13,6 @@ PerColumn = Float[np.ndarray, " k"]
 LOG_2_PI = float(np.log(2.0 * np.pi))
 
 
-def mean_absolute_error(predicted: Columns, target: Columns) -> PerColumn:
-    """Mean of |predicted - target| over the rows, in the units of the columns."""
-    return np.abs(predicted - target).mean(axis=0)
-
-
-def root_mean_square_error(predicted: Columns, target: Columns) -> PerColumn:
-    """Root of the mean of (predicted - target)^2 over the rows, in the units of the columns."""
-    return np.sqrt(np.square(predicted - target).mean(axis=0))
-
-
 def negative_log_density(
     mean: Columns, covariance: Float[np.ndarray, "rows k k"], target: Columns
 ) -> Float[np.ndarray, " rows"]:

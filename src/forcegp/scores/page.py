@@ -9,7 +9,7 @@ import numpy as np
 
 from forcegp.data import Preparation, preparation_report
 from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE
-from forcegp.scores.paired import CRITERIA, PairedDifference
+from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference
 from forcegp.scores.scores import Scores
 from forcegp.scores.tables import formatted, markdown_table, number, rendered
 
@@ -36,7 +36,7 @@ def page(scores: Scores, figures: Collection[str] = ()) -> str:
     return rendered(
         Path(__file__).with_name("report.md.jinja"),
         **{"source": {}, "preparation": [], "splits": [], "configuration": {}, **scores.about, "notes": notes},
-        margin=scores.margin,
+        margin=MARGIN,
         taken=[[CRITERIA[name], f"**{each['model']}**", each["why"]] for name, each in scores.winners.items()],
         rival=scores.rival,
         differences=differences,

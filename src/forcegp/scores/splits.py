@@ -69,14 +69,12 @@ class Split:
 
     def training_rows(self, dataset: Dataset) -> Bool[np.ndarray, " rows"]:
         """Which rows may be learned from: not held out, and not within the guard."""
-        return ~(self.test_rows(dataset) | self._near(dataset, self.guard))
+        return ~self._near(dataset, self.guard)
 
     def _near(self, dataset: Dataset, margin: float) -> Bool[np.ndarray, " rows"]:
         inside = np.zeros(len(dataset), dtype=bool)
         for stretch in self.held_out:
-            after, before = dataset.time >= stretch.begin, dataset.time < stretch.end
-            if margin > 0.0:
-                after, before = dataset.time > stretch.begin - margin, dataset.time < stretch.end + margin
+            after, before = dataset.time >= stretch.begin - margin, dataset.time < stretch.end + margin
             inside |= (dataset.episode == stretch.episode) & after & before
         return inside
 

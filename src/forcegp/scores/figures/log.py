@@ -89,14 +89,13 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
     rows = log.applied(shown)
     tau = inverse_dynamics(log.robot, rows)
     measured, fitted = rows.u[:, joint], log.fit.at(log.robot, tau, rows)[:, joint]
-    mended = not np.array_equal(rows.u[:, joint], shown.u[:, joint])
-    if mended:
+    if not np.array_equal(measured, shown.u[:, joint]):
         style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")
     style.draw_line(axes, rows.time, measured, style.MEASUREMENT, 2.2, "measured, filtered")
     style.draw_line(axes, rows.time, tau[:, joint], style.TRUTH, 0.8, "inverse dynamics", linestyle=":")
     dashed = {"label": "with factor, armature, friction", "linestyle": style.DASHED}
     style.draw_line(axes, rows.time, fitted, style.PREDICTION, 1.1, **dashed)
-    drawn = [measured, fitted, *([shown.u[:, joint]] if mended else [])]
+    drawn = measured, fitted, shown.u[:, joint]
     low, high = min(values.min() for values in drawn), max(values.max() for values in drawn)
     space = 0.3 * max(float(high - low), 1e-9)
     axes.set_ylim(low - space, high + space)  # inverse dynamics alone may be far off: for example with a wrong unit
