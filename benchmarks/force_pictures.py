@@ -115,8 +115,7 @@ def joint_forces() -> Any:
 def joint_friction() -> Any:
     data = recording(1, surface="none", joint_friction="stribeck")
     posterior = fitted(data, JointFriction(), 100)
-    joints = [f"lbr_iiwa_joint_{number}" for number in (1, 2, 4)]
-    return friction_curves_figure(posterior, recording(2, surface="none", joint_friction="stribeck"), latents=joints)
+    return friction_curves_figure(posterior, recording(2, surface="none", joint_friction="stribeck"))
 
 
 def tool_forces() -> Any:

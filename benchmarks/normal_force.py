@@ -3,7 +3,6 @@
 `kuka-surface` with Stribeck friction at the tool, in proportion to the load (PyBullet at 240 Hz, ideal contact). The
 tool follows the motion of another recording of the scenario for 8 s and presses with 15 N; gains omega = 10. Errors
 after the first second: root mean square of the normal force, and of the tool's distance to its path. The model learns
-from forcegp.forces import parse_forces
 from 100 rows of 40 s of the scenario's own motion (`load-friction`, analytical mean); of the same rows least squares
 finds a law with two numbers, mu = c + d s of the speed s. "noise": the controller reads positions with noise of 0.1
 mrad and velocities with 2 mrad/s. Five seeds, medians.
@@ -22,6 +21,7 @@ from scipy.optimize import least_squares
 
 from forcegp import Dataset, HybridForce, KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.data import farthest_rows
+from forcegp.forces import parse_forces
 from forcegp.posterior.predictor import Predictor
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import IdealContact

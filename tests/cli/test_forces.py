@@ -75,11 +75,11 @@ def test_the_table_tells_errors_of_forces_and_what_the_normal_force_rests_on(arm
     assert "forces along the contact normal rest on the prior alone" in " ".join(done.stdout.split())
 
 
-def test_another_robot_and_contact_are_named_with_the_remedy_and_the_remedy_helps(arm, forcegp):
+def test_another_contact_is_named_with_the_remedy_and_the_remedy_helps(arm, forcegp):
     default = forcegp("score", "run", "other.h5", "--json", folder=arm)
     assert default.returncode == 0, default.stderr
     (warning,) = [each for each in json.loads(default.stdout)["warnings"] if "not those of the data" in each]
-    assert warning.startswith("the contacts and robot of the model are not those of the data")
+    assert warning.startswith("the contacts of the model are not those of the data")
     assert "--system data" in warning
     assert [line for line in default.stderr.splitlines() if "--system data" in line] == [f"warning: {warning}"]
 

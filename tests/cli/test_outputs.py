@@ -27,7 +27,6 @@ FILES = {
     "prepare": "import arm.h5 --every 2 --overwrite --out OUT",
 }
 FOLDERS = {
-    "spectra": "import arm.h5 --every 2 --overwrite --out x.h5 --plots OUT",
     "fit": "fit arm.h5 --overwrite --out OUT",
     "payload": "payload arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
@@ -39,7 +38,6 @@ STORES = {
     "reproduce": "reproduce fig2b --out OUT",
     "docs": "reproduce fig2b --out runs --docs OUT",
 }
-KINDS = {"spectra": "forcegp import"}
 COMMANDS = FILES | FOLDERS | STORES
 
 
@@ -124,7 +122,7 @@ def test_a_full_disk_is_noticed_before_the_work(folder, no_work, monkeypatch, ca
 def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypatch, capfd, name):
     monkeypatch.setattr(sys, "argv", [name])
     Path("out").mkdir()
-    kind = KINDS.get(name, f"forcegp {name}")
+    kind = f"forcegp {name}"
     Path("out/config.json").write_text(json.dumps({"kind": kind}))
     write_digests(Path("out"))
     Path("out/notes.txt").write_text("mine")
@@ -209,8 +207,6 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     [
         f"{IMPORT} --out x.h5 --write-mapping x.h5",
         f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
-        "import arm.h5 --every 2 --out x.h5 --plots x.h5",
-        "import arm.h5 --every 2 --out new/x.h5 --plots new",
         "reproduce fig2b --out x --docs x",
     ],
 )

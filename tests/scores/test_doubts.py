@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
-from tests.posterior.arm import NOISE, arm_data, arm_model
+from tests.posterior.arm import NOISE, arm_data
 
 from forcegp import score
 from forcegp.errors import DataWarning
@@ -89,34 +89,14 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
     names = data.joint_names
     found = scored(friction, dataclasses.replace(data, a=measured, truth={"a": a}))
     assert found.value("mae", TRUE) < found.value("known_physics_mae", TRUE)
-    (sentence,) = about(found.warnings, "worse at")
-    assert f"worse at 1 of {len(names)} joints (noise-free MAE: {names[0]} " in sentence
+    (sentence,) = about(found.warnings, "worse here than")
+    assert f"at 1 of {len(names)} joints, {names[0]} " in sentence
     noisy = data.a.copy()
     noisy[:, 2] += 2.0 * NOISE * np.random.default_rng(0).normal(size=len(noisy))
     found = scored(friction, dataclasses.replace(data, a=noisy))
     assert found.value("coverage_95") > 0.85
     (sentence,) = about(found.warnings, "95 % intervals")
     assert f"of the measurements ({names[2]} {found.columns('coverage_95')[2]:.0%}):" in sentence
-
-
-@pytest.mark.parametrize("identified", [True, False])
-def test_another_robot_is_advised_only_where_the_rows_bear_it_out(identified):
-    """The advice to take the robot of the data turned an error of .28 into 25 where the model's own was identified."""
-    true = arm_model().with_robot(arm_model().robot.with_armature(torch.tensor([0.4, 0.4, 0.4])))
-    data = {seed: arm_data(40, seed, true) for seed in (0, 1)}
-    mine, theirs = (true, arm_model()) if identified else (arm_model(), true)
-    train = dataclasses.replace(data[0], model=mine)
-    posterior = fit(mine.with_forces(JointFriction()), train, **QUICK)
-    test = dataclasses.replace(data[1], model=theirs)
-    sentences = about(scored(posterior, test).warnings, "robot of the model is not that of the data")
-    kept, moved = (scored(model, test).value("mae") for model in (posterior, posterior.with_model(theirs)))
-    if identified:
-        assert moved > 2.0 * kept
-        assert sentences == []
-    else:
-        (sentence,) = sentences
-        assert "`posterior.with_model(dataset.model)`" in sentence
-        assert f"{moved:.3g} instead of {kept:.3g}" in sentence
 
 
 def test_noise_that_nobody_stated_is_learned_and_said_so():
@@ -135,7 +115,7 @@ def test_noise_that_nobody_stated_is_learned_and_said_so():
 # ---------------------------------------------------------------- rows, noise and contacts that differ
 
 
-def test_a_larger_noise_of_the_data_counts_and_another_one_of_the_model_is_named(posterior, test_data):
+def test_a_larger_noise_of_the_data_counts(posterior, test_data):
     std = NOISE * np.array([1.0, 1.4, 3.0])  # the model's is NOISE
     noisier = dataclasses.replace(test_data, noise_std=std)
     predicted = predict_rows(posterior, noisier)
@@ -143,11 +123,6 @@ def test_a_larger_noise_of_the_data_counts_and_another_one_of_the_model_is_named
     prediction = posterior.predict(test_data.q[7], test_data.v[7], test_data.u[7])
     joint = multivariate_normal(prediction.mean.numpy(), prediction.covariance.numpy() + np.diag(std**2))
     assert predicted.negative_log_density[7] == pytest.approx(-joint.logpdf(test_data.a[7]), rel=1e-8)
-    (warning,) = about(scored(posterior, noisier).warnings, "noise std")
-    assert "the noise std of the model is 0.05, that of the data 0.15 (joint bend" in warning
-    for factor, named in ((0.7, 0), (1.4, 0), (0.6, 1)):
-        other = dataclasses.replace(test_data, noise_std=np.full(3, factor * NOISE))
-        assert len(about(scored(posterior, other).warnings, "noise std")) == named
 
 
 @pytest.mark.parametrize(("stated", "counts"), [((0.1, 2.0, 0.5), (1.0, 2.0, 1.0)), (None, (1.0, 1.0, 1.0))])

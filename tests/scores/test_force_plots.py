@@ -13,7 +13,7 @@ from tests.scores.friction import VISCOUS, fitted, friction_data, joint_law
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointFriction, PeriodicJointForces, ToolForces
+from forcegp.forces import ContactFriction, JointFriction, PeriodicJointForces
 from forcegp.scores import curve_panels, friction_curves_figure, normal_force_figure, save_figure
 
 
@@ -25,11 +25,6 @@ def data() -> Dataset:
 @pytest.fixture(scope="module")
 def friction():
     return fitted(JointFriction(), ContactFriction(kernel="linear"))
-
-
-@pytest.fixture(scope="module")
-def tool():
-    return fitted(ToolForces(kernel="linear"), iterations=20)
 
 
 def line(axes, label: str) -> tuple[np.ndarray, np.ndarray]:
@@ -57,8 +52,8 @@ def test_every_curve_has_a_panel_that_names_it_with_its_units(friction, data, tm
     assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed [m/s]", "force [N]")
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [
-        "learned",
         "95 % band",
+        "learned",
         "beyond the training data",
         "training velocities",
         "true",
@@ -111,19 +106,6 @@ def test_a_coefficient_is_the_true_force_per_true_load(data):
     assert set(np.round(coefficient, 9)) <= set(np.round(expected, 9))
 
 
-def test_tool_forces_are_slices_that_resist(tool, data):
-    figure = friction_curves_figure(tool, data)
-    for number, axes in enumerate(figure.axes):
-        velocity, mean = line(axes, "learned")
-        features = np.zeros((len(velocity), 2))
-        features[:, number] = velocity
-        np.testing.assert_allclose(mean, -tool.curve(f"force-tangent-{number + 1}", features).mean, atol=1e-9)
-        assert np.polyfit(velocity, mean, 1)[0] > 0.0  # resists
-        at, truth = line(axes, "true")
-        np.testing.assert_allclose(truth, VISCOUS * at, atol=1e-2)
-        assert axes.get_ylabel() == "resisting force [N]"
-
-
 def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, posterior, data):
     for given in (None, dataclasses.replace(data, truth={})):
         figure = friction_curves_figure(friction, given)
@@ -133,17 +115,12 @@ def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, 
         friction_curves_figure(posterior)
 
 
-def test_large_models_say_how_many_curves_are_shown_and_others_can_be_chosen(monkeypatch):
+def test_large_models_say_how_many_curves_are_shown(monkeypatch):
     model = fitted(JointFriction(), PeriodicJointForces(1.0), iterations=1)
     monkeypatch.setattr("forcegp.scores.figures.friction_curves.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
     assert len(figure.axes) == 2
     assert "2 of 6 curves" in figure.get_suptitle()
-    chosen = friction_curves_figure(model, latents=["periodic-joint-forces lift"])
-    assert [axes.get_title(loc="left") for axes in chosen.axes] == ["lift"]
-    assert chosen.get_suptitle().startswith("Forces")
-    with pytest.raises(InvalidInput, match="no curve"):
-        friction_curves_figure(model, latents=["nothing"])
 
 
 def test_the_normal_force_is_drawn_with_its_truth(friction, data, tmp_path):

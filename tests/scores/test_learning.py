@@ -19,7 +19,7 @@ from forcegp.mechanics import fixed_point
 from forcegp.noise import ACCELERATION
 from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots import Robot
-from forcegp.scores import choose_forces, named_model, summands, usual_forces
+from forcegp.scores import named_model, summands, usual_forces
 from forcegp.scores.candidates import candidates, default_models, usual_identification
 from forcegp.scores.learning import allowing_for_correlation, with_force_noise
 
@@ -34,35 +34,6 @@ def bare() -> Model:
     return replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies()))
 
 
-def test_friction_is_found_in_free_motion(log, bare):
-    chosen, why = choose_forces(log, bare)
-    assert chosen == "gp:joint-friction"
-    assert "gp:joint-friction in free motion; left-out stretches of" in why
-    assert "do not show gp:joint, gp:joint+gp:joint-friction to be better" in why
-
-
-def test_a_spring_is_no_friction(log, bare):
-    spring = replace(log, u=log.u + 30.0 * np.sin(4.0 * log.q) + 3.0 * log.v)
-    moved = replace(spring, a=log.a)
-    chosen, why = choose_forces(moved, bare)
-    assert chosen != "gp:joint-friction"
-    assert "better than gp:joint-friction, by" in why
-
-
-def test_an_identified_system_lacks_the_rest_of_its_friction(log):
-    chosen, why = choose_forces(log, slide(1.0, 1.0))
-    assert chosen == "gp:joint-friction"
-    assert "beside the friction laws" in why
-
-
-def test_in_contact_it_is_the_tool_and_too_few_rows_are_no_look():
-    model = arm_model(contacts=1)
-    assert usual_forces(model) == "gp:tool-friction"
-    chosen, why = choose_forces(arm_data(2, 0, model), model)
-    assert chosen == "gp:tool-friction"
-    assert "could not be compared with it" in why
-
-
 def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
     rotors = Actuation(), Thrusters("body", ((0.2, 0.0, 0.0), (-0.1, 0.2, 0.0), (-0.1, -0.2, 0.0))), RigidBodies()
     robots = [Robot.from_urdf_text(DRONE, base="floating", locked=locked) for locked in ({"tilt": 0.0}, {})]
@@ -71,6 +42,7 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
     walker = Model(limbs, fixed_point("a_foot", switch="a_stands"))
     rock = Model(robots[0], (), (RigidBodies(),))
     models = *drones, walker, rock
+    assert usual_forces(arm_model(contacts=1)) == "gp:tool-friction"
     found = [usual_forces(model) for model in models]
     assert found == ["gp:aerodynamic", "gp:joint-friction+gp:aerodynamic", "gp:joint-friction", "gp:joint"]
     for model, name in zip(models, found, strict=True):

@@ -1,4 +1,4 @@
-"""Models fitted once, with stretches of time left out in closed form; and the forces that are chosen by them."""
+"""Models fitted once, with stretches of time left out in closed form."""
 
 import dataclasses
 

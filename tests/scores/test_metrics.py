@@ -22,24 +22,6 @@ def gaussians(seed: int, rows: int = ROWS, k: int = K) -> tuple[np.ndarray, np.n
     return mean, covariance, target
 
 
-def test_errors_of_numbers_done_by_hand():
-    predicted, target = np.array([[0.0, 1.0], [2.0, 1.0]]), np.array([[1.0, 1.0], [-1.0, 3.0]])
-    np.testing.assert_allclose(metrics.mean_absolute_error(predicted, target), [2.0, 1.0])
-    np.testing.assert_allclose(metrics.root_mean_square_error(predicted, target), [np.sqrt(5.0), np.sqrt(2.0)])
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(-5.0, 5.0))
-def test_errors_obey_their_inequality_and_ignore_a_common_shift(seed, shift):
-    generator = np.random.default_rng(seed)
-    predicted, target = generator.normal(size=(2, 12, 3))
-    mae, rmse = metrics.mean_absolute_error(predicted, target), metrics.root_mean_square_error(predicted, target)
-    assert (mae <= rmse * (1 + 1e-12)).all()
-    np.testing.assert_allclose(metrics.mean_absolute_error(predicted + shift, target + shift), mae, atol=1e-12)
-    np.testing.assert_allclose(
-        rmse**2, (predicted - target).mean(axis=0) ** 2 + (predicted - target).var(axis=0), rtol=1e-10
-    )
-
-
 def test_joint_density_is_that_of_scipy():
     mean, covariance, target = gaussians(0)
     expected = [-multivariate_normal(m, S).logpdf(y) for m, S, y in zip(mean, covariance, target, strict=True)]

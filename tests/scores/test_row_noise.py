@@ -55,15 +55,6 @@ def test_a_model_whose_level_is_higher_counts_all_rows_as_noisier(posterior, une
     np.testing.assert_allclose(quieter.measurement_variance - quieter.variance, STATED**2, rtol=1e-7)
 
 
-def test_rows_may_be_quieter_on_the_whole_than_those_learned_from(uneven):
-    train = dataclasses.replace(arm_data(30, seed=0), noise_std=np.full((30, 3), NOISE))
-    fitted = fit(train.model.with_forces(JointForces()), train, restarts=1, options=QUICK)
-    quiet = dataclasses.replace(uneven, noise_std=0.01 * STATED)
-    predicted = predict_rows(fitted, quiet)
-    np.testing.assert_allclose(predicted.measurement_variance - predicted.variance, (0.01 * STATED) ** 2, rtol=1e-5)
-    assert not any("noise std" in warning for warning in score(fitted, quiet, horizons=()).warnings)
-
-
 def test_noise_of_forces_is_added_to_that_of_rows(uneven):
     train = dataclasses.replace(arm_data(30, seed=0, model=arm_model()), noise_std=np.full((30, 3), NOISE))
     fitted = fit(train.model.with_forces(JointForces(), noise=Noise(None, 0.1)), train, restarts=1, options=QUICK)

@@ -93,7 +93,7 @@ def test_blocks_of_rows_join_seamlessly(posterior):
     assert calls == [(ROWS_PER_BLOCK, len(data)), (len(data), len(data))]
     rows = [0, ROWS_PER_BLOCK - 1, ROWS_PER_BLOCK, len(data) - 1]
     ends = predict_rows(posterior, data.rows(rows))
-    for name in ("mean", "variance", "negative_log_density", "A", "b"):
+    for name in ("mean", "variance", "negative_log_density", "residual"):
         np.testing.assert_allclose(getattr(whole, name)[rows], getattr(ends, name), rtol=1e-8, atol=1e-9)
 
 

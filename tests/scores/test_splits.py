@@ -92,21 +92,11 @@ def test_splits_by_name():
     assert "0.1 s" in split.words
 
 
-def test_imported_episodes_answer_to_the_names_of_their_logs():
-    listed = [{"recording": f"/logs/{name}.csv"} for name in ("run-143339", "run-143524", "run-143524")]
-    data = recording(metadata={"import": {"episodes": listed}})
-    assert split_named(data, "episodes:143339")[0].held_out == (Stretch(0),)
-    assert split_named(data, "episodes:143524")[0].held_out == (Stretch(1), Stretch(2))
-    assert "run-143339.csv" in split_named(data, "episodes:0")[0].words
-    with pytest.raises(InvalidInput, match=r"run-143339\.csv, run-143524\.csv"):
-        split_named(data, "episodes:run")
-
-
 WRONG = [
-    ("episodes:7", r"no episode or log is called so; the dataset has episodes \[0, 1, 2\]"),
-    ("episodes:0,0", "name one twice"),
+    ("episodes:7", r"held-out episodes are \[7\]; name some of \[0, 1, 2\]"),
+    ("episodes:0,0", "each once"),
     ("episodes:0,1,2", "leave one to learn from"),
-    ("episodes:", "no episode or log"),
+    ("episodes:", "give auto, episodes:N"),
     ("fraction:0", "between 0 and 1"),
     ("fraction:half", "give auto, episodes:N"),
     ("fraction:0.5:-1", "0 or more"),

@@ -34,7 +34,7 @@ HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
 MOST = 3
 """Findings whose text is shown; the others by their subject."""
-CHOSEN = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic, unless left-out rows prefer another"
+USUAL_FORCES = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic"
 LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torques:both"
 
 
@@ -58,7 +58,7 @@ class Fit(RobotOptions, Overwriting):
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
-    forces: Annotated[tuple[str, ...], listed("FORCE,...", CHOSEN, goes_on=FIELDS)] = ()
+    forces: Annotated[tuple[str, ...], listed("FORCE,...", USUAL_FORCES, goes_on=FIELDS)] = ()
     """What is found, beside the forces that the model has. Laws: viscous, coulomb, rotor, offset, spring,
     payload:LINK, bodies; their numbers are estimated unless they are given, as in viscous:.1. Unknown forces: gp:joint,
     gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
@@ -124,8 +124,9 @@ class Fit(RobotOptions, Overwriting):
             notes += [] if note is None else [note]
         words = self.forces
         if not words:
-            words, note = self._chosen(dataset, replace(given, noise=noise), windows)
-            notes.append(note)
+            usual = forcegp.scores.usual_forces(given)
+            words = forcegp.scores.summands(usual)
+            notes.append(f"forces: {usual}, the usual ones; forcegp score compares others")
         if windows and noise is None:  # no dataset states the noise of windows
             noise = forcegp.Noise(None, learn=True)
         model = forcegp.scores.named_model(given, words, noise).to(self.device)
@@ -170,14 +171,6 @@ class Fit(RobotOptions, Overwriting):
         contacts = parse_contacts(self.contact)
         model = self.chosen_model(dataset, self.data)
         return model.with_contacts((*contacts, *model.loops)) if self.contact else model
-
-    def _chosen(self, dataset: forcegp.Dataset, model: forcegp.Model, windows: bool) -> tuple[tuple[str, ...], str]:
-        """The unknown forces that a look at some rows prefers, and the reason."""
-        if windows:
-            name = forcegp.scores.usual_forces(model)
-            return forcegp.scores.summands(name), f"forces: {name}, the usual ones; windows are not looked at"
-        name, why = forcegp.scores.choose_forces(dataset, model, seed=self.seed, iterations=self.iterations)
-        return forcegp.scores.summands(name), f"learned: {why}"
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model, accelerations: bool) -> None:
         """One line on what would spoil the model; contacts are not warned of again by the fit.

@@ -13,7 +13,6 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.data
 import forcegp.recordings
-import forcegp.scores
 from forcegp.atomic_files import atomic_file, write_text
 from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
@@ -21,7 +20,7 @@ from forcegp.cli.input_options import PreparationOptions, RobotOptions
 from forcegp.cli.terminal import Terminal, columns, facts, shown
 from forcegp.errors import ForceGPError, InvalidInput
 
-NOT_ABOUT_LOGS = {"logs", "out", "plots", "stance", "json", "debug"}
+NOT_ABOUT_LOGS = {"logs", "out", "stance", "json", "debug"}
 
 Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
@@ -177,15 +176,13 @@ class Import(LogOptions):
       forcegp import *.csv --mapping columns.yaml --unit q=deg,time=ms --out log.h5
       forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
       forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
-      forcegp import log.h5 --cutoff auto --delay auto --every 10 --out data.h5 --plots spectra
+      forcegp import log.h5 --cutoff auto --delay auto --every 10 --out data.h5
     """
 
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     write_mapping: Annotated[Path | None, unless_given("FILE.yaml", "not written", Path)] = None
     """Write the mapping that results from flags and --mapping."""
-    plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
-    """Also draw the spectra before and after the filter, with the cut-off, into this folder."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, check, prepare, write and show."""
@@ -193,7 +190,6 @@ class Import(LogOptions):
             raise InvalidInput("give at least one log.")
         self.require_free_file(self.out)
         self.require_free_file(self.write_mapping, _is_mapping, "a mapping")
-        self.require_free(self.plots)
         preparation, mapping = self._preparation(), None
         if forcegp.data.is_dataset(self.logs[0]):
             raw, done = self._dataset(preparation), {}
@@ -206,18 +202,13 @@ class Import(LogOptions):
             if done["open_switches"]:
                 preparation = replace(preparation, stance="auto")
         dataset, prepared = raw, None
-        if not preparation.changes_nothing or self.plots is not None:
+        if not preparation.changes_nothing:
             with terminal.progress("preparing"):
                 prepared = preparation.apply(raw)
             dataset = prepared.dataset
             done |= {"rows": len(dataset), "preparation": prepared.report}
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:
             dataset.save(temporary)
-            if prepared is not None and self.plots is not None:  # plots that fail leave no dataset behind
-                with self.folder(self.plots, {"data": str(self.logs[0]), "preparation": prepared.report}) as folder:
-                    figure = forcegp.scores.preparation_figure(raw, prepared.preparation)
-                    forcegp.scores.save_figure(figure, folder / "spectra.png")
-                terminal.note(f"plots: {self.plots}")
             if self.write_mapping is not None and mapping is not None:
                 write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
         shown = [] if mapping is None else [_imported(terminal, self.out, done)]

@@ -14,7 +14,6 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 import forcegp.data
 import forcegp.posterior
-import forcegp.scores
 from forcegp.atomic_files import SUMS, require_unchanged
 from forcegp.cli.command import (
     FIELDS,
@@ -203,8 +202,9 @@ def for_system(
         return posterior
     if log.model is None:
         raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-    model = forcegp.scores.moved_model(posterior, log.model)
-    if model is not log.model:
+    model = log.model
+    if posterior.parameters:
+        model = replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
         terminal.note("--system data: contacts of the data; the robot stays the identified one")
     return posterior.with_model(model)
 

@@ -28,7 +28,7 @@ from forcegp.cli.input_options import (
     forces_of,
     require_same_joints,
 )
-from forcegp.cli.terminal import Terminal, columns, facts, nats, number, percent
+from forcegp.cli.terminal import Terminal, columns, nats, number, percent
 from forcegp.errors import ForceGPError, InvalidInput
 
 THERE = InputPath(" does not exist; give folders of forcegp fit, and a dataset (.h5) after them.", Path.exists)
@@ -81,8 +81,6 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
     """How motions are predicted: rk4, symplectic-euler (as PyBullet), implicit-midpoint (stiff friction), projected
     (contacts hold exactly)."""
-    margin: Annotated[float, arg(metavar="RATIO")] = 0.02
-    """Models whose errors differ by less count as equal."""
     restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
     """Starts of every search for hyper-parameters; the best is kept."""
     iterations: Annotated[int | None, unless_given("N", "200", int)] = None
@@ -91,8 +89,6 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
     """Robot and contacts that a RUN predicts for: model, those that it was trained with; data, those of the log."""
     contact: Annotated[tuple[str, ...], listed(CONTACTS, "those of --system", goes_on=NUMBERS)] = ()
     """A RUN predicts under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
-    friction_coefficient: Annotated[float | None, unless_given("F", "no margins", float)] = None
-    """Also show how far feet are from slipping on ground of this friction coefficient."""
     jobs: Annotated[int, arg(metavar="J")] = 1
     """So many pieces of work at once, each on one core."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
@@ -115,8 +111,8 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
             raise InvalidInput(
                 "models are fitted, which takes time; give --out FOLDER, where all that is done is kept."
             )
-        if (self.report is not None or self.friction_coefficient is not None) and len(runs) != 1:
-            raise InvalidInput(f"{len(runs)} runs were given; a report and margins to slipping are of one RUN.")
+        if self.report is not None and len(runs) != 1:
+            raise InvalidInput(f"{len(runs)} runs were given; a report is of one RUN.")
         start = time.monotonic()
         raw = forcegp.Dataset.load(data)
         models: dict[str, Any] = {}
@@ -139,7 +135,6 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
                 model=model,
                 recording=recording,
                 seeds=self.seeds,
-                margin=self.margin,
                 jobs=self.jobs,
                 source=source,
                 overwrite=self.overwrite,
@@ -213,7 +208,7 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
         content: Mapping[str, Any],
     ) -> dict[str, Any]:
         """What is shown, drawn and written of a single model."""
-        mu, name = self.friction_coefficient, next(iter(scores.models))
+        name = next(iter(scores.models))
         # what an observer reports is neither robot nor contact
         trained, here = ({**each.to_dict(), "forces": None} for each in (posterior.trained, posterior.model))
         where = ", carried to another robot or contacts" if trained != here else ""
@@ -223,9 +218,8 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
         rests = forcegp.scores.normal_force_rests_on_prior(posterior)
         why = NORMAL_FORCES_KNOWN if known else NORMAL_FORCES if rests else NORMAL_FORCES_SEEN
         posterior, rows = forcegp.posterior.observing(posterior, rows)
-        slips = {} if mu is None else forcegp.scores.slip_scores(posterior, rows, mu)
         if self.out is not None:
-            draw(terminal, self.out, posterior, rows, mu)
+            draw(terminal, self.out, posterior, rows)
         if self.report is not None:
             with terminal.progress("writing the report") as progress:
                 page = forcegp.report.model_page(
@@ -235,28 +229,23 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
                     best=forcegp.report.scores_sentence(scores, unit_of_a(rows)),
                     findings=[forcegp.report.Finding("warning", each) for each in content["warnings"]],
                     tables=[forcegp.report.scores_table(scores)],
-                    mu=mu,
                     details={key: value for key, value in content.items() if key != "runs"},
                     shapes=self.shapes,
                     progress=progress,
                 )
                 forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
             terminal.note(f"report: {self.report}")
-        terminal.show(joint_table(title, scores), quantity_table(scores), facts("", slip_facts(slips)))
+        terminal.show(joint_table(title, scores), quantity_table(scores))
         if "contact force" in scores.quantities():
             terminal.show(f"Contact force: {why}.")
-        return {"normal_force_rests_on_prior": rests} | ({} if mu is None else {"slip": slips})
+        return {"normal_force_rests_on_prior": rests}
 
 
 def draw(
-    terminal: Terminal,
-    folder: Path,
-    posterior: forcegp.posterior.Posterior,
-    dataset: forcegp.Dataset,
-    mu: float | None = None,
+    terminal: Terminal, folder: Path, posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset
 ) -> list[str]:
     """Write every plot of one model that these data allow to `folder`; returns the names of the files."""
-    figures, drawn = forcegp.scores.model_figures(posterior, dataset, mu), []
+    figures, drawn = forcegp.scores.model_figures(posterior, dataset), []
     with terminal.progress("drawing") as report:
         for done, (name, (_, figure)) in enumerate(figures.items()):
             report(done, len(figures), name)
@@ -317,13 +306,3 @@ def quantity_table(scores: forcegp.Scores) -> Any:
         if name not in ("acceleration", "all joints") and any(value is not None for value in shown.values()):
             rows.append([name, *(show(shown[each]) for each, show in QUANTITY.items())])
     return columns("", ["all joints", "MAE", "RMSE", "RMSE /\nits size", "in 95 %\nband"], rows)
-
-
-def slip_facts(scores: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
-    """One line per foot: its least margin to slipping, and in how many rows it rather slips."""
-    return {
-        f"margin of {foot} to slipping": f"{each['least_margin']:.3g} ± {each['std']:.2g} N at least (row "
-        f"{each['row']}); slips in {percent(each['slipping'])} of the rows, "
-        f"with probability {each['most_likely']:.2g} at most"
-        for foot, each in scores.items()
-    }

@@ -1,6 +1,6 @@
 from .row_selection import (
     time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
-    require_disjoint as require_disjoint,
+    repeated_rows as repeated_rows, require_disjoint as require_disjoint,
 )
 from .contact_evidence import (
     contact_rows as contact_rows, rows_in_contact as rows_in_contact, contact_doubts as contact_doubts,
@@ -17,9 +17,7 @@ from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE
 from .hdf5 import is_dataset as is_dataset
 from .motion_records import RecordedMotions as RecordedMotions, recorded_motions as recorded_motions
 from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
-from .spectrum import (
-    MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum, power_density as power_density,
-)
+from .spectrum import MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum
 from .stance import Stance as Stance, estimate_stance as estimate_stance
 from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag, thruster_columns as thruster_columns
 from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind

@@ -37,22 +37,26 @@ def time_blocks(
     return tuple(tuple(rows) for rows in blocks.values())
 
 
+def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Dataset) -> Int[np.ndarray, " repeated"]:
+    """Numbers of the rows of `test` whose (q, v, u) is exactly one of those in `trained`, each (rows, k)."""
+    # -0.0 becomes 0.0: equal numbers have equal bytes
+    known, rows = (np.hstack(each) + 0.0 for each in (trained, (test.q, test.v, test.u)))
+    found = {row.tobytes() for row in known}
+    return np.array([number for number, row in enumerate(rows) if row.tobytes() in found], dtype=np.int64)
+
+
 def require_disjoint(train: Dataset, test: Dataset) -> None:
     """Refuse a pair of Datasets in which the test repeats the training.
 
     Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both were simulated or recorded with
     the same `metadata` (same seed, same configuration) and share an episode: two samples of one trajectory.
     """
-    if train.nv == test.nv:
-        # -0.0 becomes 0.0: equal numbers have equal bytes
-        trained, tested = (np.hstack([data.q, data.v, data.u]) + 0.0 for data in (train, test))
-        known = {row.tobytes() for row in trained}
-        repeated = [number for number, row in enumerate(tested) if row.tobytes() in known]
-        if repeated:
-            raise DatasetError(
-                f"{len(repeated)} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
-                "Test on another trajectory: another episode, recording or seed."
-            )
+    repeated = repeated_rows((train.q, train.v, train.u), test)
+    if repeated.size:
+        raise DatasetError(
+            f"{repeated.size} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
+            "Test on another trajectory: another episode, recording or seed."
+        )
     shared = sorted(set(train.episodes) & set(test.episodes))
     if train.metadata and train.metadata == test.metadata and shared:
         raise DatasetError(

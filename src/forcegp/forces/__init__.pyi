@@ -15,6 +15,7 @@ from .parameters import (
 )
 from .registry import (
     FORCES as FORCES, force_from_dict as force_from_dict, force_to_dict as force_to_dict, parse_forces as parse_forces,
+    split_outside as split_outside,
 )
 from .rigid_bodies import Payload as Payload, RigidBodies as RigidBodies
 from .rotor import CoupledRotors as CoupledRotors, Rotor as Rotor

@@ -141,7 +141,7 @@ def parse_forces(expression: str | Sequence[str]) -> tuple[Force, ...]:
     Lists are written with "/", for example "gp:joint:inputs=q/v", and so are points. Raises InvalidInput for unknown
     names, fields and values.
     """
-    words = _split(expression, ",") if isinstance(expression, str) else list(expression)
+    words = split_outside(expression, ",") if isinstance(expression, str) else list(expression)
     joined: list[str] = []
     for word in (word.strip() for word in words):
         # a comma may stand between options as well: gp:tool-forces:frame=link_7,axes=world
@@ -161,7 +161,7 @@ def is_unknown(name: str) -> bool:
 
 def _one(text: str, expression: Any) -> Any:
     unknown = text.startswith(UNKNOWN)
-    name, *options = _split(text.removeprefix(UNKNOWN), ":")
+    name, *options = split_outside(text.removeprefix(UNKNOWN), ":")
     name = name.strip()
     if name not in (*SHORT, *FORCES) or is_unknown(name) != unknown:
         _refuse(name, unknown, expression)
@@ -238,7 +238,7 @@ def _without_parentheses(text: str) -> str:
     return text[1:-1].strip() if enclosed else text
 
 
-def _split(text: str, separator: str) -> list[str]:
+def split_outside(text: str, separator: str) -> list[str]:
     """The parts between separators outside of parentheses."""
     parts, depth = [""], 0
     for character in text:

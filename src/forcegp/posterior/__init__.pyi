@@ -2,7 +2,6 @@ from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .components import Components as Components, Curve as Curve, ForceComponent as ForceComponent
 from .estimates import Estimate as Estimate, Estimates as Estimates
-from .friction_margin import FrictionMargins as FrictionMargins, friction_margins as friction_margins
 from .motion_intervals import HORIZONS as HORIZONS, MotionIntervals as MotionIntervals
 from .observed_wrench import observing as observing
 from .posterior import Posterior as Posterior

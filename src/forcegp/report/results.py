@@ -27,7 +27,6 @@ def model_page(
     findings: Sequence[Finding] = (),
     tables: Sequence[Table] = (),
     pictures: Sequence[Picture] = (),
-    mu: float | None = None,
     next_steps: Sequence[Finding] = (),
     details: Mapping[str, Any] | None = None,
     shapes: str | Path | None = None,
@@ -36,10 +35,10 @@ def model_page(
     """A page with the robot in motion and the pictures that this model and recording allow.
 
     `pictures` of the caller come first. What cannot be drawn is named on the page with the reason: without viser the
-    robot, and motions of a recording with uneven time steps. `mu` [1] is the friction coefficient of the ground under
-    feet. `shapes` is a URDF with visual elements.
+    robot, and motions of a recording with uneven time steps. `shapes` is a URDF with
+    visual elements.
     """
-    steps, drawn, notes = model_figures(posterior, dataset, mu), list(pictures), []
+    steps, drawn, notes = model_figures(posterior, dataset), list(pictures), []
     for done, (name, (caption, draw)) in enumerate(steps.items()):
         if progress is not None:
             progress(done, len(steps) + 1, name)

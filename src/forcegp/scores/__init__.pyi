@@ -3,16 +3,12 @@ from .accuracy import (
 )
 from .candidates import Candidate as Candidate, Training as Training
 from .doubts import (
-    moved_model as moved_model, normal_force_rests_on_prior as normal_force_rests_on_prior,
-    unfinished_search as unfinished_search,
+    normal_force_rests_on_prior as normal_force_rests_on_prior, unfinished_search as unfinished_search,
 )
 from .figures.contacts import contacts_figure as contacts_figure
 from .figures.excitation import excitation_figure as excitation_figure
 from .figures.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
-from .figures.friction_margins import (
-    friction_margins_figure as friction_margins_figure, slip_scores as slip_scores,
-)
-from .figures.log import check_figure as check_figure, preparation_figure as preparation_figure
+from .figures.log import check_figure as check_figure
 from .figures.motion_bands import motion_bands_figure as motion_bands_figure
 from .figures.of_model import model_figures as model_figures
 from .figures.prediction import (
@@ -24,7 +20,6 @@ from .learning import (
     learn as learn, named_model as named_model, summands as summands, usual_evidence as usual_evidence,
     usual_forces as usual_forces, with_intervals_of_motions as with_intervals_of_motions,
 )
-from .leave_out import choose_forces as choose_forces
 from .paired import CRITERIA as CRITERIA, PairedDifference as PairedDifference
 from .page import overall as overall
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows

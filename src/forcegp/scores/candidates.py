@@ -5,7 +5,6 @@ robot as given, or beside those of the robot as `identified`, such as gp:joint-f
 identified+gp:joint-friction@accelerations+motions:1. Laws alone are found from all training rows, as identified is.
 """
 
-import difflib
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -71,7 +70,6 @@ class Candidate:
     kind: parametric (`given`, `identified`), `residual`, `black box` or `force prior`.
     fit: makes the posterior; or the posterior that was fitted before.
     identification: the name of the identification that it builds on, see `identified_model`; None for none.
-    cost: CPU time relative to others, for the remaining time alone.
     all_rows: whether it learns from all training rows alone, so that one seed stands for all.
     digest: what its result depends on beside its name and its code.
     """
@@ -80,7 +78,6 @@ class Candidate:
     kind: Kind
     fit: Callable[[Training], Posterior] | Posterior
     identification: str | None = None
-    cost: float = 1.0
     all_rows: bool = False
     digest: str = ""
 
@@ -133,7 +130,7 @@ def candidate(name: str, given: Given, model: Model, identification: str) -> Can
         kind, few = kind_of(given), bool(given.unknown_forces) and has_few_inputs(given.unknown, given.robot)
         every = few or (given.is_open and not given.unknown_forces)
         work = partial(_fit_model, given, (), ())
-        return Candidate("a model of yours", kind, work, cost=10.0, all_rows=every, digest=_digest(given))
+        return Candidate("a model of yours", kind, work, all_rows=every, digest=_digest(given))
     if isinstance(given, Candidate):
         return given
     if not callable(given):
@@ -149,7 +146,7 @@ def fitted_before(posterior: Posterior) -> Candidate:
     numbers = [*(getattr(training, name) for name in ("q", "v", "u")), *posterior.hyperparameters.values()]
     digest = _digest(posterior.model.known, *(each.detach().cpu().numpy().tobytes() for each in numbers))
     kind, summary = kind_and_summary(posterior)
-    return Candidate(summary, kind, posterior, cost=0.1, all_rows=True, digest=digest)
+    return Candidate(summary, kind, posterior, all_rows=True, digest=digest)
 
 
 def kind_and_summary(posterior: Posterior) -> tuple[Kind, str]:
@@ -182,9 +179,8 @@ def _named_candidate(name: str, expression: str, model: Model, identification: s
     try:
         described = named_model(model, words or (GIVEN,))
     except InvalidInput as error:
-        close = difflib.get_close_matches(name, [GIVEN, IDENTIFIED], n=1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
-        raise InvalidInput(f"no model is called {name!r}; {hint}give FORCES[@EVIDENCE] ({error})") from None
+        known = f"{GIVEN}, {IDENTIFIED} or FORCES[@EVIDENCE]"
+        raise InvalidInput(f"no model is called {name!r}; give {known} ({error})") from None
     unknown, opened = described.unknown_forces, described.is_open and not model.is_open
     if opened and not unknown and on_identified:
         raise InvalidInput(f"model {name!r}: `identified` has its laws already; name all laws, or leave these out.")
@@ -212,7 +208,6 @@ def _named_candidate(name: str, expression: str, model: Model, identification: s
         kind,
         partial(_fit_named, words, on_identified, others if unknown else (), motions),
         key,
-        cost=(10.0 if unknown else 1.0) * (5.0 if motions else 1.0),
         all_rows=few or (key is not None and not unknown),
     )
 

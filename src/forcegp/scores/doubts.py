@@ -1,21 +1,14 @@
 """Sentences that belong beside the scores of a model: what a reader would have to find out otherwise."""
 
 import json
-import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
-from forcegp.data import Dataset
-from forcegp.errors import ForceGPError
-from forcegp.model import Model
+from forcegp.data import Dataset, repeated_rows
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, TRUE_ACCELERATION, Table
-from forcegp.scores.predicted_rows import stated_noise_level
 from forcegp.summary import listed
 
 WORSE = 1.01
@@ -38,9 +31,6 @@ all joints (a joint that is held in its posture moves little, and a little more 
 
 MOST_OUTSIDE = 0.01
 """Share of the rows that may lie further outside."""
-
-NOISE_FACTOR = 1.5
-"""Noise levels of model and Dataset that differ by more than this factor are named."""
 
 
 def unfinished_search(posterior: Posterior) -> Iterator[str]:
@@ -89,15 +79,11 @@ def poor_scores(posterior: Posterior, dataset: Dataset, table: Table) -> Iterato
         f"{names[joint]} {mine[joint]:.3g} against {alone[joint]:.3g}"
         for joint in sorted(np.flatnonzero(worse), key=lambda joint: alone[joint] / mine[joint])
     ]
-    if mine.mean() > WORSE * alone.mean():
+    if places or mine.mean() > WORSE * alone.mean():
+        where = f" at {len(places)} of {len(names)} joints, {listed(places)}" if places else ""
         yield (
-            f"the model is worse here than its known forces alone ({what} {mine.mean():.3g} against "
-            f"{alone.mean():.3g}): do not use it for motions like these"
-        )
-    elif places:
-        yield (
-            f"the model is better here than its known forces alone on average, but worse at {len(places)} of "
-            f"{len(names)} joints ({what}: {listed(places)}): do not use it for these"
+            f"the model is worse here than its known forces alone{where} ({what} {mine.mean():.3g} against "
+            f"{alone.mean():.3g} on average): do not use it for motions like these"
         )
     least = 0.95 - max(MISSED, CHANCE * (0.95 * 0.05 / len(dataset)) ** 0.5)
     for quantity, what in ((ACCELERATION, "measurements"), (TRUE_ACCELERATION, "true accelerations")):
@@ -118,21 +104,6 @@ def doubts(posterior: Posterior, dataset: Dataset, table: Table) -> tuple[str, .
     """All of them, for the scores of this model on this dataset."""
     poor = poor_scores(posterior, dataset, table)
     return (*unfinished_search(posterior), *rows_outside(posterior, dataset), *poor)
-
-
-def noise_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
-    """A sentence if model and Dataset disagree about the noise of some joint by more than NOISE_FACTOR."""
-    stated = stated_noise_level(posterior, dataset)
-    if stated is None:
-        return
-    model = posterior.noise_std.detach().cpu().numpy()
-    ratio = np.maximum(model / stated, stated / model)
-    joint = int(ratio.argmax())
-    if ratio[joint] > NOISE_FACTOR:
-        yield (
-            f"the noise std of the model is {model[joint]:.3g}, that of the data {stated[joint]:.3g} "
-            f"(joint {dataset.joint_names[joint]}, where they differ most); coverage and NLPD use the larger one."
-        )
 
 
 STATES = 20
@@ -158,48 +129,22 @@ def normal_force_rests_on_prior(posterior: Posterior) -> bool:
         dynamics = posterior.trained.dynamics(q, v, u)
         forces = posterior.trained.unknown
         B, features = forces.direction(dynamics), forces.features(dynamics)
-        pressing = dynamics.multiplier_map().matrix @ B
-        return any(_presses_unseen((dynamics.H @ B)[..., which], pressing[..., which]) for which in _groups(features))
-
-
-def _groups(features: tuple[Tensor, ...]) -> list[list[int]]:
-    """Numbers of the processes that have the same inputs."""
-    groups: dict[int, list[int]] = {}
-    for index, z in enumerate(features):
-        constant = bool((z == z[:1]).all())  # also without any feature
-        first = next((k for k in groups if not constant and torch.equal(features[k], z)), index)
-        groups.setdefault(first, []).append(index)
-    return list(groups.values())
-
-
-def _presses_unseen(moving: Tensor, pressing: Tensor) -> bool:
-    """Whether the null space of `moving` (rows, nv, k) changes lambda through `pressing` (rows, m, k)."""
-    _, sizes, rows = torch.linalg.svd(moving)
-    largest = sizes[..., :1]
-    padded = torch.cat([sizes, sizes.new_zeros(*sizes.shape[:-1], rows.shape[-1] - sizes.shape[-1])], dim=-1)
-    unseen = (padded <= INVISIBLE * largest)[..., None] * rows
-    effect = pressing @ unseen.mT
-    return bool((effect.abs().amax((-2, -1)) > INVISIBLE * pressing.abs().amax((-2, -1))).any())
-
-
-TRIED_ROWS = 200
-"""Rows on which both systems are tried before one is advised."""
-
-WORTH_MOVING = 0.9
-"""Error in the system of the data over that in the model's own, below which the model is worth carrying over."""
-
-
-def shared_rows(posterior: Posterior, dataset: Dataset) -> Int[np.ndarray, " shared"]:
-    """Numbers of the rows of `dataset` whose (q, v, u) is exactly that of a training point."""
-    training = posterior.training
-    trained = {row.tobytes() for row in _inputs(*(getattr(training, name).cpu().numpy() for name in ("q", "v", "u")))}
-    rows = _inputs(dataset.q, dataset.v, dataset.u)
-    return np.array([number for number, row in enumerate(rows) if row.tobytes() in trained], dtype=np.int64)
+        moving, pressing = dynamics.H @ B, dynamics.multiplier_map().matrix @ B
+        for z in features:
+            alike = [k for k, other in enumerate(features) if torch.equal(z, other)]
+            if (z == z[:1]).all():  # constant, also without any feature
+                alike = alike[:1]
+            here, there = moving[..., alike], pressing[..., alike]
+            unseen = torch.eye(len(alike)).to(B) - torch.linalg.pinv(here, rtol=INVISIBLE) @ here
+            if ((there @ unseen).abs().amax((-2, -1)) > INVISIBLE * there.abs().amax((-2, -1))).any():
+                return True
+    return False
 
 
 def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
     """Warnings about rows or trajectories that training and test share, and about contacts that differ."""
-    repeated = shared_rows(posterior, dataset)
+    q, v, u = (getattr(posterior.training, name).cpu().numpy() for name in "qvu")
+    repeated = repeated_rows((q, v, u), dataset)
     if repeated.size:
         yield (
             f"{repeated.size} of {len(dataset)} test rows have the very (q, v, u) of training rows (the first: row "
@@ -214,58 +159,10 @@ def overlap_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
                 f"training and test rows come from the same recording (equal metadata, episodes {shared} in both), "
                 "so these scores flatter the model; test on another trajectory."
             )
-    yield from system_warnings(posterior, dataset)
-
-
-def system_warnings(posterior: Posterior, dataset: Dataset) -> Iterator[str]:
-    """A sentence where predictions are for other contacts or another robot than those of the data, with the remedy.
-
-    A robot and known forces that were identified are worth more than those that the data came with, and contacts of the
-    data more than those of another recording: whether to carry the model over is decided by some rows, not by a rule.
-    """
     own, model = dataset.model, posterior.model
-    if own is None or posterior.is_black_box:  # which has no contacts, and can be carried nowhere
-        return
-    contacts = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
-    # inertias that were identified are meant to differ from those that the data came with
-    robots = not posterior.parameters and not own.robot.tree.equals(model.robot.tree)
-    if not contacts and not robots:
-        return
-    what = " and ".join(name for name, differ in (("contacts", contacts), ("robot", robots)) if differ)
-    are, those = ("are", "those") if contacts else ("is", "that")
-    sentence = f"the {what} of the model {are} not {those} of the data"
-    sentence += f"; the constraint error is measured on {those} of the data" if contacts else ""
-    errors = _errors_here_and_there(posterior, dataset, own)
-    if errors is not None and errors[1] < WORTH_MOVING * errors[0]:
-        sentence += f"; carried over to them, the error of its mean is {errors[1]:.3g} instead of {errors[0]:.3g} on "
-        sentence += "some of these rows: `posterior.with_model(dataset.model)`"
-    elif errors is not None:
-        sentence += f"; it stays as it is, for carried over to them its error would be {errors[1]:.3g} instead of "
-        sentence += f"{errors[0]:.3g}"
-    if contacts or errors is None or errors[1] < WORTH_MOVING * errors[0]:
-        yield sentence  # else a robot that serves these data better than theirs was identified
-
-
-def _errors_here_and_there(posterior: Posterior, dataset: Dataset, model: Model) -> tuple[float, float] | None:
-    """Errors of the mean on some rows as it is and carried over to that model; None where it cannot be."""
-    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRIED_ROWS).round().astype(int)))
-    try:
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            each = posterior, posterior.with_model(moved_model(posterior, model))
-            means = [one.predict(rows.q, rows.v, rows.u, covariance=False).mean for one in each]
-    except ForceGPError:
-        return None
-    here, there = (float(np.abs(mean.cpu().numpy() - rows.a).mean()) for mean in means)
-    return here, there
-
-
-def moved_model(posterior: Posterior, model: Model) -> Model:
-    """The system of other data, with the robot and known forces of a model that has identified them."""
-    if not posterior.parameters:
-        return model
-    return replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
-
-
-def _inputs(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.hstack([q, v, u]) + 0.0  # + 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes
+    differ = own is not None and (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
+    if differ and not posterior.is_black_box:  # which has no contacts, and can be carried nowhere
+        yield (
+            "the contacts of the model are not those of the data, on which the constraint error is measured; predict "
+            "under them with `posterior.with_model(dataset.model)`"
+        )

@@ -38,12 +38,11 @@ def jobs_of(experiment: Experiment, models: Mapping[str, Candidate], seeds: int)
         spec = {"configuration": configuration, "kind": kind, "name": name, "split": split, "seed": seed, **read}
         spec |= {} if isinstance(work, str) else {"digest": work.digest}
         place = job_name(experiment.splits[split], seed, kind, name)
-        cost = 1.0 if isinstance(work, str) else work.cost
         # where the function is defined, which somebody else may have added
         fit = None if isinstance(work, str) or isinstance(work.fit, Posterior) else work.fit
         modules = (__name__,) if fit is None else (_plain(fit).__module__,)
         inputs = tuple(sorted({*read.values()}))
-        return Job(place, f"{__name__}:compute", spec, inputs, cost, (experiment, work), modules)
+        return Job(place, f"{__name__}:compute", spec, inputs, arguments=(experiment, work), code=modules)
 
     for number, split in enumerate(experiment.splits):
         places = {name: job_name(split, 0, IDENTIFICATION, name) for name in sorted(wanted)}

@@ -19,6 +19,7 @@ from forcegp.forces import (
     IndependentAccelerations,
     has_few_inputs,
     parse_forces,
+    split_outside,
 )
 from forcegp.inference import Inducing
 from forcegp.model import Model
@@ -31,13 +32,6 @@ Report = Callable[[int, int, str], None]
 GIVEN, ONLY, NONE = "given", "only", "none"
 """First words of the forces of a model: those that it has, and none of them; "none" adds nothing."""
 
-FREE_MOTION = "gp:joint-friction", "gp:joint", "gp:joint+gp:joint-friction"
-IN_CONTACT = "gp:tool-friction", "gp:joint", "gp:tool-friction+gp:joint-friction"
-FLYING = "gp:aerodynamic", "gp:base-wrench"
-FREE_BODY = "gp:joint", "gp:base-wrench"
-FLYING_ARM = "gp:joint-friction+gp:aerodynamic", "gp:joint-friction", "gp:aerodynamic"
-"""Forces that are looked at, those that are taken without a look first."""
-
 POINTS = 200
 """Rows that functions of many inputs are learned from where nobody says how many."""
 RESIDUALS = 20_000  # rows whose residuals show how long errors resemble each other
@@ -48,14 +42,7 @@ STEPS = 100  # of a search on motions, for the bar alone
 
 def summands(expression: str) -> tuple[str, ...]:
     """The words between the "+" of an expression that stand outside of parentheses."""
-    parts, depth = [""], 0
-    for character in expression:
-        depth += (character == "(") - (character == ")")
-        if character == "+" and depth == 0:
-            parts.append("")
-        else:
-            parts[-1] += character
-    return tuple(part.strip() for part in parts)
+    return tuple(part.strip() for part in split_outside(expression, "+"))
 
 
 def named_model(model: Model, words: Sequence[str], noise: Noise | None = None) -> Model:
@@ -77,19 +64,16 @@ def named_model(model: Model, words: Sequence[str], noise: Noise | None = None) 
 
 
 def usual_forces(model: Model) -> str:
-    """What is learned without a look: friction of the joints, in contact forces at the tool, in flight air."""
-    return looked_at(model)[0][0]
+    """What is learned where no force is named: in flight air, at a tool that slides its friction, else of the joints.
 
-
-def looked_at(model: Model) -> tuple[tuple[str, ...], str]:
-    """Names of forces, and where the robot moves. Under feet that stand nothing slides, so no friction acts there."""
+    Under feet that stand nothing slides, so no friction acts there. A body without joints has forces of any kind.
+    """
+    jointed = bool(model.robot.single_joint_names)
     if thruster_columns(model):
-        return FLYING_ARM if model.robot.single_joint_names else FLYING, "in flight"
+        return "gp:joint-friction+gp:aerodynamic" if jointed else "gp:aerodynamic"
     if any(slides(contact) for contact in model.touching):
-        return IN_CONTACT, "in contact"
-    if not model.robot.single_joint_names:
-        return FREE_BODY, "of a body without joints"
-    return FREE_MOTION, "where nothing slides" if model.touching else "in free motion"
+        return "gp:tool-friction"
+    return "gp:joint-friction" if jointed else "gp:joint"
 
 
 def usual_evidence(model: Model) -> Evidence:

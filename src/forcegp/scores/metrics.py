@@ -13,16 +13,6 @@ PerColumn = Float[np.ndarray, " k"]
 LOG_2_PI = float(np.log(2.0 * np.pi))
 
 
-def mean_absolute_error(predicted: Columns, target: Columns) -> PerColumn:
-    """Mean of |predicted - target| over the rows, in the units of the columns."""
-    return np.abs(predicted - target).mean(axis=0)
-
-
-def root_mean_square_error(predicted: Columns, target: Columns) -> PerColumn:
-    """Root of the mean of (predicted - target)^2 over the rows, in the units of the columns."""
-    return np.sqrt(np.square(predicted - target).mean(axis=0))
-
-
 def negative_log_density(
     mean: Columns, covariance: Float[np.ndarray, "rows k k"], target: Columns
 ) -> Float[np.ndarray, " rows"]:
@@ -60,10 +50,3 @@ def interval_coverage(mean: Columns, variance: Columns, target: Columns, level: 
     if not 0.0 < level < 1.0:
         raise InvalidInput(f"level is {level}; it must be between 0 and 1, for example 0.95.")
     return (np.abs(target - mean) <= ndtri(0.5 + 0.5 * level) * np.sqrt(variance)).mean(axis=0)
-
-
-def constraint_residual(
-    A: Float[np.ndarray, "rows m nv"], b: Float[np.ndarray, "rows m"], a: Float[np.ndarray, "rows nv"]
-) -> Float[np.ndarray, "rows m"]:
-    """A a - b of every row and contact [m/s^2 for surfaces that are signed distances]."""
-    return (A @ a[..., None])[..., 0] - b

@@ -104,7 +104,7 @@ def motion_scores(
     """`position after 0.5 s` and the like at every horizon, and what belongs to all of them; None without motions.
 
     `rmse` over the motions of q in rad or m, of a base in its own axes, of `velocity after ...` in their time
-    derivative, of `contact points after ...` in m; `coverage_95` of q where the model has intervals of motions. Motions
+    derivative; `coverage_95` of q where the model has intervals of motions. Motions
     that had diverged by then do not count (None where all had); `diverged` counts them by horizon. `squared` (horizons,
     motions) is the mean over joints of the squared error of q.
     """
@@ -117,7 +117,6 @@ def motion_scores(
     recorded = torch.as_tensor(motions.q.copy(), device=rollout.q.device)
     off = apart_from(recorded, rollout.q, rollout.space)
     found = {"position": off, "velocity": torch.as_tensor(motions.v.copy(), device=rollout.q.device) - rollout.v}
-    found |= _contact_points(posterior, rollout, recorded)
     inside = inside_interval(rollout, recorded)
     table: Table = {}
     facts: dict[str, Any] = {"horizons": list(held_out.horizons), "motions": len(motions.q), "integrator": integrator}
@@ -133,17 +132,6 @@ def motion_scores(
         facts["diverged"].append(int((~lasting).sum()))
         facts["squared"].append(plain(off[:, row].square().mean(-1).cpu().numpy()))
     return table, facts
-
-
-def _contact_points(posterior: Posterior, rollout: Rollout, recorded: Tensor) -> dict[str, Tensor]:
-    """Distance (motions, rows, contacts) of every contact point from the recorded one in m."""
-    contacts, robot = posterior.model.contacts, posterior.model.robot
-    if not contacts:
-        return {}
-    lost = torch.isnan(rollout.q).any(-1, keepdim=True)
-    here, there = (robot.kinematics(q) for q in (torch.where(lost, recorded, rollout.q), recorded))
-    apart = [torch.linalg.vector_norm(each.position(here) - each.position(there), dim=-1) for each in contacts]
-    return {"contact points": torch.stack(apart, -1)}
 
 
 def apart_from(q0: Tensor, q1: Tensor, space: ConfigurationSpace) -> Float[Tensor, "*batch nv"]:

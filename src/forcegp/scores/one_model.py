@@ -7,7 +7,7 @@ from forcegp.data import Dataset, contact_doubts
 from forcegp.posterior import observing
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import Matrices, row_scores
-from forcegp.scores.doubts import doubts, noise_warnings, overlap_warnings
+from forcegp.scores.doubts import doubts, overlap_warnings
 from forcegp.scores.motions import HeldOutMotions, motion_scores
 
 OBSERVED = "wind, and the force that stays unexplained, were observed from the rows before each."
@@ -33,7 +33,7 @@ def scored(
         posterior, test = observing(posterior, test, whole=True)
     table, stretches = row_scores(posterior, test, mass, progress)
     moving, facts = motion_scores(alone, motions, integrator)
-    told = [*noise_warnings(posterior, test), *(str(doubt) for doubt in contact_doubts(test, posterior.model))]
+    told = [str(doubt) for doubt in contact_doubts(test, posterior.model)]
     told = ([] if fitted_here else [*overlap_warnings(alone, recorded), *told]) + list(doubts(posterior, test, table))
     told += [] if posterior is alone else [OBSERVED]
     return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

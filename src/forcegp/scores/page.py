@@ -1,12 +1,15 @@
 """The page of scores in Markdown, and the same tables as rows of text for terminals and reports."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from forcegp.data import preparation_report
+import numpy as np
+
+from forcegp.data import Preparation, preparation_report
 from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE
-from forcegp.scores.paired import CRITERIA, PairedDifference
+from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference
 from forcegp.scores.scores import Scores
 from forcegp.scores.tables import formatted, markdown_table, number, rendered
 
@@ -33,7 +36,7 @@ def page(scores: Scores, figures: Collection[str] = ()) -> str:
     return rendered(
         Path(__file__).with_name("report.md.jinja"),
         **{"source": {}, "preparation": [], "splits": [], "configuration": {}, **scores.about, "notes": notes},
-        margin=scores.margin,
+        margin=MARGIN,
         taken=[[CRITERIA[name], f"**{each['model']}**", each["why"]] for name, each in scores.winners.items()],
         rival=scores.rival,
         differences=differences,
@@ -139,31 +142,15 @@ def unit_of(scores: Scores, quantity: str) -> str:
 
 
 def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
-    """`metadata["preparation"]` of a Dataset (`data.Preparation`) as sentences, the last step first."""
+    """`metadata["preparation"]` of a Dataset (`data.Preparation`) as lines, the last step first; delays in s."""
     report = preparation_report(metadata)
     if not report:
         return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
-    parts = []
-    for name, what in (("delay", "u taken from {} ms later"), ("lag", "u through actuators of first order, {} ms")):
-        each = [float(value) for value in report.get(name) or []]
-        if any(each):
-            shown = each if len(set(each)) > 1 else each[:1]
-            parts.append(what.format(", ".join(f"{1e3 * value:.3g}" for value in shown)))
-    cutoff, every = report.get("cutoff"), report.get("every", 1)
-    filtered = {"q": "q and u, v and a from it", "v": "q, v and u, a from v"}.get(str(report.get("differentiate")), "q")
-    low_pass = f"zero-phase Butterworth low-pass of order {report.get('order')} at {cutoff:g} Hz on" if cutoff else ""
-    parts.append(f"{low_pass} {filtered} by central differences" if cutoff else "no filter")
-    parts += [f"one of {every} rows"] if every > 1 else []
-    parts += [f"{report['trim']:g} s dropped at both ends of every episode"] if report.get("trim") else []
-    lines = [f"Preparation: {'; '.join(parts)}."]
-    removed = report.get("power_removed")
-    if isinstance(removed, Mapping) and removed.get("a"):
-        shares = ", ".join("–" if share is None else f"{100.0 * share:.3g} %" for share in removed["a"])
-        lines.append(
-            f"The filter took {shares} of the variance of the joints' acceleration; scores are against the rest."
-        )
+    settings = {each.name: report.get(each.name) for each in fields(Preparation)}
+    given = ", ".join(f"{name} {value}" for name, value in settings.items() if name == "cutoff" or np.any(value))
+    lines = [f"Preparation: {given}."]
     for quantity, reason in dict(report.get("why") or {}).items():
         told = "; ".join(f"{name} {why}" for name, why in reason.items()) if isinstance(reason, Mapping) else reason
         lines.append(f"Chosen automatically, {quantity}: {told}")
-    earlier = report.get("earlier")
-    return lines + (preparation_lines({"preparation": earlier}) if preparation_report({"preparation": earlier}) else [])
+    earlier = {"preparation": report.get("earlier")}
+    return lines + (preparation_lines(earlier) if preparation_report(earlier) else [])

@@ -38,7 +38,8 @@ class PairedDifference:
 
     `value` is the ratio of root mean square errors (0.8: a fifth less), or the mean difference in nats; the interval is
     of the same kind, None for one stretch and one seed. The challenger was better in `wins` of `runs` and, over all
-    seeds, in `ahead` of `stretches` (motions, for that score). A ratio within `margin` of 1 is no difference.
+    seeds, in `ahead` of `stretches` (motions, for that score). A ratio within `MARGIN` of 1 is no
+    difference.
     """
 
     criterion: str
@@ -50,13 +51,12 @@ class PairedDifference:
     interval: tuple[float, float] | None
     ahead: int = 0
     stretches: int = 0
-    margin: float = MARGIN
 
     @property
     def outcome(self) -> str:
         """`better`, `worse` or `no difference`."""
         equal = 0.0 if self.criterion == "density" else 1.0  # where both are equal
-        if self.interval is None or abs(self.value - equal) < self.margin:
+        if self.interval is None or abs(self.value - equal) < MARGIN:
             return "no difference"
         low, high = self.interval
         return "better" if high < equal else "worse" if low > equal else "no difference"
@@ -96,7 +96,7 @@ def _formatted(criterion: str, value: float) -> str:
 
 
 def paired_difference(
-    criterion: str, challenger: str, baseline: str, one: Errors, other: Errors, margin: float = MARGIN
+    criterion: str, challenger: str, baseline: str, one: Errors, other: Errors
 ) -> PairedDifference | None:
     """Compare squared errors (nats for `density`) of two models, the lower the better.
 
@@ -136,5 +136,6 @@ def paired_difference(
         interval = (shown(value - half), shown(value + half))
     wins = int((one.mean(axis=(1, 2)) < other.mean(axis=(1, 2))).sum())
     ahead = int((one.mean(axis=(0, 1)) < other.mean(axis=(0, 1))).sum())
-    counts = len(one), wins, shown(value), interval, ahead, one.shape[2]
-    return PairedDifference(criterion, challenger, baseline, *counts, margin)
+    return PairedDifference(
+        criterion, challenger, baseline, len(one), wins, shown(value), interval, ahead, one.shape[2]
+    )

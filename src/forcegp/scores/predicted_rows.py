@@ -27,7 +27,7 @@ class PredictedRows:
     the Dataset where it states a larger one or that of every row; `negative_log_density` of the measured rows under
     that noise; `known_physics` the acceleration of the known forces alone; `unknown_force` Q_U and
     `carried_known_force` what of it is known (Q_K without an analytical mean, else 0); `multiplier` lambda, all
-    three None for a model without forces; `A`, `b` and the mass matrix `mass`.
+    three None for a model without forces; `residual` |A a - b| of the mean; the mass matrix `mass`.
     """
 
     mean: Float[np.ndarray, "rows nv"]
@@ -40,8 +40,7 @@ class PredictedRows:
     multiplier_variance: Float[np.ndarray, "rows m"] | None
     known_physics: Float[np.ndarray, "rows nv"]
     carried_known_force: Float[np.ndarray, "rows nv"] | None
-    A: Float[np.ndarray, "rows c nv"]
-    b: Float[np.ndarray, "rows c"]
+    residual: Float[np.ndarray, "rows c"]
     mass: Float[np.ndarray, "rows nv nv"]
 
     @property
@@ -58,7 +57,7 @@ class PredictedRows:
 def predict_rows(
     posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
 ) -> PredictedRows:
-    """Predict all rows. `A` and `b` are those of the Dataset's own system if it has one, else the model's."""
+    """Predict all rows. The constraint is that of the Dataset's own system if it has one, else the model's."""
     blocks = in_blocks(posterior, dataset, lambda block: _predict_block(posterior, dataset, block), progress)
     joined: dict[str, Any] = {}
     for field in fields(PredictedRows):
@@ -111,22 +110,9 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
         multiplier_variance=None if multiplier is None else _array(multiplier.variance),
         known_physics=known,
         carried_known_force=None if force is None else _array(carried),
-        A=_array(own.A),
-        b=_array(own.b),
+        residual=_array(((own.A @ prediction.mean[..., None])[..., 0] - own.b).abs()),
         mass=mass,
     )
-
-
-def stated_noise_level(posterior: Posterior, dataset: Dataset) -> Float[np.ndarray, " nv"] | None:
-    """What the noise of the model has to be compared with; None where the Dataset does not state its noise.
-
-    Where it states that of every row, rows of a recording may be quieter on the whole than those of another: the level
-    is then that of the training rows, if they stated theirs as well (windows state that of their own mean).
-    """
-    trained = None if posterior.training.weights is not None else posterior.training.noise_std
-    if dataset.noise_std is None or dataset.noise_std.ndim == 1 or trained is None:
-        return dataset.noise_level
-    return _array(trained.square().mean(0).sqrt())
 
 
 def _noise_covariance(
@@ -145,8 +131,8 @@ def _noise_covariance(
     if dataset.noise_std.ndim == 1:
         missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
         return noise + np.maximum(missing, 0.0)[..., None] * identity
-    stated, model = stated_noise_level(posterior, dataset), _array(posterior.noise_std)
-    rows = np.maximum(model / stated, 1.0) * dataset.noise_std[block]
+    model = _array(posterior.noise_std)
+    rows = np.maximum(model / dataset.noise_level, 1.0) * dataset.noise_std[block]
     return noise + (np.square(rows) - np.square(model))[..., None] * identity
 
 

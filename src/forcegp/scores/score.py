@@ -36,7 +36,6 @@ from forcegp.scores.leave_out import leave_out
 from forcegp.scores.motions import STARTS, held_out_motions
 from forcegp.scores.one_model import scored
 from forcegp.scores.page import page, preparation_lines
-from forcegp.scores.paired import MARGIN
 from forcegp.scores.scores import Scores
 from forcegp.scores.splits import Split, split_named
 
@@ -61,7 +60,6 @@ def score(
     identification: str | None = None,
     restarts: int | None = None,
     iterations: int | None = None,
-    margin: float = MARGIN,
     jobs: int | Executor = 1,
     source: Mapping[str, Any] | None = None,
     overwrite: bool = False,
@@ -90,7 +88,6 @@ def score(
     identification: what `identified` is, as in "bodies+viscous+coulomb+rotor@torques"; its mass matrix turns errors of
         accelerations into forces.
     restarts, iterations: of searches for hyper-parameters; None leaves them to the model.
-    margin: ratios of errors within it of 1 count as no difference.
     jobs: pieces at once, in as many processes of this machine, or an executor in which they run.
     source: where the data come from, for the page: "title", and "data", a list of lines.
     overwrite: compute everything anew, also where the folder holds results.
@@ -107,8 +104,6 @@ def score(
         raise InvalidInput(f"models is a {type(given).__name__}; give a Posterior, a mapping from names, or names.")
     if isinstance(seeds, bool) or seeds < 1:
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
-    if not 0.0 <= margin < 1.0:
-        raise InvalidInput(f"the margin is {margin:g}; it must be at least 0 and below 1, such as {MARGIN}.")
     named = given if isinstance(given, Mapping) else {}
     before = {name: each for name, each in named.items() if isinstance(each, Posterior)}
     about = {"kind": KIND, "machine": machine(), "forcegp": __version__, "source": dict(source or {}), "rows": len(log),
@@ -120,7 +115,7 @@ def score(
             digests = {name: fitted_before(each).digest for name, each in before.items()}
             how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
             JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
-        scores = _fitted_before(before, log, recording or log, horizons, starts, integrator, margin, about, progress)
+        scores = _fitted_before(before, log, recording or log, horizons, starts, integrator, about, progress)
         if folder is not None:
             write(scores, Path(folder))
         return scores
@@ -150,7 +145,7 @@ def score(
             "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
         }
         kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
-        scores = replace(_scores(log, runs, kinds, margin, about), fit=partial(_on_all_rows, experiment, chosen))
+        scores = replace(_scores(log, runs, kinds, about), fit=partial(_on_all_rows, experiment, chosen))
         if folder is not None:
             with store.locked():
                 write(scores, store.folder)
@@ -185,7 +180,6 @@ def _fitted_before(
     horizons: tuple[float, ...] | None,
     starts: int,
     integrator: str,
-    margin: float,
     about: dict[str, Any],
     progress: Progress | None,
 ) -> Scores:
@@ -204,7 +198,7 @@ def _fitted_before(
         run |= {"mass_matrix": "the model itself", "training_rows": len(posterior.training)}
         runs[name], models[name] = [run], kind_and_summary(posterior)
     about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
-    return replace(_scores(log, runs, models, margin, about), posteriors=dict(given))
+    return replace(_scores(log, runs, models, about), posteriors=dict(given))
 
 
 def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
@@ -218,7 +212,6 @@ def _scores(
     log: Dataset,
     runs: Mapping[str, Sequence[Mapping[str, Any]]],
     models: Mapping[str, tuple[str, str]],
-    margin: float,
     about: Mapping[str, Any],
 ) -> Scores:
     used = sorted({run["mass_matrix"] for each in runs.values() for run in each if run["error"] is None})
@@ -228,6 +221,5 @@ def _scores(
         runs=runs,
         joint_names=tuple(log.joint_names),
         units={name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
-        margin=margin,
         about={**about, "mass_matrix": used},
     )

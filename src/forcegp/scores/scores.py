@@ -12,7 +12,7 @@ from typing_extensions import override
 from forcegp.errors import FitError, InvalidInput, require_known
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, over_columns
-from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference, paired_difference
+from forcegp.scores.paired import CRITERIA, PairedDifference, paired_difference
 from forcegp.scores.tables import alike, median_and_range
 from forcegp.summary import Summary, listed
 
@@ -35,7 +35,6 @@ class Scores(Summary):
     runs: name -> one entry per split and seed, with "table" (`accuracy.row_scores`, `motions.motion_scores`),
         "stretches" and "motions" for differences, "warnings", and "error" where it failed.
     joint_names, units: of the log.
-    margin: ratios of errors within it of 1 are no difference.
     about: what was done, for the page.
     posteriors: models that were fitted only once, and those that were given.
     fit: how a model by this name is fitted to all rows.
@@ -45,7 +44,6 @@ class Scores(Summary):
     runs: Mapping[str, Sequence[Mapping[str, Any]]]
     joint_names: tuple[str, ...]
     units: Mapping[str, Any]
-    margin: float = MARGIN
     about: Mapping[str, Any] = field(default_factory=dict)
     posteriors: Mapping[str, Posterior] = field(default_factory=dict)
     fit: Callable[[str], Posterior] | None = field(default=None, compare=False)
@@ -131,7 +129,7 @@ class Scores(Summary):
             np.concatenate([np.stack([side[split, seed] for seed in seeds]) for split in splits], axis=2)
             for side in (one, other)
         )
-        return paired_difference(criterion, challenger, baseline, a, b, self.margin)
+        return paired_difference(criterion, challenger, baseline, a, b)
 
     def best_of(self, kinds: Sequence[str], criterion: str, but: str | None = None) -> str | None:
         """The model of these kinds with the lowest error, among those that failed least and diverged least."""

@@ -7,9 +7,8 @@ model-selection for dependent data: hv-block cross-validation").
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -70,14 +69,12 @@ class Split:
 
     def training_rows(self, dataset: Dataset) -> Bool[np.ndarray, " rows"]:
         """Which rows may be learned from: not held out, and not within the guard."""
-        return ~(self.test_rows(dataset) | self._near(dataset, self.guard))
+        return ~self._near(dataset, self.guard)
 
     def _near(self, dataset: Dataset, margin: float) -> Bool[np.ndarray, " rows"]:
         inside = np.zeros(len(dataset), dtype=bool)
         for stretch in self.held_out:
-            after, before = dataset.time >= stretch.begin, dataset.time < stretch.end
-            if margin > 0.0:
-                after, before = dataset.time > stretch.begin - margin, dataset.time < stretch.end + margin
+            after, before = dataset.time >= stretch.begin - margin, dataset.time < stretch.end + margin
             inside |= (dataset.episode == stretch.episode) & after & before
         return inside
 
@@ -110,7 +107,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     """The splits of a text, as `forcegp score --split` takes it: several for leave-one-out, else one.
 
     auto: a quarter of the episodes, or with one episode blocks 3 and 5 of five.
-    episodes:N,N...: whole episodes. Those that `forcegp import` made may be named by a part of the name of their log.
+    episodes:N,N...: whole episodes.
     leave-one-out: every episode once.
     fraction:F[:SEED]: a fraction of the episodes drawn by the seed, at least one on either side.
     blocks:N:K,K...: every episode is cut into N blocks of equal duration; those of these numbers, from 1, are held out,
@@ -128,7 +125,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
             case "leave-one-out", []:
                 return tuple(_episodes_apart(dataset, [number]) for number in dataset.episodes)
             case "episodes", [words]:
-                return (_episodes_apart(dataset, [n for word in words.split(",") for n in _episodes(dataset, word)]),)
+                return (_episodes_apart(dataset, [int(word) for word in words.split(",")]),)
             case "fraction", [share, *seed] if len(seed) < 2:
                 return (_fraction_apart(dataset, float(share), int((seed or ["0"])[0])),)
             case "blocks", [count, numbers]:
@@ -144,16 +141,16 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
 
 def _episodes_apart(dataset: Dataset, episodes: Sequence[int]) -> Split:
     """Whole episodes."""
-    if len(set(episodes)) < len(episodes):
-        raise InvalidInput(f"episodes {list(episodes)} name one twice; name each once.")
+    if len(set(episodes)) < len(episodes) or not set(episodes) <= set(dataset.episodes):
+        known = list(dataset.episodes)
+        raise InvalidInput(f"held-out episodes are {list(episodes)}; name some of {known}, each once.")
     rest = [number for number in dataset.episodes if number not in episodes]
     if not rest:
         raise InvalidInput(
             f"all episodes {list(dataset.episodes)} are held out; leave one to learn from, or hold out blocks of time "
             f"({DEFAULT_BLOCKS})."
         )
-    tested, others = (_listed([_called(dataset, number) for number in numbers]) for numbers in (episodes, rest))
-    words = f"trained on whole episodes ({others}), tested on others ({tested})"
+    words = f"trained on whole episodes ({_listed(rest)}), tested on others ({_listed(episodes)})"
     return Split(f"episodes-{'-'.join(map(str, episodes))}", words, tuple(Stretch(number) for number in episodes))
 
 
@@ -190,40 +187,6 @@ def _blocks_apart(dataset: Dataset, blocks: int, held_out: Sequence[int], guard:
     return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
 
 
-def _episodes(dataset: Dataset, word: str) -> list[int]:
-    """The episode of this number, or those of the one log with this text in its name."""
-    word = word.strip()
-    if word.isdecimal() and int(word) in dataset.episodes:
-        return [int(word)]
-    logs = _logs(dataset)
-    found = sorted({name for name in logs.values() if word and word in name})
-    if len(found) != 1:
-        what = f"several logs are called so ({', '.join(found)})" if found else "no episode or log is called so"
-        known = f", from {', '.join(dict.fromkeys(logs.values()))}" if logs else ""
-        raise InvalidInput(f"episodes:{word}: {what}; the dataset has episodes {list(dataset.episodes)}{known}.")
-    return [number for number, name in logs.items() if name == found[0]]
-
-
-def _logs(dataset: Dataset) -> dict[int, str]:
-    """Name of the log of every episode, where `forcegp import` wrote it down."""
-    imported = dataset.metadata.get("import")
-    listed = imported.get("episodes") if isinstance(imported, Mapping) else None
-    if not isinstance(listed, Sequence):
-        return {}
-    names = {
-        number: PurePath(str(entry["recording"])).name
-        for number, entry in enumerate(listed)
-        if isinstance(entry, Mapping) and "recording" in entry
-    }
-    return {number: names[number] for number in dataset.episodes if number in names}
-
-
-def _called(dataset: Dataset, number: int) -> str:
-    name = _logs(dataset).get(number)
-    return f"episode {number}" if name is None else f"episode {number}, {name}"
-
-
-def _listed(parts: Sequence[int | str]) -> str:
-    *first, last = map(str, parts)
-    separator = "; " if any("," in part for part in (*first, last)) else ", "
-    return f"{separator.join(first)} and {last}" if first else last
+def _listed(numbers: Sequence[int]) -> str:
+    *first, last = map(str, numbers)
+    return f"{', '.join(first)} and {last}" if first else last

@@ -7,22 +7,16 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.figures.friction_curves import curve_panels, friction_curves_figure
-from forcegp.scores.figures.friction_margins import friction_margins_figure
 from forcegp.scores.figures.motion_bands import motion_bands_figure
 from forcegp.scores.figures.prediction import normal_force_figure, prediction_figure
 
 
-def model_figures(
-    posterior: Posterior, dataset: Dataset, mu: float | None = None
-) -> dict[str, tuple[str, Callable[[], Figure]]]:
-    """File name without ending -> a caption, and what draws it; `mu` [1] of the ground for margins to slipping.
+def model_figures(posterior: Posterior, dataset: Dataset) -> dict[str, tuple[str, Callable[[], Figure]]]:
+    """File name without ending -> a caption, and what draws it.
 
     Drawing raises ForceGPError for what the recording does not allow, as motions with uneven time steps.
     """
     found: dict[str, tuple[str, Callable[[], Figure]]] = {}
-    if mu is not None:
-        caption = "How much more force along the ground every foot could bear."
-        found["friction_margins"] = caption, lambda: friction_margins_figure(posterior, dataset, mu)
     if curve_panels(posterior):
         caption = (
             "Forces over velocity, with 95 % bands: the friction laws of the model and what was learned beside them. "

@@ -109,9 +109,8 @@ def _contact_labels(contact: Contact) -> tuple[str, str]:
     """What a contact is, and what its multiplier is."""
     if not isinstance(contact.surface, Held):
         return f"{type(contact.surface).__name__.lower()} at {contact.frame}", "normal force [N]"
-    n = contact.surface.normal
-    axis = "xyz"[n.index(1.0)] if sorted(n) == [0.0, 0.0, 1.0] else "({:.2g}, {:.2g}, {:.2g})".format(*n)
-    if isinstance(contact, LoopClosure):
-        where = f"{contact.frame} with {contact.second_frame}"
-        return (f"{where} about {axis}", "torque [Nm]") if contact.turning else (f"{where} along {axis}", "force [N]")
+    axis = " ".join(f"{x:.2g}" for x in contact.surface.normal)
+    axis = {"1 0 0": "x", "0 1 0": "y", "0 0 1": "z"}.get(axis, f"({axis})")
+    if isinstance(contact, LoopClosure) and contact.turning:
+        return f"{contact.frame} about {axis}", "torque [Nm]"
     return f"{contact.frame} along {axis}", "force [N]"
