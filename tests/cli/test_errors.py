@@ -3,8 +3,6 @@
 import dataclasses
 import os
 import signal
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -227,13 +225,3 @@ def test_a_box_becomes_a_sentence():
 │         Train on so many rows.         │
 ╰────────────────────────────────────────╯"""
     assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."
-
-
-def test_a_limit_of_the_address_space_is_refused_before_libraries_wait_in_it(folder):
-    limits = 'ulimit -v 800000; ulimit -t 60; exec "$0" "$@"'
-    command = ["bash", "-c", limits, sys.executable, "-m", "forcegp", "fit", "arm.h5", "--out", "run"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith("forcegp: the address space is limited to 781 MiB (ulimit -v), and ")
-    assert done.stderr.endswith("MiB more are needed to begin with; raise the limit.\n")
-    assert done.stderr.count("\n") == 1

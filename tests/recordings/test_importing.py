@@ -184,6 +184,19 @@ def test_wrapped_angles_are_continued_if_told_so(tmp_path):
     np.testing.assert_allclose(found.q, data["q"], atol=1e-13)
 
 
+def test_angles_are_continued_within_an_episode(tmp_path):
+    """Another episode begins as it was logged."""
+    data = motion()
+    number = (data["time"] > 0.2).astype(float)
+    data["q"] = np.where(number[:, None] > 0, 0.2, 3.1) + 0.0 * data["q"]
+    path = write_text(tmp_path / "log.csv", {**table(data), "number": number})
+    found = imported(path, dataclasses.replace(NAMES, episode="number"), unwrap=True)
+    assert set(found.q[:, 0]) == {3.1, 0.2}
+    data["q"][number > 0] = -3.1
+    found = imported(write_text(path, {**table(data), "number": number}), dataclasses.replace(NAMES, episode="number"), unwrap=True)
+    assert set(found.q[:, 0]) == {3.1, -3.1}
+
+
 def test_coupled_angles_units_signs_and_constants(tmp_path):
     data = motion()
     columns = {

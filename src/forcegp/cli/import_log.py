@@ -93,7 +93,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
     end: Seconds = None
     """Leave out what comes later."""
     unwrap: bool = False
-    """Continue angles that jump by a turn; those that count turns stay."""
+    """Continue angles of joints that jump by a turn."""
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
     max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
