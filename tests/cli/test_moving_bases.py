@@ -55,8 +55,6 @@ def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
     masses = [each["value"] for name, each in content["estimates"].items() if name.endswith(".mass")]
     assert sum(masses) == pytest.approx(bodies.sum() + 0.6 * bodies[0], rel=0.01)
     assert content["estimates"]["coulomb.level.a_hip"]["value"] == pytest.approx(0.5, abs=0.02)
-    before, after = (max(content["residuals"][when]["acceleration_rms"]) for when in ("before", "after"))
-    assert after < before
     fitted = forcegp("fit", "walk.h5", "--identified", "found", "--forces", "gp:joint-friction", "--points", 30,
                      "--restarts", 1, "--noise", 0.01, "--out", "run", folder=folder)  # fmt: skip
     assert fitted.returncode == 0, fitted.stderr

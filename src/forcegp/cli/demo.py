@@ -150,7 +150,7 @@ class Demo(Command):
         model = train.model.with_forces(forcegp.JointForces())
         model = model if mean else model.without_mean()
         how: dict[str, Any] = {"points": self.points, "iterations": self.iterations, "jobs": self.jobs}
-        with terminal.progress(f"fitting {name}", may_end_early=True) as report:
+        with terminal.progress(f"fitting {name}") as report:
             posterior: Any = forcegp.scores.learn(model, train, report=report, **how)[0]
         seconds = time.monotonic() - start
         forcegp.save_posterior(posterior, run)

@@ -35,7 +35,7 @@ GROUPS: Mapping[str, str] = {
     "Score": "split guard seeds seed_list horizon margin strict",
     "Program": "to steps covariance jacobian unchecked",
     "Compute": "preset seed jobs device port",
-    "Output": "out plots report html browser write_mapping docs overwrite json",
+    "Output": "out plots report html write_mapping docs overwrite json",
     "Other": "debug",
 }
 """Options of all commands by purpose, in the order of the pages: a name means the same everywhere."""
