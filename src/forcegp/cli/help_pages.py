@@ -49,8 +49,7 @@ HELP = ("-h, --help", "Show this page.")
 
 def front_page(description: str, summaries: Mapping[str, str]) -> str:
     """The page of `forcegp --help`."""
-    completion = "--print-completion SHELL", "Print what completes commands and options in bash, zsh or fish."
-    others = [HELP, ("--version", "Print the version."), completion]
+    others = [HELP, ("--version", "Print the version.")]
     rows = [*_section("Commands", summaries.items()), *_section("Other", others)]
     return "\n".join(["usage: forcegp COMMAND [OPTIONS]", "", *_paragraphs(description), *rows])
 

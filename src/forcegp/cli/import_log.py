@@ -41,7 +41,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
     wheels: Annotated[tuple[str, ...], listed(WHEELS, "none")] = ()
     """Wheels that roll about the y axes of these frames without slipping, on level ground; radius in m."""
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
-    """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
+    """Files, or folders of ROS 2 bags; each is at least one episode."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
         None
     )
@@ -161,7 +161,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
 
 @dataclass(frozen=True, kw_only=True)
 class Import(LogOptions):
-    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
+    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags.
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
     their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS

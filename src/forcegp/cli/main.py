@@ -14,10 +14,10 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from itertools import takewhile
-from typing import Annotated, Any, get_type_hints
+from typing import get_type_hints
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, subcommand
+from tyro.conf import FlagCreatePairsOff
 
 from forcegp.cli.command import Command, repeats
 from forcegp.cli.help_pages import command_page, flag_of, front_page, show
@@ -66,7 +66,6 @@ NOT_NUMBERS = {
     "could not convert string to float": "a number",
 }
 """What Python calls a text that is no number, and what would be one."""
-SHELLS = ("bash", "zsh", "fish")
 
 
 def command_class(name: str) -> type[Command]:
@@ -76,7 +75,7 @@ def command_class(name: str) -> type[Command]:
 
 
 def parse_arguments(words: Sequence[str]) -> Command:
-    """The command that the words ask for. --help and --print-completion print and raise SystemExit(0).
+    """The command that the words ask for. --help prints and raises SystemExit(0).
 
     Raises InvalidInput, with a message of one line, for words that make no command.
     """
@@ -90,8 +89,6 @@ def parse_arguments(words: Sequence[str]) -> Command:
     if first in ("-h", "--help"):
         show(front_page(DESCRIPTION, COMMANDS))
         raise SystemExit(0)
-    if first == "--print-completion":
-        _print_completion(others)
     close = difflib.get_close_matches(first, COMMANDS, n=1)
     hint = f" Did you mean {close[0]}?" if close else " Options follow the command." if first.startswith("-") else ""
     what = f"there is no command {first!r}.{hint}" if first else "no command was given."
@@ -127,23 +124,6 @@ def _check_options(name: str, kind: type[Command], words: Sequence[str]) -> None
         if flag in given and not repeats(flags[flag]):
             raise InvalidInput(f"{flag} is given twice; give it once, a list with commas.")
         given.add(flag)
-
-
-def _print_completion(words: Sequence[str]) -> None:
-    if len(words) != 1 or words[0] not in SHELLS:
-        raise InvalidInput(f"--print-completion takes the name of a shell: {', '.join(SHELLS)}.")
-    kinds: Any = None
-    for name, summary in COMMANDS.items():
-        kind: Any = Annotated[command_class(name), subcommand(name, description=summary, prefix_name=False)]
-        kinds = kind if kinds is None else kinds | kind
-    with contextlib.redirect_stdout(io.StringIO()) as script, contextlib.suppress(SystemExit):
-        tyro.cli(kinds, prog="forcegp", args=["--tyro-write-completion", words[0], "-"], config=(FlagCreatePairsOff,))
-    # a newline within a description would end it, and complete its next words as if they were options
-    text = re.sub(r"(?m)^.*COMPLETION_SPEC = .*$", lambda line: re.sub(r"\\+n *", " ", line[0]), script.getvalue())
-    for name, summary in COMMANDS.items():
-        text = text.replace(f"'{name}': {{'description': '{name}'", f"'{name}': {{'description': '{summary}'")
-    print(text, end="")
-    raise SystemExit(0)
 
 
 def one_line(box: str) -> str:

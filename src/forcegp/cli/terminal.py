@@ -64,6 +64,7 @@ PLAIN_SECONDS = 10.0
 UNLIMITED = 10_000
 """Columns of a terminal that cuts nothing."""
 
+
 @runtime_checkable
 class ProgressCallback(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
