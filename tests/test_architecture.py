@@ -252,7 +252,7 @@ def test_the_whole_public_api_loads_neither_simulator_nor_plots_nor_command_line
     assert not loaded & IMPORTED_WHERE_USED.keys()
 
 
-@pytest.mark.parametrize("words", ["--help", "import --help", "fit --pionts 3", "fti", "--print-completion bash"])
+@pytest.mark.parametrize("words", ["--help", "import --help", "fit --pionts 3", "fti"])
 def test_help_and_usage_errors_need_neither_torch_nor_numpy(words):
     loaded = modules_loaded_by(
         "import contextlib; from forcegp.cli.main import main\n"

@@ -128,7 +128,7 @@ def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path)
     with subprocess.Popen(command, cwd=tmp_path, **to) as process:
         os.close(terminal)
         seen = b""
-        while b" left" not in seen:  # the bar tells the remaining time, so the work is under way
+        while b" left " not in seen:  # the bar tells the remaining time, so the work is under way
             seen += os.read(screen, 4096)
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(OSError):  # how Linux reports the end of a terminal; others with an empty read

@@ -58,7 +58,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
 
 ELSEWHERE = {"auto": "test_auto", "demo": "test_commands"}
 """Those that take long, and where they are run."""
-IN_A_PROCESS = ("robot", "fit")
+IN_A_PROCESS = ("fit",)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +104,8 @@ def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(installed, folder):
     assert not (folder / "never").exists()
 
 
-def test_people_read_the_result_on_stdout_and_warnings_on_stderr(installed, folder):
-    done = installed("score", "run", "arm.h5", folder=folder)
+def test_people_read_the_result_on_stdout_and_warnings_on_stderr(forcegp, folder):
+    done = forcegp("score", "run", "arm.h5", folder=folder)
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"^\s*(?:pan|lift|bend)\s", done.stdout, re.M)) == 3
     lines = done.stderr.splitlines()

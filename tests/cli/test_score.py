@@ -104,6 +104,7 @@ def test_the_same_command_resumes_and_another_is_refused(forcegp, found, folder)
 
 def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder):
     words = ["score", "raw.h5", "--robot", "arm.urdf", "--out", "raw", "--seeds", 1, *QUICK, "--forces", "given"]
+    words += ["--identification", "viscous@accelerations"]
     words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.01]
     done = forcegp(*words, folder=folder)
     assert done.returncode == 0, done.stderr

@@ -26,7 +26,6 @@ FLAGS = {
     "log73.mat": ARRAYS,
     "log.h5": ARRAYS,
     "log.mcap": "--q /joint_states:position --u /joint_states:effort --joints shoulder,elbow",
-    "lerobot": "--q observation.state.q_{joints} --u observation.effort --joints shoulder,elbow",
 }
 CELLS = st.sampled_from(
     ("0", "1", "", "nan", "inf", "x", "1e400", "-", "1,5", '"', "'", "\x00", "a" * 140_000, "é", "1 2", "#", "\r")

@@ -14,7 +14,6 @@ from tests.recordings.log_files import (
     table,
     write_bag2,
     write_hdf5,
-    write_lerobot,
     write_matlab5,
     write_matlab73,
     write_parquet,
@@ -37,7 +36,7 @@ MODELS = ("structured", "carried", "independent")
 QUICK = OptimizerOptions(iterations=2)
 INPUTS: Any = SimpleNamespace(folder=None)
 """`folder` with the files below, `data`, `posterior`, `predictor`; filled by `make`."""
-LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.parquet", "log.mcap", "lerobot")
+LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.parquet", "log.mcap")
 
 
 def make(folder: Path) -> None:
@@ -73,7 +72,6 @@ def make(folder: Path) -> None:
     write_matlab73(folder / "log73.mat", rows)
     write_hdf5(folder / "log.h5", rows)
     write_parquet(folder / "log.parquet", table(rows))
-    write_lerobot(folder / "lerobot", rows)
     next(write_bag2(folder / "bag", rows).glob("*.mcap")).rename(folder / "log.mcap")
     (folder / "log.yaml").write_text(
         "time: time\nq: q_{joints}\nv: v_{joints}\nu: u_{joints}\njoints: shoulder,elbow\n"

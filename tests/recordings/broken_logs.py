@@ -2,7 +2,6 @@
 
 import gzip
 import io
-import json
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -18,14 +17,12 @@ from tests.recordings.log_files import (
     table,
     write_bag2,
     write_hdf5,
-    write_lerobot,
     write_text,
 )
 
 FLAGS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --joints shoulder,elbow"
 ARRAYS = "--time time --q q --v v --u u --joints shoulder,elbow"
 TOPIC = "--q /joint_states:position --u /joint_states:effort --joints shoulder,elbow"
-LEROBOT = "--q observation.state.q_{joints} --u observation.effort --joints shoulder,elbow"
 
 URDF = """<robot name="pendulum"><link name="base"/>
 {links}
@@ -187,26 +184,8 @@ def unknown_compression(folder: Path) -> Path:
     return path
 
 
-def lerobot(change: Callable[[dict], None]) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        path = write_lerobot(folder / "log", motion())
-        info = json.loads((path / "meta" / "info.json").read_text())
-        change(info)
-        (path / "meta" / "info.json").write_text(json.dumps(info))
-        return path
-
-    return make
-
-
-def episode_again(folder: Path) -> Path:
-    path = write_lerobot(folder / "log", motion())
-    first, second = sorted(path.rglob("*.parquet"))
-    content = second.read_bytes()
-    (first.parent / "file-002.parquet").write_bytes(first.read_bytes())
-    second.write_bytes(content)
-    info = json.loads((path / "meta" / "info.json").read_text())
-    (path / "meta" / "info.json").write_text(json.dumps(info | {"total_frames": 300}))
-    return path
+def episode_again(columns: dict) -> None:
+    columns["episode"] = np.repeat([0.0, 1.0, 0.0, 0.0], len(columns["time"]) // 4)
 
 
 def with_mapping(content: str) -> Callable[[Path], Path]:
@@ -273,7 +252,7 @@ BROKEN = {
     "latin-1": Broken(written("log.csv", "time,q_größe\n0,1\n".encode("latin-1")), "not UTF-8 text"),
     "unknown extension": Broken(written("log.xlsx", b"PK"), "the extension '.xlsx' is not known"),
     "pickle": Broken(written("log.pkl", pickle.dumps([1])), "reading those runs code"),
-    "folder": Broken(folder_of_logs, "neither a ROS 2 bag (metadata.yaml) nor a LeRobot"),
+    "folder": Broken(folder_of_logs, "no ROS 2 bag (metadata.yaml)"),
     "not gzip": Broken(written("log.csv.gz", b"time,q\n0,1\n"), "is not compressed with gzip"),
     "gzip bomb": Broken(bomb_of_gzip, "no log of sensors shrinks so far"),
     "time backwards": Broken(csv(swapped), "time runs backwards by 0.00195312 s at row 51 (line 53)"),
@@ -314,6 +293,5 @@ BROKEN = {
         "several topics are joined by their stamps",
         "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --joints shoulder,elbow",
     ),
-    "fewer frames": Broken(lerobot(lambda info: info.update(total_frames=7)), "has 7 frames", LEROBOT),
-    "episode again": Broken(episode_again, "episode 0 begins again at row 200", LEROBOT),
+    "episode again": Broken(csv(episode_again), "episode 0 begins again at row 100", f"{FLAGS} --episode episode"),
 }

@@ -1,7 +1,6 @@
 """One motion of two joints, written in every format that can be imported."""
 
 import gzip
-import json
 from pathlib import Path
 
 import h5py
@@ -139,31 +138,3 @@ def write_bag2(
             own = store.types[wrench.msgtype](header=message.header, wrench=both)
             bag.write(wrench, stamp + 1000, store.serialize_cdr(own, wrench.msgtype))
     return path
-
-
-def write_lerobot(folder: Path, data: dict[str, np.ndarray], version: str = "v3.0", episodes: int = 2) -> Path:
-    """Two episodes; 3.0 has both in files of their own number, 2.1 one file each."""
-    rows = len(data["time"])
-    bounds = np.linspace(0, rows, episodes + 1).astype(int)
-    number = np.searchsorted(bounds[1:], np.arange(rows), side="right")
-    columns = {
-        "observation.state": np.hstack([data["q"], data["v"]]),
-        "observation.effort": data["u"],
-        "timestamp": data["time"] - data["time"][bounds[number]],
-        "frame_index": np.arange(rows) - bounds[number],
-        "episode_index": number,
-        "index": np.arange(rows),
-    }
-    (folder / "meta").mkdir(parents=True)
-    chunk = folder / "data" / "chunk-000"
-    chunk.mkdir(parents=True)
-    for episode in range(episodes):
-        own = {name: values[number == episode] for name, values in columns.items()}
-        name = f"file-{episode:03d}" if version == "v3.0" else f"episode_{episode:06d}"
-        write_parquet(chunk / f"{name}.parquet", own)
-    state = {"dtype": "float64", "shape": [4], "names": [f"{s}_{joint}" for s in "qv" for joint in JOINTS]}
-    effort = {"dtype": "float64", "shape": [2], "names": {"motors": list(JOINTS)}}
-    features = {"observation.state": state, "observation.effort": effort}
-    info = {"codebase_version": version, "total_frames": rows, "total_episodes": episodes, "features": features}
-    (folder / "meta" / "info.json").write_text(json.dumps(info))
-    return folder

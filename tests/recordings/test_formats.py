@@ -10,7 +10,6 @@ from tests.recordings.log_files import (
     write_bag1,
     write_bag2,
     write_hdf5,
-    write_lerobot,
     write_matlab5,
     write_matlab73,
     write_parquet,
@@ -207,30 +206,6 @@ class TestAnyMessage(TestRos2Folder):
             "/wrench:wrench.force.y": np.full(200, 0.5),
             "/wrench:wrench.torque.z": row**2,
         }
-
-
-class TestLeRobot3(Tables):
-    version = "v3.0"
-
-    def write(self, folder):
-        return write_lerobot(folder / "log", motion(), self.version)
-
-    def truncated(self, path):
-        return sorted(path.rglob("*.parquet"))[-1]
-
-    def expected(self):
-        data = motion()
-        columns = {
-            f"observation.state.{signal}_{joint}": data[signal][:, i]
-            for signal in "qv"
-            for i, joint in enumerate(JOINTS)
-        }
-        columns |= {f"observation.effort.{joint}": data["u"][:, i] for i, joint in enumerate(JOINTS)}
-        return columns | {"episode_index": np.repeat([0, 1], 100)}
-
-
-class TestLeRobot21(TestLeRobot3):
-    version = "v2.1"
 
 
 def test_columns_of_several_topics_are_refused(tmp_path):

@@ -13,7 +13,6 @@ from tests.recordings.log_files import (
     write_bag1,
     write_bag2,
     write_hdf5,
-    write_lerobot,
     write_matlab5,
     write_matlab73,
     write_parquet,
@@ -53,16 +52,6 @@ FORMATS = {
     "bag": ("log.bag", write_bag1, TOPIC),
     "mcap": ("log", write_bag2, TOPIC),
     "db3": ("log", lambda p, d: write_bag2(p, d, "sqlite3"), TOPIC),
-    "lerobot 3.0": (
-        "log",
-        lambda p, d: write_lerobot(p, d, episodes=1),
-        ColumnMapping(
-            q=("observation.state.q_{joints}",),
-            v=("observation.state.v_{joints}",),
-            u=("observation.effort",),
-            joints=JOINTS,
-        ),
-    ),
 }
 
 
@@ -182,6 +171,20 @@ def test_wrapped_angles_are_continued_if_told_so(tmp_path):
         imported(path, NAMES)
     found = imported(path, NAMES, unwrap=True)
     np.testing.assert_allclose(found.q, data["q"], atol=1e-13)
+
+
+def test_angles_are_continued_within_an_episode(tmp_path):
+    """Another episode begins as it was logged."""
+    data = motion()
+    number = (data["time"] > 0.2).astype(float)
+    data["q"] = np.where(number[:, None] > 0, 0.2, 3.1) + 0.0 * data["q"]
+    path = write_text(tmp_path / "log.csv", {**table(data), "number": number})
+    found = imported(path, dataclasses.replace(NAMES, episode="number"), unwrap=True)
+    assert set(found.q[:, 0]) == {3.1, 0.2}
+    data["q"][number > 0] = -3.1
+    write_text(path, {**table(data), "number": number})
+    found = imported(path, dataclasses.replace(NAMES, episode="number"), unwrap=True)
+    assert set(found.q[:, 0]) == {3.1, -3.1}
 
 
 def test_coupled_angles_units_signs_and_constants(tmp_path):

@@ -124,10 +124,10 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         assert recording.model is not None, "it has one"
         expression, _, evidence = identification(model).partition("@")
         laws = forcegp.scores.summands(expression)
-        with terminal.progress("identifying", may_end_early=True) as progress:
+        with terminal.progress("identifying") as progress:
             how: dict[str, Any] = {"evidence": forcegp.evidence.parse_evidence(evidence), "report": progress}
             identified: Any = forcegp.scores.learn(named(recording.model, laws), recording, **how)[0]
-        with terminal.progress("looking for a payload", may_end_early=True) as progress:
+        with terminal.progress("looking for a payload") as progress:
             try:
                 payload = with_payload(named(recording.model, laws[1:]), recording, self.link, report=progress)
                 held = payload_text(payload)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from statistics import median
 from typing import Any
 
 import forcegp
@@ -12,7 +11,6 @@ import forcegp.data
 from forcegp.cli.import_log import stance_text
 from forcegp.cli.payload import DRY, LAWS
 from forcegp.cli.terminal import number
-from forcegp.summary import listed
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
@@ -106,37 +104,27 @@ def best_sentence(scores: forcegp.Scores, dataset: forcegp.Dataset) -> str:
     """Which model to trust, and how much better than the URDF it is on unseen time."""
     best = scores.recommended
     assert best is not None, "a model was scored"
-    unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
-    horizon = f"{scores.horizons[-1]:g} s" if scores.horizons else ""
-    patterns = {
-        f"positions {horizon} ahead are wrong by {{:.2g}} {unit}": _motion,
-        "accelerations are wrong by {:.2g} of their standard deviation": _acceleration,
-    }
-    name, error = short_name(best), _acceleration(scores, best)
-    if _motion(scores, best) is None and error is not None and error >= 1.0:  # no better than a = 0
+    name, motion, error = short_name(best), _motion(scores, best), _acceleration(scores, best)
+    wrong = "" if error is None else f"wrong by {error:.2g} of their standard deviation"
+    poor = error is not None and error >= 1.0  # no better than a = 0
+    if motion is None and poor:
         return (
-            f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are wrong by "
-            f"{error:.2g} of their standard deviation. Forces, flags of stance, units or the robot's file are wrong."
+            f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are {wrong}. "
+            "Forces, flags of stance, units or the robot's file are wrong."
         )
-    for pattern, score in patterns.items():
-        own, urdf = score(scores, best), score(scores, "given")
-        if own is not None:
-            against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
-            if urdf is None and score is _motion and "given" in scores.models:
-                against = "; with the URDF alone they diverge"
-            doubt = _no_better_than_rest(scores, best) if error is not None and error >= 1.0 else ""
-            return f"Trust the model “{name}”: on unseen time, {pattern.format(own)}{against}.{doubt}"
-    return f"Trust the model “{name}”."
-
-
-def _no_better_than_rest(scores: forcegp.Scores, model: str) -> str:
-    """Which joints make the mean error of the acceleration larger than that of no acceleration at all."""
-    each = zip(scores.joint_names, scores.columns("nrmse", model=model), strict=True)
-    errors = {name: error for name, error in each if error is not None}
-    above = [f"{name} {error:.3g}" for name, error in errors.items() if error >= 1.0]
-    others = [error for error in errors.values() if error < 1.0]
-    rest = f"; in the median {median(others):.2g} at the others" if others else ""
-    return f" But no acceleration at all has a lower error at {listed(above)} (nRMSE{rest})."
+    if motion is None:
+        urdf = _acceleration(scores, "given")
+        against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
+        trust = f": on unseen time, accelerations are {wrong}{against}" if wrong else ""
+        return f"Trust the model “{name}”{trust}."
+    urdf = _motion(scores, "given")
+    against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
+    if urdf is None and "given" in scores.models:
+        against = "; with the URDF alone they diverge"
+    unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
+    ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
+    doubt = f" But its accelerations are {wrong}." if poor else ""
+    return f"Trust the model “{name}”: on unseen time, {ahead}.{doubt}"
 
 
 def _motion(scores: forcegp.Scores, model: str) -> float | None:

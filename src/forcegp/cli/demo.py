@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -61,17 +59,15 @@ class Demo(Command):
         if self.points < 2:
             raise InvalidInput(f"--points is {self.points}; at least 2 are needed.")
         self.require_free(self.out)
-        machine = {"system": platform.platform(), "cores": os.cpu_count(), "python": platform.python_version()}
         options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
         start = time.monotonic()
-        with self.folder(self.out, {"options": options, "machine": machine}) as folder:
+        with self.folder(self.out, {"options": options}) as folder:
             data, seeds = {}, {"train": self.seed, "test": self.seed + 1}
             for name, seed in seeds.items():
-                begin, how = time.monotonic(), {"seconds": self.seconds, "seed": seed, "noise": NOISE}
+                how: dict[str, Any] = {"seconds": self.seconds, "seed": seed, "noise": NOISE}
                 data[name] = simulate_with_progress(terminal, "kuka-surface", **how)
                 data[name].save(folder / f"{name}.h5")
-                seconds = time.monotonic() - begin
-                terminal.note(f"simulated {name}: {len(data[name])} rows, seed {seed} ({seconds:.1f} s)")
+                terminal.note(f"simulated {name}: {len(data[name])} rows, seed {seed}")
             train, test = data.values()
             models, fits = {}, {}
             for name, (place, mean) in MODELS.items():
@@ -80,19 +76,17 @@ class Demo(Command):
                 scores = forcegp.score(models, test, horizons=(), progress=report)
             for warning in scores.warnings:
                 terminal.warn(warning)
-            best = models["S-GP + analytical mean"]
             results: dict[str, Any] = {
                 "out": str(self.out),
                 "seeds": seeds,
                 "points": self.points,
                 "seconds": self.seconds,
+                "models": {name: {"run": str(self.out / MODELS[name][0]), "fit": fit} for name, fit in fits.items()},
+                "scores": scores.to_dict(),
+                "wall_seconds": time.monotonic() - start,
             }
-            results["models"] = {
-                name: {"run": str(self.out / place), "fit": fits[name]} for name, (place, _) in MODELS.items()
-            }
-            results |= {"scores": scores.to_dict(), "wall_seconds": time.monotonic() - start, "machine": machine}
             write_json(folder / "results.json", results)
-            sentence = self._write_report(terminal, folder, best, test, results)
+            sentence = self._write_report(terminal, folder, models["S-GP + analytical mean"], test, results)
         title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
         terminal.show(
             *comparison(scores, title),
@@ -150,7 +144,7 @@ class Demo(Command):
         model = train.model.with_forces(forcegp.JointForces())
         model = model if mean else model.without_mean()
         how: dict[str, Any] = {"points": self.points, "iterations": self.iterations, "jobs": self.jobs}
-        with terminal.progress(f"fitting {name}", may_end_early=True) as report:
+        with terminal.progress(f"fitting {name}") as report:
             posterior: Any = forcegp.scores.learn(model, train, report=report, **how)[0]
         seconds = time.monotonic() - start
         forcegp.save_posterior(posterior, run)

@@ -25,7 +25,7 @@ from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Overwriting, listed, n
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.estimates import estimates_table, what_is_open
 from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of
-from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
+from forcegp.cli.terminal import Terminal, facts, with_option_names
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
 NEARLY_ALL = 0.995
@@ -130,7 +130,7 @@ class Fit(RobotOptions, Overwriting):
         if windows and noise is None:  # no dataset states the noise of windows
             noise = forcegp.Noise(None, learn=True)
         model = forcegp.scores.named_model(given, words, noise).to(self.device)
-        with terminal.progress("fitting", may_end_early=True) as report:
+        with terminal.progress("fitting") as report:
             posterior, found = forcegp.scores.learn(
                 model,
                 dataset,
@@ -142,10 +142,6 @@ class Fit(RobotOptions, Overwriting):
             )
         summary = fit_summary(posterior, time.monotonic() - start)
         tables = fit_report(self.out, posterior, summary)
-        if not model.unknown_forces and model.is_open:
-            residuals = _residuals(given, posterior, recording)
-            tables.insert(1, residuals.pop("table"))
-            summary["residuals"] = residuals
         self._write(posterior)
         for note in [*forces_of(given), *notes, *found]:
             terminal.note(note)
@@ -184,10 +180,9 @@ class Fit(RobotOptions, Overwriting):
             found = forcegp.checks.quick_check(*looked_at)
             of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
             used = [each for each in found if each.subject not in of_accelerations]
-            # check has no --contact: it would find nothing wrong with the contacts of the data
-            line = findings_in_one_line(used, self.data, self.words(*ROBOT_OPTIONS), advise=bool(self.contact))
-            if line is not None:
-                terminal.warn(line)
+            if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
+                see = f"See {shlex.join(['forcegp', 'check', str(self.data), *self.words(*ROBOT_OPTIONS)])}"
+                terminal.warn(findings_in_one_line(used, used[0].remedy.rstrip(".") if self.contact else see))
         warnings.simplefilter("ignore", ContactWarning)
 
     def _rows(self, dataset: forcegp.Dataset, model: forcegp.Model) -> tuple[forcegp.Dataset, str | None]:
@@ -246,21 +241,11 @@ def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> N
     known.to_urdf(folder / f"{name}.urdf")
 
 
-def findings_in_one_line(
-    findings: Sequence[forcegp.checks.Finding], data: Path, words: Sequence[str] = (), advise: bool = False
-) -> str | None:
-    """The worst findings, the subjects of the others, and where to read more; None if there are none.
-
-    `words` are the options of forcegp check that show the same findings; `advise` names what to do about the worst
-    finding instead, where no options do.
-    """
-    if not findings:
-        return None
+def findings_in_one_line(findings: Sequence[forcegp.checks.Finding], following: str) -> str:
+    """The worst findings, the subjects of the others, and what to do next."""
     shown = [f"{each.subject}: {each.seen.rstrip('.')}" for each in findings[:MOST]]
     more = dict.fromkeys(each.subject for each in findings[MOST:])
     others = [f"further {', '.join(more)}"] if more else []
-    see = f"See {shlex.join(['forcegp', 'check', str(data), *words])}"
-    following = findings[0].remedy.rstrip(".") if advise else see
     return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
 
 
@@ -333,20 +318,6 @@ def fit_report(run: Path, posterior: Any, summary: Mapping[str, Any]) -> list[An
             f"rms of q by joint: {error}."
         )
     return [*shown, f"Next: forcegp score {run} TEST.h5"]
-
-
-def _residuals(given: forcegp.Model, posterior: Any, dataset: forcegp.Dataset) -> dict[str, Any]:
-    """How far the residuals of the data fell, as numbers and as a table."""
-    from forcegp.evidence import motion_residuals, residual_scores
-
-    models = {"before": given, "after": posterior.model}
-    found: dict[str, Any] = {
-        name: residual_scores(*motion_residuals(dataset, model), dataset) for name, model in models.items()
-    }
-    scores = [each[score] for score in ("force_rms", "acceleration_nrmse") for each in found.values()]
-    rows = [[joint, *(f"{each[k]:.4g}" for each in scores)] for k, joint in enumerate(dataset.joint_names)]
-    header = ["joint", "force rms\nbefore", "\nafter", "nRMSE of a\nbefore", "\nafter"]
-    return {**found, "table": columns(f"residuals of {len(dataset)} rows, in Nm or N", header, rows)}
 
 
 def _per_joint(values: list[float]) -> str:

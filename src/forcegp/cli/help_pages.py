@@ -35,7 +35,7 @@ GROUPS: Mapping[str, str] = {
     "Score": "split guard seeds seed_list horizon margin strict",
     "Program": "to steps covariance jacobian unchecked",
     "Compute": "preset seed jobs device port",
-    "Output": "out plots report html browser write_mapping docs overwrite json",
+    "Output": "out plots report html write_mapping docs overwrite json",
     "Other": "debug",
 }
 """Options of all commands by purpose, in the order of the pages: a name means the same everywhere."""
@@ -49,8 +49,7 @@ HELP = ("-h, --help", "Show this page.")
 
 def front_page(description: str, summaries: Mapping[str, str]) -> str:
     """The page of `forcegp --help`."""
-    completion = "--print-completion SHELL", "Print what completes commands and options in bash, zsh or fish."
-    others = [HELP, ("--version", "Print the version."), completion]
+    others = [HELP, ("--version", "Print the version.")]
     rows = [*_section("Commands", summaries.items()), *_section("Other", others)]
     return "\n".join(["usage: forcegp COMMAND [OPTIONS]", "", *_paragraphs(description), *rows])
 

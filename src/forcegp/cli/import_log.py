@@ -17,7 +17,7 @@ from forcegp.atomic_files import atomic_file, write_text
 from forcegp.cli.command import LOG, MAPPING, NUMBERS, URDF, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import FEET, WHEELS, parse_feet, parse_wheels
 from forcegp.cli.input_options import PreparationOptions, RobotOptions
-from forcegp.cli.terminal import Terminal, columns, facts, shown
+from forcegp.cli.terminal import Terminal, facts, shown
 from forcegp.errors import ForceGPError, InvalidInput
 
 NOT_ABOUT_LOGS = {"logs", "out", "stance", "json", "debug"}
@@ -40,7 +40,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
     wheels: Annotated[tuple[str, ...], listed(WHEELS, "none")] = ()
     """Wheels that roll about the y axes of these frames without slipping, on level ground; radius in m."""
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
-    """Files, or folders of ROS 2 bags and LeRobot datasets; each is at least one episode."""
+    """Files, or folders of ROS 2 bags; each is at least one episode."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
         None
     )
@@ -92,7 +92,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
     end: Seconds = None
     """Leave out what comes later."""
     unwrap: bool = False
-    """Continue angles that jump by a turn; those that count turns stay."""
+    """Continue angles of joints that jump by a turn."""
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
     max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
@@ -160,7 +160,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
 
 @dataclass(frozen=True, kw_only=True)
 class Import(LogOptions):
-    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags, LeRobot.
+    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags.
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
     their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
@@ -212,7 +212,7 @@ class Import(LogOptions):
             if self.write_mapping is not None and mapping is not None:
                 write_text(self.write_mapping, forcegp.recordings.mapping_text(mapping))
         shown = [] if mapping is None else [_imported(terminal, self.out, done)]
-        terminal.show(*shown, *([] if prepared is None else _price(self.out, raw, prepared)))
+        terminal.show(*shown, *([] if prepared is None else [_price(self.out, raw, prepared)]))
         return {"out": str(self.out), **done}
 
     def _dataset(self, preparation: forcegp.Preparation) -> forcegp.Dataset:
@@ -274,8 +274,8 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> list[Any]:
-    """The price, joint by joint."""
+def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> Any:
+    """What was done, and the noise of every joint before and after; what the filter removed is in the report."""
     report = prepared.report
     before, after = report["rows"]
     values = {"rows": f"{before} -> {after}"}
@@ -293,27 +293,12 @@ def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared)
             values[f"{name} of u"] = f"{milliseconds} ms{'' if why is None else f'; {why}'}"
     if "stance" in report:
         values["stance"] = stance_text(report)
-    tables: list[Any] = [facts(f"{out}: prepared", values)]
-    if cutoff is None:
-        return tables
-
-    noise, removed = report["acceleration_noise"], report["power_removed"]
-    own = dataset.joint_names
-    inputs = own if dataset.model is None else dataset.model.actuators
-    forces = dict(zip(inputs, removed["u"], strict=False))
-    header = ["joint", "noise of a\nbefore", "after", "removed\nof q", "v", "a", "u"]
-    rows = [
-        [name, shown(noise["before"][joint]), shown(noise["after"][joint])]
-        + [shown(removed[signal][joint], "{:.2g} %", 100.0) for signal in ("q", "v", "a")]
-        + [shown(forces.get(name), "{:.2g} %", 100.0)]
-        for joint, name in enumerate(own)
-    ]
-    rows += [[name, *5 * [shown(None)], shown(forces[name], "{:.2g} %", 100.0)] for name in forces if name not in own]
-    unit = dataset.units["a"]
-    title = f"What it costs; noise in {unit if isinstance(unit, str) else 'the units of each joint'}, shares of power"
-    tables.append(columns(title.replace("^2", "²"), header, rows))
-    tables.append("Noise is that of differenced positions above the noise floor; – where the log shows no floor.")
-    return tables
+    if cutoff is not None:
+        noise, unit = report["acceleration_noise"], dataset.units["a"]
+        each = zip(dataset.joint_names, noise["before"], noise["after"], strict=True)
+        found = ", ".join(f"{name} {shown(before)} -> {shown(after)}" for name, before, after in each)
+        values["noise of a"] = f"{found}, in {unit if isinstance(unit, str) else 'the units of each joint'}"
+    return facts(f"{out}: prepared", values)
 
 
 def stance_text(report: Mapping[str, Any]) -> str:

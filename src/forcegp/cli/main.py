@@ -7,7 +7,6 @@ import importlib
 import io
 import os
 import re
-import shlex
 import signal
 import sys
 import traceback
@@ -15,15 +14,15 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from itertools import takewhile
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import get_type_hints
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, subcommand
+from tyro.conf import FlagCreatePairsOff
 
-from forcegp.cli.command import Command, Listed, repeats
+from forcegp.cli.command import Command, repeats
 from forcegp.cli.help_pages import command_page, flag_of, front_page, show
 from forcegp.cli.terminal import Terminal, with_option_names
-from forcegp.errors import ForceGPError, InvalidInput, NotEnoughMemory
+from forcegp.errors import ForceGPError, InvalidInput
 
 DESCRIPTION = """Learn the forces that a robot model lacks: friction, payload, cables.
 
@@ -67,7 +66,6 @@ NOT_NUMBERS = {
     "could not convert string to float": "a number",
 }
 """What Python calls a text that is no number, and what would be one."""
-SHELLS = ("bash", "zsh", "fish")
 
 
 def command_class(name: str) -> type[Command]:
@@ -77,7 +75,7 @@ def command_class(name: str) -> type[Command]:
 
 
 def parse_arguments(words: Sequence[str]) -> Command:
-    """The command that the words ask for. --help and --print-completion print and raise SystemExit(0).
+    """The command that the words ask for. --help prints and raises SystemExit(0).
 
     Raises InvalidInput, with a message of one line, for words that make no command.
     """
@@ -91,8 +89,6 @@ def parse_arguments(words: Sequence[str]) -> Command:
     if first in ("-h", "--help"):
         show(front_page(DESCRIPTION, COMMANDS))
         raise SystemExit(0)
-    if first == "--print-completion":
-        _print_completion(others)
     close = difflib.get_close_matches(first, COMMANDS, n=1)
     hint = f" Did you mean {close[0]}?" if close else " Options follow the command." if first.startswith("-") else ""
     what = f"there is no command {first!r}.{hint}" if first else "no command was given."
@@ -100,62 +96,34 @@ def parse_arguments(words: Sequence[str]) -> Command:
 
 
 def _parse(name: str, kind: type[Command], words: Sequence[str]) -> Command:
-    lists = _checked_options(name, kind, words)
+    _check_options(name, kind, words)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             return tyro.cli(kind, prog=f"forcegp {name}", args=words, config=(FlagCreatePairsOff,))
     except SystemExit:
         reason = one_line(complaint.getvalue())
-        unknown = re.match(r"Unrecognized options: ([^-].*?)\.(?= |$)", reason)
-        for flag, values in lists.items():
-            if unknown and len(values) > 1:
-                listed = shlex.quote(",".join(values[: 1 + len(unknown[1].split(", "))]))
-                raise InvalidInput(f"{flag} takes one list, written with commas: {flag} {listed}") from None
         for pattern, kind_of_number in NOT_NUMBERS.items():
             reason = re.sub(rf"Error parsing (.*?): {pattern}: (.*)\.$", rf"\1 is \2; give {kind_of_number}.", reason)
         raise InvalidInput(f"{reason} See forcegp {name} --help.") from None
 
 
-def _checked_options(name: str, kind: type[Command], words: Sequence[str]) -> dict[str, list[str]]:
-    """The words that follow each option that takes a list. Raises InvalidInput for unknown and repeated options."""
+def _check_options(name: str, kind: type[Command], words: Sequence[str]) -> None:
+    """Raise InvalidInput for options that the command does not have, and for those that are given twice."""
     hints = get_type_hints(kind, include_extras=True)
     flags = {flag: hints[field.name] for field in fields(kind) if (flag := flag_of(field, hints[field.name]))}
-    lists = {flag for flag, hint in flags.items() if any(isinstance(each, Listed) for each in get_args(hint))}
-    given: dict[str, list[str]] = {}
-    for place, word in enumerate(takewhile("--".__ne__, words)):
-        flag, _, value = word.partition("=")
-        flag = flag.replace("_", "-")
+    given: set[str] = set()
+    for word in takewhile("--".__ne__, words):
+        flag = word.partition("=")[0].replace("_", "-")
         if not flag.startswith("--"):
             continue
         if flag not in flags:
             close = difflib.get_close_matches(flag, flags, n=1)
             hint = f" Did you mean {close[0]}?" if close else ""
             raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
-        values = [value] if value else list(takewhile(lambda each: not each.startswith("-"), words[place + 1 :]))
         if flag in given and not repeats(flags[flag]):
-            entries = shlex.quote(",".join([*given[flag][:1], *values[:1]]))
-            once = f"write one list: {flag} {entries}" if flag in lists else "give it once"
-            raise InvalidInput(f"{flag} is given twice; {once}.")
-        given[flag] = values
-    return {flag: values for flag, values in given.items() if flag in lists}
-
-
-def _print_completion(words: Sequence[str]) -> None:
-    if len(words) != 1 or words[0] not in SHELLS:
-        raise InvalidInput(f"--print-completion takes the name of a shell: {', '.join(SHELLS)}.")
-    kinds: Any = None
-    for name, summary in COMMANDS.items():
-        kind: Any = Annotated[command_class(name), subcommand(name, description=summary, prefix_name=False)]
-        kinds = kind if kinds is None else kinds | kind
-    with contextlib.redirect_stdout(io.StringIO()) as script, contextlib.suppress(SystemExit):
-        tyro.cli(kinds, prog="forcegp", args=["--tyro-write-completion", words[0], "-"], config=(FlagCreatePairsOff,))
-    # a newline within a description would end it, and complete its next words as if they were options
-    text = re.sub(r"(?m)^.*COMPLETION_SPEC = .*$", lambda line: re.sub(r"\\+n *", " ", line[0]), script.getvalue())
-    for name, summary in COMMANDS.items():
-        text = text.replace(f"'{name}': {{'description': '{name}'", f"'{name}': {{'description': '{summary}'")
-    print(text, end="")
-    raise SystemExit(0)
+            raise InvalidInput(f"{flag} is given twice; give it once, a list with commas.")
+        given.add(flag)
 
 
 def one_line(box: str) -> str:
@@ -214,7 +182,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with Terminal(json=command.json, options=command.options) as terminal, warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
-            _require_address_space()
             terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -239,30 +206,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
     return OK
-
-
-def _require_address_space() -> None:
-    """Refuse a limit (`ulimit -v`) in which the libraries do not fit.
-
-    OpenBLAS, while it is loaded, asks for its buffers again and again and for ever. Raises NotEnoughMemory.
-    """
-    if sys.platform == "win32" or "torch" in sys.modules:
-        return
-    import mmap
-    import resource
-
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    given = os.environ.get("OPENBLAS_NUM_THREADS") or os.environ.get("OMP_NUM_THREADS") or ""
-    threads = min(int(given) if given.isdecimal() else 64, os.cpu_count() or 1)
-    needed = (820 + 80 * threads) << 20
-    if limit != resource.RLIM_INFINITY:
-        try:
-            mmap.mmap(-1, needed).close()
-        except OSError:
-            raise NotEnoughMemory(
-                f"the address space is limited to {limit >> 20} MiB (ulimit -v), and {needed >> 20} MiB more are "
-                "needed to begin with; raise the limit."
-            ) from None
 
 
 def _fail(message: str, code: int, debug: bool) -> int:

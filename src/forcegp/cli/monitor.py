@@ -12,10 +12,9 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
-import forcegp.recordings
 import forcegp.scores
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import LOG, MAPPING, MODEL, Overwriting, unless_given
+from forcegp.cli.command import DATASET, MODEL, Overwriting, unless_given
 from forcegp.cli.input_options import require_same_joints
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
@@ -30,25 +29,23 @@ class Monitor(Overwriting):
     """Find contacts in a log without a force sensor: time, link and force of each.
 
     A residual torque counts as a contact if it exceeds what free motion of the same robot shows.
-    LOG is a dataset, or any log that forcegp import reads, with the signals of the joints of the model.
+    LOG is a dataset; forcegp import makes one of any log.
 
     For example:
       forcegp monitor run log.h5 --free-seconds 120 --out contacts
-      forcegp monitor run shift.csv --free morning.csv --mapping columns.yaml --false-alarms 0.01 --out contacts
+      forcegp monitor run shift.h5 --free morning.h5 --false-alarms 0.01 --out contacts
     """
 
     run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote, of a robot without contacts."""
-    log: Annotated[Positional[Path], LOG, arg(metavar="LOG")]
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The log to search, at the rate of its sensors."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: contacts.csv, contacts.json and contacts.png."""
-    free: Annotated[Path | None, LOG, unless_given("LOG", "--free-seconds of LOG")] = None
+    free: Annotated[Path | None, DATASET, unless_given("LOG", "--free-seconds of LOG")] = None
     """A log of 40 s or more without contacts, not used for training."""
     free_seconds: Annotated[float | None, unless_given("S", "--free")] = None
     """The first S seconds of LOG are without contacts; they replace --free and are not searched."""
-    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "beside the log, or by the names")] = None
-    """What the columns of logs mean, as for forcegp import."""
     false_alarms: Annotated[float, arg(metavar="N")] = 0.1
     """Accepted false alarms per hour."""
     bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
@@ -62,11 +59,11 @@ class Monitor(Overwriting):
             raise InvalidInput(f"--free-seconds is {self.free_seconds:g}; give seconds above 0.")
         self.require_free(self.out)
         posterior = forcegp.load_posterior(self.run_folder)
-        log = self._dataset(terminal, self.log, posterior)
+        log = _dataset(self.log, posterior)
         dt = forcegp.data.filtering.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
         motions = list(_motions(log, self.log, dt))
         if self.free is not None:
-            known = [each[1:] for each in _motions(self._dataset(terminal, self.free, posterior), self.free, dt)]
+            known = [each[1:] for each in _motions(_dataset(self.free, posterior), self.free, dt)]
         else:
             first, rows = motions[0], round((self.free_seconds or 0.0) / dt)
             known, motions[0] = [tuple(x[:rows] for x in first[1:])], tuple(x[rows:] for x in first)
@@ -80,7 +77,7 @@ class Monitor(Overwriting):
         content = {
             "run": str(self.run_folder),
             "log": str(self.log),
-            "options": self.words("free", "free_seconds", "mapping"),
+            "options": self.words("free", "free_seconds"),
             **{name: getattr(self, name) for name in ("false_alarms", "bandwidth")},
             **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
         }
@@ -106,20 +103,12 @@ class Monitor(Overwriting):
         terminal.show(columns(title, header, rows) if rows else title)
         return {**content, "contacts": contacts}
 
-    def _dataset(self, terminal: Terminal, path: Path, posterior: Any) -> forcegp.Dataset:
-        """A dataset, or a log imported for this robot. Raises what importing raises."""
-        if path.is_file() and forcegp.data.is_dataset(path):
-            dataset = forcegp.Dataset.load(path)
-        else:
-            beside = self.mapping or forcegp.recordings.beside(path)
-            mapping = forcegp.ColumnMapping() if beside is None else forcegp.recordings.read_mapping(beside)
-            with terminal.progress(f"reading {path}") as report:
-                try:
-                    dataset = forcegp.import_recordings([path], mapping, model=posterior.model, report=report)
-                except InvalidInput as error:
-                    raise InvalidInput(f"{error} Or write a dataset of {path} by `forcegp import`.") from None
-        require_same_joints(posterior, dataset, path)
-        return dataset
+
+def _dataset(path: Path, posterior: Any) -> forcegp.Dataset:
+    """The dataset, of the joints of the model. Raises InvalidInput for others."""
+    dataset = forcegp.Dataset.load(path)
+    require_same_joints(posterior, dataset, path)
+    return dataset
 
 
 def _motions(dataset: forcegp.Dataset, path: Path, dt: float) -> Iterator[tuple[Any, Any, Any, Any]]:

@@ -62,7 +62,7 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
         notes += forces_of(model)
         words = [word for word in self.forces if word != "none"]
         model = forcegp.scores.named_model(model, words)
-        with terminal.progress("identifying", may_end_early=True) as report:
+        with terminal.progress("identifying") as report:
             found = with_payload(model, rows, self.link, baseline, report)
         content = {"data": str(self.data), **payload_dict(found, baseline is not None)}
         if self.out is not None:

@@ -34,18 +34,13 @@ class Robot(RobotFileOptions, Overwriting):
       forcegp robot arm.urdf
       forcegp robot dog.urdf --base floating
       forcegp robot arm.urdf --inertias nearest --lock finger=0 --out arm.png
-      forcegp robot arm.urdf --browser
       forcegp robot identified/identified.urdf --out arm.xml
     """
-
-    interrupted = "the page is closed"
 
     file: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
     """The robot file."""
     out: Annotated[Path | None, unless_given("FILE.png|xml|urdf", "no file")] = None
     """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
-    browser: bool = False
-    """Show the robot in the browser, until Ctrl-C."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
@@ -74,16 +69,13 @@ class Robot(RobotFileOptions, Overwriting):
             terminal.note(f"wrote {self.out}")
             if model.loops and self.out.suffix == ".urdf":
                 terminal.warn("URDF has no closed loops: the file holds the open chain.")
-        if drawn is not None or self.browser:
+        if drawn is not None:
             scene = forcegp.report.still_scene(robot, self.file)
             if scene.doubts:
                 terminal.note(f"{len(scene.doubts)} meshes are drawn as capsules, for example: {scene.doubts[0]}")
-            if drawn is not None:
-                forcegp.scores.save_figure(forcegp.report.robot_figure(scene), drawn)
-                content["picture"] = str(drawn)
-                terminal.note(f"picture: {drawn}")
-            if self.browser:
-                forcegp.report.serve(scene, ready=lambda url: terminal.note(f"open {url}; Ctrl-C ends it"))
+            forcegp.scores.save_figure(forcegp.report.robot_figure(scene), drawn)
+            content["picture"] = str(drawn)
+            terminal.note(f"picture: {drawn}")
         return content
 
 

@@ -125,7 +125,7 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
         )  # fmt: skip
         horizons = self.horizon or (None if fits else ())
         source = {"title": str(data), "data": [f"{data} (SHA-256 {file_digest(data)[:16]}…)"]}
-        with terminal.progress(f"scoring {len(rows)} rows", may_end_early=fits) as report:
+        with terminal.progress(f"scoring {len(rows)} rows") as report:
             scores = forcegp.score(
                 models or None,
                 rows,

@@ -22,6 +22,8 @@ from forcegp.errors import InvalidInput
 Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped", "quadrotor"]
 TOOL_FRICTION = arg(metavar="LAW", help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
 JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; dry with more near rest for free arms)")
+OF_THE_TOOL = ("tool_friction", "friction_coefficient", "patch", "surface", "contact_model")
+"""Options of the scenario that has a tool."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,20 +99,16 @@ class Simulate(Overwriting):
 
     def _config(self) -> dict[str, Any]:
         """The fields of the scenario's configuration that the options set."""
-        given = {name: getattr(self, name) for name in ("seconds", "seed", "noise", "joint_friction")}
-        if self.wind is not None and self.scenario != "quadrotor":
-            raise InvalidInput(f"--wind means nothing to {self.scenario}; only a quadrotor flies.")
-        fields = {name: value for name, value in given.items() if value is not None} | {"episodes": self.trajectories}
+        names = "seconds", "seed", "noise", "joint_friction", "wind"
+        fields = {name: value for name in names if (value := getattr(self, name)) is not None}
+        fields["episodes"] = self.trajectories
+        own = {"kuka-surface": (*OF_THE_TOOL, "joint_friction"), "quadrotor": ("wind",)}
+        others = {*OF_THE_TOOL, "joint_friction", "wind"} - {*own.get(self.scenario, ("joint_friction",))}
+        for word in self.words(*sorted(others)):
+            raise InvalidInput(f"{word} means nothing to {self.scenario}; leave it out.")
         if self.scenario != "kuka-surface":
-            for word in self.words("tool_friction", "friction_coefficient", "patch", "surface", "contact_model"):
-                raise InvalidInput(f"{word} means nothing to {self.scenario}, which has no tool; leave it out.")
-            if self.scenario == "quadrotor":
-                if self.joint_friction is not None:
-                    raise InvalidInput(
-                        "--joint-friction means nothing to quadrotor, which has no joints; leave it out."
-                    )
-                return fields if self.wind is None else {**fields, "wind": self.wind}
-            return fields if self.scenario == "quadruped" else {"arm": self.scenario, **fields}
+            arm = {} if self.scenario.startswith("quad") else {"arm": self.scenario}
+            return fields | arm
         fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}
         fields["patch_factor"] = self.patch
         if self.friction_coefficient is not None:

@@ -62,11 +62,7 @@ PLAIN_SECONDS = 10.0
 
 
 UNLIMITED = 10_000
-FOLDED = 16
-"""Columns that are left to long names, which are folded."""
-
-LEAST_SHARE = 0.02
-"""Of the work that must be done before the remaining time is guessed from it."""
+"""Columns of a terminal that cuts nothing."""
 
 
 @runtime_checkable
@@ -137,10 +133,13 @@ class Terminal:
         """Print the result, texts as they are; nothing with --json. A table gets the columns that it needs."""
         if not self.json:
             from rich.console import Console
+            from rich.measure import Measurement
             from rich.text import Text
 
             for renderable in (Text(each) if isinstance(each, str) else each for each in renderables):
-                needed = _columns_needed(self.out, renderable)
+                # cells that must not be folded: a number without its end is a wrong number
+                wide = self.out.options.update(width=UNLIMITED)
+                needed = 0 if isinstance(renderable, Text) else Measurement.get(self.out, wide, renderable).minimum
                 console = self.out if needed <= self.out.width else Console(highlight=False, width=needed)
                 console.print(renderable)
 
@@ -162,16 +161,16 @@ class Terminal:
         return with_option_names(text, self.options)
 
     @contextmanager
-    def progress(self, what: str, *, may_end_early: bool = False) -> Iterator[ProgressCallback]:
+    def progress(self, what: str) -> Iterator[ProgressCallback]:
         """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
         if self.err.is_terminal:
-            yield from self._bar(what, may_end_early)
+            yield from self._bar(what)
         else:
-            yield self._lines(what, may_end_early)
+            yield self._lines(what)
 
-    def _lines(self, what: str, may_end_early: bool) -> ProgressCallback:
-        """Lines such as `simulating: 40 %, 12 s left`, at most one every few seconds."""
-        start = reported = time.monotonic()
+    def _lines(self, what: str) -> ProgressCallback:
+        """Lines such as `simulating: 40 %`, at most one every few seconds."""
+        reported = time.monotonic()
         if self.names_stages:
             self.note(f"{what} ...")
 
@@ -180,52 +179,22 @@ class Terminal:
             now = time.monotonic()
             if now - reported >= PLAIN_SECONDS and done < total:
                 reported = now
-                parts = [f"{done / total:.0%}", _remaining(now - start, done, total, may_end_early), note]
-                self.note(f"{what}: {', '.join(part for part in parts if part)}")
+                self.note(f"{what}: {done / total:.0%}{note and f', {note}'}")
 
         return report
 
-    def _bar(self, what: str, may_end_early: bool) -> Iterator[ProgressCallback]:
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    def _bar(self, what: str) -> Iterator[ProgressCallback]:
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-        columns = (
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=30),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[remaining]}{task.fields[note]}"),
-        )
-        with Progress(*columns, console=self.err, transient=True) as bars:
-            task = bars.add_task(what, total=None, note="", remaining="")
-            start = time.monotonic()
+        of_a_task = TextColumn("{task.description}"), BarColumn(bar_width=30), TimeElapsedColumn()
+        left = TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
+        with Progress(SpinnerColumn(), *of_a_task, *left, console=self.err, transient=True) as bars:
+            task = bars.add_task(what, total=None, note="")
 
             def report(done: int, total: int, note: str = "") -> None:
-                remaining = _remaining(time.monotonic() - start, done, total, may_end_early)
-                bars.update(task, completed=done, total=total, note=note and f"  {note}", remaining=remaining)
+                bars.update(task, completed=done, total=total, note=note)
 
             yield report
-
-
-def _columns_needed(console: Console, renderable: RenderableType) -> int:
-    """Columns without which a table of numbers would cut them: a number without its end is a wrong number."""
-    from rich.measure import Measurement
-    from rich.table import Table
-
-    if not isinstance(renderable, Table) or not any(column.no_wrap for column in renderable.columns):
-        return 0
-    wide = console.options.update(width=UNLIMITED)
-    folded = [column for column in renderable.columns if not column.no_wrap]
-    names = [Measurement.get(console, wide, cell).maximum for column in folded for cell in column.cells]
-    return Measurement.get(console, wide, renderable).maximum - max(0, max(names, default=0) - FOLDED)
-
-
-def _remaining(elapsed: float, done: int, total: int, may_end_early: bool) -> str:
-    """`12 s left` at the speed so far, or `at most 12 s left`."""
-    if not LEAST_SHARE * total < done < total or elapsed < 1.0:
-        return ""
-    seconds = elapsed * (total - done) / done
-    time_left = f"{seconds:.0f} s left" if seconds < 120 else f"{seconds / 60:.0f} min left"
-    return f"at most {time_left}" if may_end_early else time_left
 
 
 NONE = "–"

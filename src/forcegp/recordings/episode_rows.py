@@ -67,7 +67,8 @@ def read_stamps(recording: RawRecording, gap: float | None, start: float | None,
     begins = recording.episodes[:, 1]
     typical = _typical_step(recording)
     _require_rate(recording, typical)
-    kept = _first_of_each(recording.time, begins, REPEATED * typical)
+    kept = np.diff(recording.time, prepend=-np.inf) >= REPEATED * typical
+    kept[begins] = True
     repeated = len(kept) - int(kept.sum())
     if start is not None or end is not None:
         kept &= _between(recording, start, end)
@@ -143,23 +144,6 @@ def _require_rate(recording: RawRecording, step: float) -> None:
         hint = f"Is the time in {' or '.join(fitting)}? Then add `unit` time={fitting[0]}."
         raise MistakenUnit(f"{seen} {hint}", "time", fitting[0])
     raise DatasetError(f"{seen} Map another column as the time.")
-
-
-def _first_of_each(time: np.ndarray, begins: np.ndarray, least: float) -> np.ndarray:
-    """Rows that come at least `least` after the last one that was kept; the first of an episode always is."""
-    kept = np.ones(len(time), bool)
-    suspicious = np.flatnonzero(np.diff(time) < least) + 1
-    starts = set(begins.tolist())
-    last_dropped, reference = -2, 0.0
-    for row in suspicious.tolist():
-        if row in starts:
-            continue
-        if row - 1 != last_dropped:
-            reference = time[row - 1]
-        if time[row] - reference < least:
-            kept[row] = False
-            last_dropped = row
-    return kept
 
 
 def episode_rows(

@@ -11,7 +11,7 @@ from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings.array_file import ArrayFile, NumpyArchive
 from forcegp.recordings.delimited_text import DelimitedText
 from forcegp.recordings.hdf5_and_matlab import HDF5Arrays, matlab_file
-from forcegp.recordings.parquet import INFO, LeRobotFolder, ParquetFile
+from forcegp.recordings.parquet import ParquetFile
 from forcegp.recordings.ros_bag import RosBag
 from forcegp.recordings.source import Columns, Source
 
@@ -87,7 +87,7 @@ TABLES: dict[str, Callable[[Path], Source]] = {
 }
 """A new format is a subclass of `Source`, and an entry here (or in `ARRAYS`) with its extension."""
 
-READABLE = ", ".join([*(f"{name}[.gz]" for name in TEXT), *TABLES, *ARRAYS]) + ", folders of ROS 2 bags and of LeRobot"
+READABLE = ", ".join([*(f"{name}[.gz]" for name in TEXT), *TABLES, *ARRAYS]) + ", folders of ROS 2 bags"
 PICKLES = {".pkl", ".pickle", ".npy", ".pt", ".pth", ".joblib"}
 
 
@@ -110,20 +110,15 @@ def open_source(
         if kind != ".npz" and is_dataset(path):
             raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
         return ARRAYS[kind](path, within=within)
-    return LeRobotFolder(path) if kind == "lerobot" else RosBag(path) if kind == "ros2" else TABLES[kind](path)
+    return RosBag(path) if kind == "ros2" else TABLES[kind](path)
 
 
 def _kind(path: Path) -> str:
-    """The extension without .gz, "lerobot" or "ros2"."""
+    """The extension without .gz, or "ros2"."""
     if path.is_dir():
-        if (path / INFO).is_file():
-            return "lerobot"
         if (path / "metadata.yaml").is_file():
             return "ros2"
-        raise FileFormatError(
-            f"{path} is a folder, but neither a ROS 2 bag (metadata.yaml) nor a LeRobot dataset (meta/info.json); "
-            "give the files in it."
-        )
+        raise FileFormatError(f"{path} is a folder, but no ROS 2 bag (metadata.yaml); give the files in it.")
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; give the path of a log.")
     suffixes = [suffix.lower() for suffix in path.suffixes]

@@ -42,7 +42,7 @@ class ImportOptions:
     rate: "auto" gives uneven rows even times at the median of the recordings' median rates, a number (Hz) all rows at
         that rate; "log" keeps every stamp.
     start, end: seconds from the first row of each episode that are kept.
-    unwrap: continue positions of turning joints that jump by a turn; those that count turns stay.
+    unwrap: add whole turns to positions of turning joints where they jump by more than half a turn.
     beyond_limits: accept positions beyond the limits of the URDF.
     most_rows: of one recording.
     stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of

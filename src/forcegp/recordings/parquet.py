@@ -1,9 +1,7 @@
-"""Parquet files, and folders of them as LeRobot writes."""
+"""Parquet files."""
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,19 +26,17 @@ from forcegp.recordings.source import (
 class ParquetFile(Source):
     """A Parquet file: its numeric columns, and the elements of its columns of lists of equal length.
 
-    Lists are of fixed size, or as long as in the first row. `names` gives elements of a list column names of their own:
-    `observation.state.elbow` instead of `observation.state[0]`.
+    Lists are of fixed size, or as long as in the first row; their elements are called `state[0]`.
     """
 
-    def __init__(self, path: Path, *, names: Mapping[str, Sequence[str]] | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._places: dict[str, tuple[str, int | None]] = {}  # column -> its name in the file, its place in a list
         self._widths: dict[str, int] = {}
         lists = {}
         with reading(path, "a Parquet file", pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
-            self.rows = file.metadata.num_rows
             require_distinct(path, file.schema_arrow.names)
-            if not self.rows:
+            if not file.metadata.num_rows:
                 raise FileFormatError(f"{path} has columns but no rows.")
             for field in file.schema_arrow:
                 if _is_number(field.type):
@@ -52,9 +48,7 @@ class ParquetFile(Source):
         for name, width in lists.items():
             if 0 < width <= LONGEST_VECTOR:
                 self._widths[name] = width
-                own = (names or {}).get(name, ())
-                named = [f"{name}.{part}" for part in own] if len(own) == width else element_names(name, width)
-                elements += [(element, (name, index)) for index, element in enumerate(named)]
+                elements += [(element, (name, index)) for index, element in enumerate(element_names(name, width))]
         require_distinct(path, [*self._places, *(element for element, _ in elements)])
         self._places |= dict(elements)
         if not self._places:
@@ -63,12 +57,6 @@ class ParquetFile(Source):
     @override
     def columns(self) -> tuple[str, ...]:
         return tuple(self._places)
-
-    @property
-    @override
-    def vectors(self) -> Mapping[str, tuple[str, ...]]:
-        elements = [(column, stored) for column, (stored, index) in self._places.items() if index is not None]
-        return {name: tuple(column for column, stored in elements if stored == name) for name in self._widths}
 
     @override
     def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
@@ -102,58 +90,3 @@ def _is_number(kind: pa.DataType) -> bool:
 
 
 LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
-INFO = Path("meta") / "info.json"
-
-
-class LeRobotFolder(Source):
-    """A LeRobot dataset as one table: all rows of its data files in the order of their numbers.
-
-    Columns are those of the Parquet files; where `info.json` names the elements of a list, they are
-    `observation.state.<name>`. Videos are not looked at.
-    Raises FileFormatError if the files do not hold what `info.json` states.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        with reading(path / INFO, "JSON", AttributeError):
-            info = json.loads((path / INFO).read_text(encoding="utf-8"))
-            names = {name: given for name, feature in info["features"].items() if (given := _element_names(feature))}
-            stated = info.get("total_frames")
-        self.data_files = tuple(sorted((path / "data").glob("chunk-*/*.parquet")))
-        if not self.data_files:
-            raise FileFormatError(f"{path} has no data/chunk-*/*.parquet; the dataset was not copied whole.")
-        outside = [file for file in self.data_files if not file.resolve().is_relative_to(path.resolve())]
-        if outside and not path.is_symlink():
-            raise FileFormatError(f"{outside[0]} is a link to a file outside of the dataset; copy the file there.")
-        self._parts = [ParquetFile(file, names=names) for file in self.data_files]
-        rows = sum(part.rows for part in self._parts)
-        if rows != stated:
-            raise FileFormatError(f"{path}: {INFO} has {stated} frames, the data files hold {rows}; copy it again.")
-
-    @override
-    def columns(self) -> tuple[str, ...]:
-        return self._parts[0].columns()
-
-    @property
-    @override
-    def vectors(self) -> Mapping[str, tuple[str, ...]]:
-        return self._parts[0].vectors
-
-    @override
-    def files(self) -> tuple[Path, ...]:
-        return (self.path / INFO, *self.data_files)
-
-    @override
-    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
-        for part in self._parts:
-            yield part.read(names)
-
-
-def _element_names(feature: Any) -> list[str]:
-    """What info.json calls the elements: a list of names, or a mapping to one (`{"motors": [...]}`)."""
-    names = feature.get("names")
-    if isinstance(names, dict) and len(names) == 1:
-        names = next(iter(names.values()))
-    if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
-        return []
-    return names if len(set(names)) == len(names) else []

@@ -29,7 +29,7 @@ class RawRecording:
     ranges: (signals, 2) least and largest value of each signal of the plan, in SI.
     jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
         seen, and what to do.
-    notes: on the orientations of a base, and angles that step by more than half a turn.
+    notes: on the orientations of a base.
     """
 
     label: str
@@ -54,11 +54,11 @@ def read_recording(source: Source, plan: SignalPlan, label: str, *, unwrap: bool
     _require_finite(values, columns, plan, source, time)
     episodes = np.zeros((1, 2), np.int64) if plan.episode is None else _episodes(columns[plan.episode], source)
     del columns
-    jumps, notes = _continued(plan, values, time, episodes[:, 1], unwrap)
+    jumps = _continued(plan, values, episodes[:, 1], unwrap)
     ranges = np.stack([values.min(axis=0), values.max(axis=0)], axis=1)
     signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
     signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
-    return RawRecording(label, source, signals, time, begin, episodes, ranges, (*jumps, *turned), (*told, *notes))
+    return RawRecording(label, source, signals, time, begin, episodes, ranges, (*jumps, *turned), tuple(told))
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
@@ -82,78 +82,21 @@ def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> t
     return plan.time_unit.in_si((raw - raw[0]).astype(np.float64)), begin
 
 
-def _continued(
-    plan: SignalPlan, values: np.ndarray, time: np.ndarray, begins: np.ndarray, unwrap: bool
-) -> tuple[list[Jumps], list[str]]:
-    """Jumps of turning joints by more than half a turn, and notes on those that count turns.
-
-    With `unwrap`, whole turns are added in `values` to the angles that wrap, and only jumps stay about which nothing
-    decides.
-    """
-    jumps, notes = list[Jumps](), list[str]()
-    rates = {item.joint: column for column, item in enumerate(plan.signals) if item.signal == "v"}
+def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap: bool) -> list[Jumps]:
+    """Jumps of turning joints by more than half a turn; with `unwrap`, whole turns are added in `values` instead."""
+    jumps = list[Jumps]()
     for column, item in enumerate(plan.signals):
         if item.signal != "q" or item.unit.si != "rad" or item.joint not in plan.joints:
             continue
-        q, name = values[:, column], f"q of joint {item.joint!r}"
-        steps = np.diff(q, prepend=q[:1])
-        steps[begins] = 0.0
-        odd = np.flatnonzero(np.abs(steps) > np.pi)
-        if not len(odd):
-            continue
-        remedy = "the angle wraps, or is in degrees. Add `unwrap`, or `unit` q=deg."
         if unwrap:
-            v = values[:, rates[item.joint]] if item.joint in rates else None
-            turns, odd = turns_to_add(q, time, v, begins)
-            values[:, column] += TURN * turns
-            remedy = "nothing shows whether it wraps or counts turns. Map its velocity (`v`), or mend these rows."
-            if not turns.any() and not len(odd):
-                notes.append(f"{name} counts turns: steps of more than half a turn stay")
-        jumps.append((odd, f"{name} jumps by more than half a turn", remedy))
-    return jumps, notes
-
-
-TURN = 2.0 * np.pi
-NEAR = 0.25 * TURN
-"""How far a step may be from that of the velocity, or from one of its neighbours."""
-PAUSE = 10.0  # median steps of time, after which a step shows nothing
-
-
-def turns_to_add(
-    q: Float[np.ndarray, " rows"],
-    time: Float[np.ndarray, " rows"],
-    v: Float[np.ndarray, " rows"] | None,
-    begins: Int[np.ndarray, " episodes"],
-) -> tuple[Float[np.ndarray, " rows"], Int[np.ndarray, " open"]]:
-    """Whole turns that continue q [rad] where it wraps, and the rows at which nothing shows whether it does.
-
-    A step beyond half a turn is a wrap, or motion between two rows. v [rad/s] decides where each of these steps is
-    within a quarter turn of it, read in one of the two ways. Otherwise the reading holds in which all of them are so
-    near the step before or behind; where both are, the angle counts turns if it covers more than one.
-    """
-    steps, times = (np.diff(x, prepend=x[:1]) for x in (q, time))
-    steps[begins] = times[begins] = 0.0
-    turns = np.where(np.abs(steps) > np.pi, -np.round(steps / TURN), 0.0)
-    readings = np.stack([steps, steps + TURN * turns])  # it counts turns, or it wraps
-    beyond = np.flatnonzero(turns)
-    pause = times > PAUSE * np.median(times)
-    shown = beyond[~pause[beyond]]
-    if v is not None:
-        moved = times * 0.5 * (v + np.append(v[:1], v[:-1]))
-        near = np.abs(readings - moved)[:, shown] < NEAR
-        if near.any(axis=0).all() and moved[shown].any():
-            turns[shown[near[0]]] = 0.0
-            turns[pause] *= near[1].any()
-            return np.cumsum(turns), beyond[:0]
-    others = np.abs(np.diff(readings, axis=1))
-    near = np.minimum(others[:, shown - 1], others[:, np.minimum(shown, len(q) - 2)]) < NEAR
-    counts, wraps = (len(shown) > 0 and bool(each.all()) for each in near)
-    if counts and (not wraps or np.ptp(q) > TURN):
-        return np.zeros(len(q)), beyond[:0]
-    if wraps and not counts:
-        return np.cumsum(turns), beyond[:0]
-    odd = shown[~near[int(near[1].sum() > near[0].sum())]]
-    return np.zeros(len(q)), odd if len(odd) else beyond
+            values[:, column] = np.concatenate([np.unwrap(each) for each in np.split(values[:, column], begins[1:])])
+            continue
+        steps = np.abs(np.diff(values[:, column], prepend=values[:1, column]))
+        steps[begins] = 0.0
+        seen = f"q of joint {item.joint!r} jumps by more than half a turn"
+        remedy = "the angle wraps, or is in degrees. Add `unwrap`, or `unit` q=deg."
+        jumps.append((np.flatnonzero(steps > np.pi), seen, remedy))
+    return jumps
 
 
 def _require_finite(
