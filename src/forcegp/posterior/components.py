@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.errors import InvalidInput, NumericalError, UnknownName, require_known
 from forcegp.evidence import Accelerations
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
@@ -52,7 +52,7 @@ class Components(Mapping[str, ForceComponent]):
 
     @override
     def __getitem__(self, name: str) -> ForceComponent:
-        require_known("component", name, "this model", self.parts)
+        require_known("component", name, "this model", self.parts, UnknownName)
         return self.parts[name]
 
     @override

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.stats import t as student
 from typing_extensions import override
 
-from forcegp.errors import require_known
+from forcegp.errors import UnknownName, require_known
 from forcegp.evidence.identifiability import BaseParameters
 from forcegp.summary import Summary, listed
 
@@ -92,7 +92,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
 
     @override
     def __getitem__(self, name: str) -> Estimate:
-        require_known("parameter", name, "this fit", list(self))
+        require_known("parameter", name, "this fit", list(self), UnknownName)
         return self._by_name[name]
 
     @override
