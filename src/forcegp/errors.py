@@ -91,7 +91,7 @@ class KinematicLoop(RobotModelError):
 
 
 class UnknownName(ForceGPError, KeyError):
-    """A frame, link or joint name that the robot does not have."""
+    """A name that is not there: a frame, link or joint of a robot, an estimate, a force."""
 
     def __str__(self) -> str:  # KeyError would print the repr, quotes and all
         return str(self.args[0])

@@ -8,7 +8,7 @@ import torch
 from tests.posterior.arm import URDF, Weight, arm_data, arm_model, on_the_plane
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, UnknownFrame
+from forcegp.errors import InvalidInput, UnknownFrame, UnknownName
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit
 from forcegp.forces import FORCES, ContactFriction, JointForces, JointFriction, ToolForces, UnknownForces
@@ -137,7 +137,7 @@ def test_components_of_any_batch_and_their_names(posterior, states):
     close(single.total.covariance, flat.total.covariance[1], 1e-12)
     assert flat["contact-friction"].latent_units == ("N",)
     assert flat["joint-friction"].latent_names == ("pan", "lift", "bend")
-    with pytest.raises(InvalidInput, match=r"'joint-fricton'.*'joint-friction'"):
+    with pytest.raises(UnknownName, match=r"'joint-fricton'.*'joint-friction'"):
         flat["joint-fricton"]
     with pytest.raises(InvalidInput, match="last dimension must be 3"):
         posterior.components([1.0], [1.0], [1.0])
