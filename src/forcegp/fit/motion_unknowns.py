@@ -46,7 +46,7 @@ class Unknowns:
 
         Numbers that the laws of `stated` know by a standard deviation of 0 stay.
         """
-        given = {} if stated is None else {type(law): law for law in stated.laws}
+        given = {} if stated is None else {type(law): law for law in stated.laws if isinstance(law, JointLaw)}
         robot, _ = thickened(posterior.model.robot)
         model = posterior.model.with_robot(robot) if bodies else posterior.model
         forces = [

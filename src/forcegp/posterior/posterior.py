@@ -367,7 +367,7 @@ class Posterior(Summary):
         ------
         InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
         """
-        how = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
+        how: Any = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
         physics, training = physics_of(self, self.model), rows_for(self.training, self.trained, self.model)
         return replace(prepared_predictor(self.latent, self.widening, training, physics, **how), posterior=self)
 
