@@ -172,6 +172,6 @@ class LawConformance:
             pytest.skip("it is no law of single joints")
         still = replace(log, q=np.zeros_like(log.q), v=np.zeros_like(log.v))
         name = force_name(self.law)
-        with pytest.warns(DataWarning, match=f"no row shows {name}.pan, {name}.lift"):
+        with pytest.warns(DataWarning, match=rf"no row shows .*{name}\."):
             found = fit(arm_model(0).with_forces(opened), still, Torques()).parameters
-        assert {each.decided_by for each in found.values()} == {"prior"}
+        assert "prior" in {each.decided_by for each in found.values()}  # a constant of a law shows at rest, too

@@ -116,7 +116,9 @@ def force_from_dict(stored: object) -> Force:
     values = {key: _read(value) for key, value in stored.items()}
     name = values.pop("type", None)
     if not isinstance(name, str) or name not in FORCES:
-        raise FileFormatError(f"unknown force {name!r}; known: {', '.join(FORCES)}")
+        raise FileFormatError(
+            f"unknown force {name!r}; import the module of a force of your own first. Known: {', '.join(FORCES)}"
+        )
     try:
         return force_class(name)(**values)
     except TypeError as error:
