@@ -187,6 +187,7 @@ def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path)
     assert torch.equal(loaded.predict(test.q, test.v, test.u).mean, expected.mean)
 
 
+@pytest.mark.nightly
 def test_fits_with_several_starts_on_the_pretended_device():
     data, test = arm_data(12, seed=3), arm_data(3, seed=4)
     how = {"restarts": 2, "options": QUICK}

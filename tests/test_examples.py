@@ -29,6 +29,7 @@ def test_all_are_listed():
     assert listed == {path.name for path in FOLDER.glob("*.py")}
 
 
+@pytest.mark.nightly
 def test_a_first_model(run, tmp_path):
     urdf, learned = (float(error) for error in re.findall(r"error (\S+)", run("first_model.py")))
     assert learned < 0.05 * urdf

@@ -136,6 +136,7 @@ def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
     assert gradient == "torch.Size([20, 7])"
 
 
+@pytest.mark.nightly
 def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "incremental.md").read_text(encoding="utf-8")
     printed = [run_example(code, tmp_path) for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]

@@ -33,6 +33,7 @@ def test_the_script_works_on_the_cpu(run, repository):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+@pytest.mark.nightly
 def test_without_a_gpu_it_says_in_one_line_what_it_needs(run):
     done = run()
     assert done.returncode == 2

@@ -38,6 +38,7 @@ def test_the_engine_is_said_and_stored(forcegp, folder):
     assert scored.returncode == 0, scored.stderr
 
 
+@pytest.mark.nightly
 def test_more_rows_than_memory_holds_is_one_line(forcegp, folder):
     few, count = arm_data(50, seed=0), 100_000
     again = {name: np.tile(getattr(few, name), (count // 50, 1)) for name in ("q", "v", "u", "a")}

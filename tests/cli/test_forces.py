@@ -47,6 +47,7 @@ def of(done) -> dict:
     }
 
 
+@pytest.mark.nightly
 def test_every_force_that_the_truth_knows_is_scored_and_drawn(arm, forcegp, tmp_path):
     out = tmp_path / "out"
     done = forcegp("score", "run", "test.h5", "--out", out, "--json", folder=arm)

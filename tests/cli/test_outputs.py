@@ -242,6 +242,7 @@ def test_links_stay_and_what_they_point_to_is_written(folder):
 
 
 @pytest.mark.parametrize("name", ["import", "fit"])
+@pytest.mark.nightly
 def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, limited_file_size, name):
     arm_data(80, seed=0).save("arm.h5")
     monkeypatch.setattr("forcegp.atomic_files.TRIAL", 1)  # a file is larger than the trial, whatever its size

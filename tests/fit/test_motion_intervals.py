@@ -35,6 +35,7 @@ def calibrated(request, log):
 
 
 @pytest.mark.parametrize("samples", [0, 12])
+@pytest.mark.nightly
 def test_they_hold_in_another_recording(calibrated, samples):
     fresh = recorded_motions(recording(bump, 2), 40, 0.5)
     found = calibrated.rollout(fresh.q[:, 0], fresh.v[:, 0], fresh.u, fresh.dt, integrator="rk4", samples=samples)

@@ -507,7 +507,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "score": (
         lambda **k: str(forcegp.score(**k)),
-        lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1, "margin": 0.02},
+        lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1},
     ),
     "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "model": None, "preparation": None}),
     "fit (laws)": (

@@ -92,6 +92,7 @@ def test_what_holds_code_is_not_kept(posterior):
     assert not list(default_folder().glob("*.safetensors"))
 
 
+@pytest.mark.nightly
 def test_a_damaged_record_is_made_again(posterior, states):
     expected = results(made(posterior, tolerance=0.1), states)
     for damage in ("cut off", "others may write", "no library"):

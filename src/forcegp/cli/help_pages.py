@@ -32,7 +32,7 @@ GROUPS: Mapping[str, str] = {
     "Noise": "noise force_noise measured_torque",
     "Model": "forces evidence identification",
     "Fit": "points learning_points rows engine restarts iterations hyperprior checks correct accept",
-    "Score": "split guard seeds seed_list horizon margin strict",
+    "Score": "split guard seeds seed_list horizon strict",
     "Program": "to steps covariance jacobian unchecked",
     "Compute": "preset seed jobs device port",
     "Output": "out plots report html write_mapping docs overwrite json",
