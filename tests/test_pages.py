@@ -114,6 +114,7 @@ def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
     assert 'xyz="' in (tmp_path / "identified.urdf").read_text()
 
 
+@pytest.mark.nightly
 def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
     commands, *_ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the others need logs of the reader's own

@@ -280,6 +280,7 @@ def test_hardly_any_noise_does_not_stop_a_search():
 
 
 @pytest.mark.parametrize("likelihood", ["acceleration", "both"])
+@pytest.mark.nightly
 def test_a_row_in_ten_may_be_wrong(walker, likelihood):
     """Neither the masses nor the levels of noise are those of outliers."""
     truth = replace(walker, forces=(*walker.forces, *FRICTION))

@@ -213,6 +213,7 @@ def test_the_program_in_c(floating, tmp_path):
     close(torch.as_tensor(made), posterior.model.robot.integrate(q[0], step), 1e-13)
 
 
+@pytest.mark.nightly
 def test_derivatives_in_c(floating, tmp_path):
     posterior = floating[0]
     written = export_c(posterior, tmp_path / "c", jacobian=True)
