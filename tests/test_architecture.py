@@ -64,7 +64,7 @@ IMPORTED_WHERE_USED = {
     "rich": ("forcegp.cli",),
 }
 
-LONGEST_MODULE = 600  # lines; 100 to 300 are the rule, and what is one idea stays together, as `Posterior` does
+LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}
 
 

@@ -1,0 +1,208 @@
+"""`Fitted`: what a fit has found, which rows it knows, and how well it predicts those that are left out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.evidence.likelihood import MarginalLikelihood
+from forcegp.evidence.training_data import TrainingData
+from forcegp.forces import IndependentAccelerations, JointAccelerations, JointForces
+from forcegp.inference import (
+    Engine,
+    Exact,
+    InducingPosterior,
+    LatentKernels,
+    LatentPosterior,
+    LeaveOut,
+    OptimizationResult,
+    exact,
+    leave_blocks_out,
+)
+from forcegp.inference.threads import blas_threads
+from forcegp.model import Model
+from forcegp.noise import ACCELERATION
+from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.motion_intervals import MotionIntervals
+from forcegp.summary import Summary, rounded
+
+AnyFitted = TypeVar("AnyFitted", bound="Fitted")  # beartype cannot check Self where a module is hooked
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fitted(Summary):
+    """a = M^-1 Q_b + H (Q_K + B f) + noise, f ~ GP (Rath et al. 2021, eqs. 6-7), conditioned on a log by `forcegp.fit`.
+
+    `trained` is the model with the numbers that were found; `hyperparameters` are those of kernels and noise by name;
+    `estimates` the numbers of laws and bodies (`parameters`); `settings` is the resolved configuration of the fit
+    (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
+    training data); `result` is the history of the search and why it ended.
+    """
+
+    trained: Model
+    likelihood: MarginalLikelihood
+    hyperparameters: Mapping[str, Tensor]
+    result: OptimizationResult
+    settings: Mapping[str, Any]
+    latent: LatentPosterior
+    """The posterior of the latent functions."""
+    engine: Engine
+    """What computed `latent`."""
+    estimates: Estimates = field(default_factory=Estimates)
+    target: Model | None = None
+    """The model that predictions are for, where it is not the one that was trained (`with_model`)."""
+
+    @property
+    def model(self) -> Model:
+        """What predictions are for: robot, contacts and forces."""
+        return self.trained if self.target is None else self.target
+
+    @property
+    def parameters(self) -> Estimates:
+        """Numbers of laws and bodies that the fit estimated, with intervals, and whether the log decides them."""
+        return self.estimates
+
+    @classmethod
+    def conditioned(
+        cls: type[AnyFitted],
+        model: Model,
+        training: TrainingData,
+        hyperparameters: Mapping[str, Tensor],
+        result: OptimizationResult,
+        settings: Mapping[str, Any],
+        engine: Engine | None = None,
+        solution: Tensor | None = None,
+        estimates: Estimates | None = None,
+    ) -> AnyFitted:
+        """The posterior at given hyper-parameters, without a search: what a stored one is loaded with.
+
+        `engine` computes it, where there is a choice; `solution` is what that engine had found (`Posterior.solution`),
+        which saves it most of its work.
+        """
+        likelihood = MarginalLikelihood(model, replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
+        engine = engine or Exact()
+        # now: a failure belongs to the fit, not to the first prediction
+        latent = likelihood.condition(likelihood.kernels, hyperparameters, engine, start=solution)
+        found = dict(hyperparameters), result, dict(settings), latent, engine, estimates or Estimates()
+        return cls(model, likelihood, *found)
+
+    @staticmethod
+    def parameter_shapes(model: Model, training: TrainingData) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the hyper-parameters that a posterior on these rows needs."""
+        return MarginalLikelihood(model, training).parameter_shapes
+
+    @property
+    def kernels(self) -> LatentKernels:
+        """Of the latent functions, at their start values."""
+        return self.likelihood.kernels
+
+    @property
+    def training(self) -> TrainingData:
+        """The rows that the model was trained on."""
+        return self.likelihood.training
+
+    @property
+    def noise_std(self) -> Float[Tensor, "nv"]:
+        """Standard deviation of the acceleration noise per joint, given, learned or estimated."""
+        return self.hyperparameters[ACCELERATION].exp()
+
+    @property
+    def solution(self) -> Tensor | None:
+        """What conditioning on these rows again can begin from, stored with the model; None where it is cheap."""
+        return self.engine.solution(self.latent)
+
+    @cached_property
+    def negative_log_likelihood(self) -> float:
+        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior.
+
+        With inducing points its upper bound.
+        """
+        with torch.no_grad():
+            if isinstance(self.latent, InducingPosterior):
+                return float(self.likelihood.bound(self.kernels, self.hyperparameters, self.latent.features))
+            return float(self.likelihood(self.kernels, self.hyperparameters))
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """Model, robot, training rows, and how the search ended."""
+        rows, result = self.training, self.result
+        return {
+            "model": self.description,
+            "robot": f"{self.model.robot.name!r}, {self.model.robot.nv} joints, {len(self.model.contacts)} contacts",
+            "learned from": f"{len(rows)} {'rows' if rows.weights is None else 'windows'}",
+            "noise std": rounded(self.noise_std.tolist()),
+            "search": f"{'converged' if result.converged else 'not converged'}, {result.status}",
+        }
+
+    @property
+    def description(self) -> str:
+        """What kind of model it is, in a few words, for titles and tables."""
+        forces = self.trained.unknown
+        mean = "zero mean" if self.carries_known_forces else "analytical mean"
+        if not forces.terms:
+            return "identified model" if self.estimates else "analytical model"
+        if self.is_black_box:
+            return "independent GP"
+        if isinstance(forces.terms[0], JointAccelerations):
+            return f"unconstrained accelerations, {mean}"
+        names = list(forces.term_names)
+        shown = "" if names == [JointForces().title] else f"{' + '.join(names)}, "
+        return f"{shown}{mean}"
+
+    @property
+    def is_black_box(self) -> bool:
+        """Whether it learned accelerations, whatever the forces are, and predicts nothing else."""
+        return any(isinstance(force, IndependentAccelerations) for force in self.trained.unknown_forces)
+
+    @property
+    def carries_known_forces(self) -> bool:
+        """Whether the predicted `unknown_force` holds the known forces, too."""
+        return self.trained.carries_known_forces
+
+    @property
+    def motion_intervals(self) -> MotionIntervals | None:
+        """Widths of the intervals of motions, where they were calibrated (`forcegp.calibrated`); a rollout has them."""
+        stored = self.settings.get("motion_intervals")
+        found = None if stored is None else MotionIntervals.from_dict(stored)
+        # widths of motions that an observer's columns were part of are not those of motions without
+        return None if found is None or found.inputs not in ((), self.model.inputs) else found
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints in the order of every last dimension."""
+        return self.model.robot.joint_names
+
+    @property
+    def objective(self) -> str:
+        """What `result.history` holds, with its unit in brackets."""
+        return "negative log likelihood with hyperpriors [nats]"
+
+    @property
+    def latent_names(self) -> tuple[str, ...]:
+        """The processes that the prior is made of."""
+        return self.trained.unknown.latent_names(self.trained.robot)
+
+    @property
+    def widening(self) -> float:
+        """How many times as wide intervals are as those of `latent`, whose hyper-parameters count as known.
+
+        `fit/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
+        """
+        return float(self.settings.get("widening", 1.0))
+
+    def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
+        """How well training rows are predicted from those outside their block: in closed form, without another fit.
+
+        `blocks` holds numbers of training rows; None leaves one row out at a time. Rows that follow each other in time
+        hold nearly the same information, so leave them out together: `forcegp.data.time_blocks`. The parameters stay
+        those that were fitted to all rows, so the scores flatter a model with many of them a little.
+        Raises InvalidInput for blocks that overlap, and for models that would have to be trained again.
+        """
+        with torch.no_grad(), blas_threads(self.training.q.numel()):
+            *_, noise = self.likelihood.terms(self.hyperparameters)
+            return leave_blocks_out(exact(self.latent, "leaving rows out").system, noise, blocks)
