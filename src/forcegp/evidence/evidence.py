@@ -30,7 +30,7 @@ class Evidence(ABC):
             )
 
     def __str__(self) -> str:
-        given = [f"{f.name} {getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name) != f.default]  # type: ignore[arg-type]
+        given = [f"{f.name} {getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name) != f.default]  # type: ignore[arg-type]  # every evidence is a dataclass
         return ", ".join([self.name, *given])
 
 

@@ -82,7 +82,8 @@ class Unknowns:
         free = np.full(self.weights.count, np.inf)
         low, high = self.space.bounds
         given = np.append(low, -free), np.append(high, free), np.append(self.space.longest_steps, free)
-        return tuple(torch.as_tensor(x) for x in given)  # type: ignore[return-value]
+        least, most, step = (torch.as_tensor(x) for x in given)
+        return least, most, step
 
     def prior(self, x: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, "P P"]]:
         """Standardised distance from the prior, and its Jacobian."""

@@ -45,7 +45,7 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: 
         if not isinstance(law, JointLaw):
             continue
         first = next(iter(law.coefficients))
-        own = (law.with_values({first: 1.0}) if first in law.learned else law).bound_to(robot)  # type: ignore[dict-item]
+        own = (law.with_values({first: 1.0}) if first in law.learned else law).bound_to(robot)  # type: ignore[dict-item]  # a number is one of what coefficients take
         with torch.no_grad():
             needed = -own.force(state).cpu().numpy()
             inertia = own.added_inertia(robot)

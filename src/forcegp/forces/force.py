@@ -213,7 +213,7 @@ class JointLaw(Law):
 
     @override
     def bound_to(self: AnyLaw, robot: Robot) -> AnyLaw:
-        return replace(self, **{name: self._bound(name, robot) for name in self.coefficients})  # type: ignore[type-var]
+        return replace(self, **{name: self._bound(name, robot) for name in self.coefficients})  # type: ignore[type-var]  # laws are dataclasses
 
     def _bound(self, name: str, robot: Robot) -> Any:
         given, coefficient = getattr(self, name), self.coefficients[name]

@@ -35,7 +35,7 @@ class RigidBodies(Law):
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        raise NotImplementedError("the force of bodies is their bias")
+        raise NotImplementedError("bodies are no sum of amplitudes: `force_at` is their bias")
 
     @override
     def force_at(self, state: State, values: Mapping[str, Tensor]) -> Tensor:
@@ -126,7 +126,7 @@ class Payload(Law):
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        raise NotImplementedError("a payload is part of its body")
+        raise NotImplementedError("a payload is part of its body, whose force is the bias")
 
     @override
     def force_at(self, state: State, values: Mapping[str, Tensor]) -> Tensor:
