@@ -239,7 +239,8 @@ def _pushes(law: Law, state: State, model: Model) -> list[_Push]:
         change = [law.force_at(state, {**law.values, name: value + sign * step}) for sign in (1.0, 0.0)]
         force = (change[0] - change[1]).expand_as(state.v)
         inputs = torch.stack([z[..., joint] if isinstance(law, JointLaw) else z[..., 0] for z in features], dim=-1)
-        own = title if not isinstance(law, JointLaw) else f"{title}.{model.robot.joint_names[joint]}"
+        label = title if len(law.coefficients) == 1 else f"{title}.{name}"  # as its estimate is called
+        own = label if not isinstance(law, JointLaw) else f"{label}.{model.robot.joint_names[joint]}"
         found.append(_Push(own, title, force, inputs, float(torch.linalg.vector_norm(force))))
     largest = max((push.share for push in found), default=0.0)
     return [replace(push, share=push.share / max(largest, 1e-300)) for push in found]
