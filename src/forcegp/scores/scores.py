@@ -162,7 +162,7 @@ class Scores(Summary):
                 if (only := simple or other) is not None:
                     second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
                     found = None if second is None else self.difference(criterion, only, second)
-                    why = f"the lowest {words}{'' if found is None else f': {found.sentence}'}"
+                    why = f"the lowest {words}" if found is None else found.sentence
                     out[criterion] = {"model": only, "why": why}
                 continue
             found = self.difference(criterion, other, simple)
