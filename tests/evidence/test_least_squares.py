@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from forcegp.evidence.least_squares import BEND, MAD, correlation_time, weighted_least_squares
+from forcegp.evidence.least_squares import BEND, MAD, Chained, Regressor, correlation_time, weighted_least_squares
 
 TRUTH = np.array([1.0, -0.5, 0.3])
 
@@ -60,6 +60,19 @@ def test_the_noise_of_every_column_is_found_and_decides_the_weights():
     np.testing.assert_allclose(fit.noise, [0.01, 0.5], rtol=0.1)
     errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
     assert (abs(fit.x - TRUTH) < 4.0 * errors).all()
+
+
+@pytest.mark.parametrize("bodies", [0, 2])
+def test_normal_equations_in_parts_are_those_of_the_whole_jacobian(bodies):
+    generator, noise = np.random.default_rng(1), np.array([0.1, 2.0, 5.0])
+    inner, others = generator.normal(size=(10 * bodies, 7 * bodies)), generator.normal(size=(50, 3, 4))
+    others[:, 0, 1:] = 0.0  # numbers of one joint do not act on others
+    jacobian = Chained(Regressor(generator.normal(size=(50, 3, 10 * bodies))), inner, others)
+    white = generator.normal(size=(50, 3))
+    gradient, curvature = jacobian.normal_equations(white, noise)
+    whole = (np.asarray(jacobian) / noise[:, None]).reshape(150, -1)
+    np.testing.assert_allclose(gradient, whole.T @ white.ravel(), rtol=1e-10)
+    np.testing.assert_allclose(curvature, whole.T @ whole, rtol=1e-10, atol=1e-10)
 
 
 def test_outliers_hardly_move_a_robust_fit():

@@ -98,14 +98,15 @@ class Bodies:
         self, x: Float[np.ndarray, " k"], regressor: Float[np.ndarray, "rows nv n 10"]
     ) -> Float[np.ndarray, "rows nv k"]:
         """Derivatives in the coordinates of what has these derivatives in the standard parameters of every body."""
-        own = self._standard(self._congruent(_log_cholesky(self._full @ x)[1])).swapaxes(-1, -2)
-        out, column = np.empty((*regressor.shape[:2], self.size)), 0
-        for body, derivative in enumerate(own):  # matrix products, where `einsum` would loop by itself
-            block = self._full[10 * body : 10 * body + 10]
-            width = sum(len(PARTS[part]) for part in self.priors[body].parts)
-            out[..., column : column + width] = regressor[:, :, body] @ (derivative @ block[:, column : column + width])
-            column += width
+        out, slopes = np.empty((*regressor.shape[:2], self.size)), self.slopes(x)
+        for body, columns in enumerate(self.slices):  # matrix products, where `einsum` would loop by itself
+            out[..., columns] = regressor[:, :, body] @ slopes[10 * body : 10 * body + 10, columns]
         return out
+
+    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "standard k"]:
+        """Derivatives of the standard parameters of all bodies, one after the other, in the coordinates."""
+        own = self._standard(self._congruent(_log_cholesky(self._full @ x)[1])).swapaxes(-1, -2)
+        return block_diag(*own) @ self._full if len(own) else np.zeros((0, 0))
 
     def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.

@@ -20,7 +20,8 @@ prior (generalized least squares). Of joint j it has the mean square ``sum_n (1 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -132,8 +133,52 @@ OUTLYING = 3.0
 MAD = 1.4826
 """Median absolute deviation of a normal distribution -> its standard deviation."""
 
-Residual = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""x -> residuals (rows, nv) and Jacobian (rows, nv, k); of the prior (p,) and (p, k)."""
+
+class Regressor:
+    """Derivatives (rows, nv, p) that stay as they are while coordinates change, so their squares are summed once."""
+
+    def __init__(self, values: Float[np.ndarray, "rows nv p"]) -> None:
+        self.values = values
+
+    @cached_property
+    def squares(self) -> Float[np.ndarray, "nv p p"]:
+        """Y_j^T Y_j of every joint."""
+        return np.stack([self.values[:, j].T @ self.values[:, j] for j in range(self.values.shape[1])])
+
+
+@dataclass(frozen=True, eq=False)
+class Chained:
+    """The Jacobian [Y C, T] (rows, nv, k): of it Y stays, C (p, m) is small, and T (rows, nv, t) has few columns."""
+
+    regressor: Regressor
+    inner: Float[np.ndarray, "p m"]
+    others: Float[np.ndarray, "rows nv t"]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.concatenate([self.regressor.values @ self.inner, self.others], axis=-1)
+
+    def normal_equations(
+        self, white: Float[np.ndarray, "rows nv"], noise: Float[np.ndarray, " nv"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """J^T r and J^T J over the noise, without J, which takes longer to write than all products."""
+        Y, p, count = self.regressor.values, len(self.inner), self.others.shape[-1]
+        across, squares, slope = np.zeros((p, count)), np.zeros((count, count)), np.zeros(count)
+        for joint, level in enumerate(noise):
+            shown = np.flatnonzero(self.others[:, joint].any(axis=0))  # most numbers of laws act on one joint
+            T, r = self.others[:, joint, shown] / level, white[:, joint]
+            across[:, shown] += Y[:, joint].T @ (T / level)
+            squares[np.ix_(shown, shown)] += T.T @ T
+            slope[shown] += T.T @ r
+        own = np.tensordot(noise**-2.0, self.regressor.squares, 1)
+        C, across = self.inner, self.inner.T @ across
+        gradient = C.T @ (Y.reshape(white.size, p).T @ (white / noise).ravel())
+        curvature = np.block([[C.T @ own @ C, across], [across.T, squares]])
+        return np.concatenate([gradient, slope]), curvature
+
+
+Jacobian = Float[np.ndarray, "rows nv k"] | Chained
+Residual = Callable[[np.ndarray], tuple[np.ndarray, Any]]
+"""x -> residuals (rows, nv) and `Jacobian` (rows, nv, k); of the prior (p,) and (p, k)."""
 Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """x and a step -> where it leads: x + step to first order."""
 
@@ -172,7 +217,8 @@ class Fit:
     @property
     def information(self) -> Float[np.ndarray, "k k"]:
         """Gauss-Newton curvature of the data, each residual weighted by its noise."""
-        return self.weighted().T @ self.weighted()
+        weighted = self.weighted()
+        return weighted.T @ weighted
 
 
 def weighted_least_squares(
@@ -196,9 +242,9 @@ def weighted_least_squares(
     is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps follow `moved`: residuals
     that are as good as linear along it have no curved valleys, in which searches creep.
     """
-    last: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
+    last: list[tuple[np.ndarray, tuple[np.ndarray, Any]]] = []
 
-    def at(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(point: np.ndarray) -> tuple[np.ndarray, Any]:
         if not last or not np.array_equal(last[0][0], point):
             last[:] = [(point.copy(), residual(point))]
         return last[0][1]
@@ -230,7 +276,9 @@ def weighted_least_squares(
     span = _span(held, noise)
     weight = _weights(without(r / noise, span), robust)
     in_prior = prior(x)[1]
-    return Fit(x, r, jacobian, noise, weight, in_prior.T @ in_prior, total, settled and converged, span, expected)
+    return Fit(
+        x, r, np.asarray(jacobian), noise, weight, in_prior.T @ in_prior, total, settled and converged, span, expected
+    )
 
 
 def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:
@@ -315,10 +363,13 @@ def _point(
         white = without(r / noise, span)
         weight = _weights(white, robust)
         cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
-        flat = without(jacobian if (noise == 1.0).all() else jacobian / noise[:, None], span)
-        flat = (flat * np.sqrt(weight)[..., None] if robust else flat).reshape(-1, len(x))
-        gradient = flat.T @ (np.sqrt(weight) * white).ravel() + prior_jacobian.T @ prior_r
-        curvature = flat.T @ flat + prior_jacobian.T @ prior_jacobian
+        if isinstance(jacobian, Chained) and span is None and not robust:
+            gradient, curvature = jacobian.normal_equations(white, noise)
+        else:
+            flat = without(np.asarray(jacobian) / noise[:, None], span)
+            flat = (flat * np.sqrt(weight)[..., None] if robust else flat).reshape(-1, len(x))
+            gradient, curvature = flat.T @ (np.sqrt(weight) * white).ravel(), flat.T @ flat
+        gradient, curvature = gradient + prior_jacobian.T @ prior_r, curvature + prior_jacobian.T @ prior_jacobian
         cost = float(cost + 0.5 * (prior_r**2).sum())
     if not (np.isfinite(cost) and np.isfinite(curvature).all()):
         return bad

@@ -271,8 +271,11 @@ class ParameterSpace:
                 force, derivatives = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
                 total -= force
             for (own, term), derivative in zip(terms, derivatives, strict=True):
-                width = len(term.size)
-                jacobian[..., column : column + width] = derivative * term.slopes(own)
+                places, width = list(term.joints or ()), len(term.size)
+                if derivative.ndim == 2:  # number j acts on joint j alone
+                    jacobian[:, places, range(column, column + width)] = derivative[:, places] * term.slopes(own)
+                else:
+                    jacobian[..., column : column + width] = derivative * term.slopes(own)
                 column += width
         return total, jacobian
 
@@ -307,7 +310,10 @@ def force_title(law: Law) -> str:
 def _derivatives(
     law: Law, values: Mapping[str, Tensor], terms: Sequence[Term], features: tuple[Tensor, ...], B: Tensor | None
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The force (rows, nv) and, of minus that, derivatives in every entry of each term (rows, nv, k)."""
+    """The force (rows, nv) and, of minus that, derivatives in every entry of each term.
+
+    They are (rows, nv, k), or (rows, nv) where entry j acts on joint j alone.
+    """
     rows = features[0].shape[:-1]
     wanted = {term.name for term in terms}
     numbers = {
@@ -321,9 +327,10 @@ def _derivatives(
         for term in terms:
             if term.joints is not None:  # amplitude j depends on entry j alone
                 slope = torch.autograd.grad(amplitude.sum(), numbers[term.name], retain_graph=True)[0]
-                places = list(term.joints)
-                each = torch.zeros(*rows, amplitude.shape[-1], len(places), dtype=slope.dtype, device=slope.device)
-                each[..., places, range(len(places))] = slope[..., places]
+                if B is None:
+                    out.append(-slope.cpu().numpy())
+                    continue
+                each = slope.diag_embed()[..., list(term.joints)]
             else:
                 parts = [
                     torch.autograd.grad(amplitude[..., k].sum(), numbers[term.name], retain_graph=True)[0]

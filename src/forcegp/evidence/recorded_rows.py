@@ -163,7 +163,7 @@ class RecordedRows:
         a = np.array(a)
         Y = self.kinematics.torque_regressor(torch.as_tensor(a, device=self.kinematics.robot.device)).cpu().numpy()
         fixed = Y.reshape(*a.shape, -1) @ self._stated.ravel() + a @ (self.inertia + self._armature) - self.force
-        return Motion(a, Y[:, :, self._carriers] * self._there[:, None], fixed)
+        return Motion(a, np.ascontiguousarray(Y[:, :, self._carriers] * self._there[:, None]), fixed)
 
     def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
         """The part of joint forces (first axis after the rows) that no lambda can explain."""

@@ -21,8 +21,8 @@ from forcegp.evidence.identifiability import BaseParameters, parameter_names
 from forcegp.evidence.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.payload_link import most_likely, possible_links
-from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
 from forcegp.fit.base_doubts import warn_of_what_holds_it_up
+from forcegp.fit.equations import Equations
 from forcegp.fit.payload_doubts import warn_of_no_body, warn_of_offsets
 from forcegp.forces import Payload, RigidBodies
 from forcegp.model import Model
@@ -62,108 +62,6 @@ class Solution:
     """Its coordinates."""
 
 
-class _Logs:
-    """Rows of one log or several as one array each, and the equations that they give at x."""
-
-    def __init__(self, space: ParameterSpace, logs: Sequence[Dataset], evidence: Torques | Accelerations) -> None:
-        self.space, self.evidence, self.logs = space, evidence, logs
-        self.parts = [RecordedRows(space, log.q, log.v, log.u, loaded=not k) for k, log in enumerate(logs)]
-        self.a = np.concatenate([log.a for log in logs])
-        self.ends = np.cumsum([len(log) for log in logs])[:-1]
-        self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
-        self.held = _stacked([part.held for part in self.parts])
-        seconds = evidence.mean if isinstance(evidence, Torques) else None
-        self.windows = None if seconds is None else _Windows(logs, seconds)
-
-    def each(self, values: np.ndarray) -> list[np.ndarray]:
-        """Rows by log."""
-        return np.split(values, self.ends)
-
-    def joined(self, parts: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
-        """Arrays of all logs."""
-        return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-
-    def equations(self, x: np.ndarray, r: np.ndarray, Y: np.ndarray, in_terms: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
-        of_bodies = self.space.bodies.chained(x[: self.space.bodies.size], Y)
-        return r, np.concatenate([of_bodies, in_terms], axis=-1)
-
-    def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, np.ndarray]:
-        """Torques needed less those measured."""
-        found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
-        r, jacobian = self.equations(x, *self.joined(found))
-        if self.windows is None:
-            return r, jacobian
-        free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
-        return self.windows.mean(free(r)), self.windows.mean(free(jacobian))
-
-    def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Accelerations measured less those predicted."""
-        found = [part.in_acceleration(x, a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
-        r, jacobian = self.equations(x, *self.joined(found))
-        return r, jacobian
-
-    def whitened(self, x: np.ndarray, likely: Sequence[LikelyAccelerations]) -> tuple[np.ndarray, np.ndarray]:
-        """Torques needed less those measured, over the noise of both."""
-        found = []
-        for part, each in zip(self.parts, likely, strict=True):
-            r, Y, in_terms, _ = part.in_torque(x, each.motion)
-            Y = each.white_regressor if Y is each.motion.regressor else each.white(Y)
-            found.append(((each.whitening @ (r + each.offset)[..., None])[..., 0], Y, each.whitening @ in_terms))
-        r, jacobian = self.equations(x, *self.joined(found))
-        if self.windows is None:
-            return r, jacobian
-        return self.windows.mean(r), self.windows.mean(jacobian)
-
-    def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
-        """Predicted accelerations, M and H."""
-        return self.joined([part.acceleration(x) for part in self.parts])
-
-    def levels(
-        self, x: np.ndarray, near: NoiseLevels | None, least: NoiseLevels | None, robust: bool, rough: bool
-    ) -> NoiseLevels:
-        """The noise about the estimates at x, sought `near` others and above `least`."""
-        if rough:
-            noise = self.parts[0].rough_noise(x, self.each(self.a)[0])
-        else:
-            predicted, M, H = self.accelerations(x)
-            noise = NoiseLevels.of(self.a - predicted, M, H, near, robust)
-        if least is None:
-            return noise
-        return NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
-
-    def stretches(self) -> list[np.ndarray]:
-        """Numbers of equations by stretch of time, some of each log in every one."""
-        lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
-        nv, starts = self.a.shape[1], np.concatenate([[0], np.cumsum(lengths)])
-        numbers = []
-        for log, start, length in zip(self.logs, starts, lengths, strict=False):
-            order = np.arange(length)
-            if self.windows is None:
-                order = np.lexsort((log.time, log.episode))
-            numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))
-        rows = [np.concatenate(each) for each in zip(*numbers, strict=True)]
-        return [(nv * each[:, None] + np.arange(nv)).ravel() for each in rows if len(each)]
-
-
-class _Windows:
-    """Means over windows of time, times the root of their rows, so that white noise keeps its size."""
-
-    def __init__(self, logs: Sequence[Dataset], seconds: float) -> None:
-        number = np.concatenate([np.full(len(log), k) for k, log in enumerate(logs)])
-        episode, time = (np.concatenate([getattr(log, name) for log in logs]) for name in ("episode", "time"))
-        keys = np.stack([number, episode, np.floor(time / seconds)])
-        self.starts = np.flatnonzero(np.r_[True, (np.diff(keys) != 0).any(axis=0)])
-        self.roots = np.sqrt(np.diff(np.r_[self.starts, len(time)]))
-        self.lengths = np.bincount(number[self.starts]).tolist()
-        """Windows of every log."""
-
-    def mean(self, values: np.ndarray) -> np.ndarray:
-        """(rows, ...) as (windows, ...)."""
-        sums = np.add.reduceat(values, self.starts, axis=0)
-        return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
-
-
 def fit_physical(
     model: Model,
     logs: Sequence[Dataset],
@@ -179,7 +77,7 @@ def fit_physical(
     typical = typical_sizes(model, logs)
     model = with_payloads_placed(model, logs, typical)
     space = ParameterSpace(model, typical)
-    equations = _Logs(space, logs, evidence)
+    equations = Equations(space, logs, evidence)
     held = equations.held if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
     if held is not None and held.any(-1).sum(1).min() == robot.nv:
         raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")
@@ -228,7 +126,7 @@ def fit_physical(
 
 
 def _with_noise_in_both(
-    equations: _Logs, search: Callable[..., Fit], x: np.ndarray, robust: bool, note: Progress
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, robust: bool, note: Progress
 ) -> tuple[Fit, NoiseLevels]:
     """Searches about likely accelerations, whose levels of noise are found along."""
     noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, not robust
@@ -254,7 +152,7 @@ def _with_noise_in_both(
 
 
 def _estimates(
-    space: ParameterSpace, fit: Fit, equations: _Logs, evidence: Torques | Accelerations, thick: tuple[str, ...]
+    space: ParameterSpace, fit: Fit, equations: Equations, evidence: Torques | Accelerations, thick: tuple[str, ...]
 ) -> Estimates:
     """The numbers at the end of the search."""
     scaled = without(fit.jacobian / fit.noise[:, None], fit.span) * np.sqrt(fit.weight)[..., None]
@@ -356,7 +254,7 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset], typical: dict[st
         tried = [Payload(link) for link in candidates]
         space = ParameterSpace(replace(model, forces=(*forces, *tried)), typical)
         evidence = Torques(mean=WINDOW)
-        equations = _Logs(space, logs, evidence)
+        equations = Equations(space, logs, evidence)
         names = [each.name for each in space.carried]
         places = [names.index(f"payload.{link}") for link in candidates]
         r, jacobian = _without_payloads(equations, space, places)
@@ -372,7 +270,9 @@ WINDOW = 0.4
 """Seconds that torques are averaged over where the link of a payload is sought, and by `forcegp payload`."""
 
 
-def _without_payloads(equations: _Logs, space: ParameterSpace, places: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _without_payloads(
+    equations: Equations, space: ParameterSpace, places: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Residual at the start without the payloads, and the Jacobian in all other coordinates."""
     bare = []
     for motion in equations.measured:
@@ -381,7 +281,7 @@ def _without_payloads(equations: _Logs, space: ParameterSpace, places: Sequence[
         bare.append(replace(motion, regressor=regressor))
     r, jacobian = equations.in_torque(space.start, bare)
     of_payloads = np.concatenate([np.arange(10 * place, 10 * place + 10) for place in places])
-    return r, np.delete(jacobian, of_payloads, axis=-1)
+    return r, np.delete(np.asarray(jacobian), of_payloads, axis=-1)
 
 
 def _warn_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> None:
@@ -399,12 +299,6 @@ def _warn_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> None:
             slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
             link = getattr(space.model.laws[each.payload], "link", "")
             warn_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
-
-
-def _stacked(held: Sequence[np.ndarray]) -> np.ndarray:
-    """Directions of contact forces of all logs, as many in every row: zeros where a log has fewer."""
-    most = max(each.shape[1] for each in held)
-    return np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
 
 
 STRETCHES_LEFT_OUT = 4
