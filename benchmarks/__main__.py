@@ -1,4 +1,4 @@
-"""Run every benchmark, print, and write `results.json`, the table of `README.md` and docs/benchmarks/performance.md.
+"""Run every benchmark, print, and write `results.json` and docs/benchmarks/performance.md.
 
 All in one process on one thread, but for those that need processes of their own.
 
@@ -15,24 +15,12 @@ from importlib import import_module
 from pathlib import Path
 
 from benchmarks.performance_page import PAGE, performance_page
-from benchmarks.questions import MEANINGS, TITLES
+from benchmarks.questions import TITLES
 from forcegp.atomic_files import write_text
 from forcegp.jobs.job import machine
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results.json"
-README = FOLDER / "README.md"
-BEGIN, END = "<!-- table: written by `make bench` -->", "<!-- end of table -->"
-
-
-def table(results: dict[str, float]) -> str:
-    """The Markdown table of all results that have a meaning."""
-    rows = ["| measured | bound | key | what |", "|---:|:---|:---|:---|"]
-    for meanings in MEANINGS.values():
-        for key, (bound, meaning) in meanings.items():
-            if key in results:
-                rows.append(f"| {results[key]:.3g} | {bound} | `{key}` | {meaning} |")
-    return "\n".join(rows)
 
 
 def main(questions: list[str]) -> None:
@@ -53,11 +41,9 @@ def main(questions: list[str]) -> None:
         stored["machine"] = f"{machine()}; one thread used"
         stored["date"] = datetime.now(UTC).date().isoformat()
         write_text(RESULTS, json.dumps(stored, indent=1, sort_keys=True) + "\n")
-    text = README.read_text(encoding="utf-8")
-    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    write_text(README, f"{before}\n{table(stored)}\n\n{stored['machine']}, {stored['date']}.\n{after}")
-    write_text(PAGE, performance_page(stored))
-    print(f"\n{table(stored)}\n\n{stored['machine']}")
+    page = performance_page(stored)
+    write_text(PAGE, page)
+    print(f"\n{page}")
 
 
 if __name__ == "__main__":
