@@ -239,7 +239,7 @@ def no_forces() -> Any:
 def friction_curves() -> Any:
     """All friction of an arm that rubs on a surface, in its joints and at its tool, from one fit."""
     options = {"friction": "stribeck", "joint_friction": "stribeck"}
-    posterior = fitted(recording(1, **options), ContactFriction(load=True) + JointFriction(), 200)
+    posterior = fitted(recording(1, **options), (ContactFriction(load=True), JointFriction()), 200)
     return friction_curves_figure(posterior, recording(2, **options))
 
 
@@ -250,12 +250,12 @@ def normal_force() -> Any:
 
 
 def friction_map() -> Any:
-    """Viscous friction with a rough strip, under three kernels."""
+    """Viscous friction with a rough strip, under two kernels."""
     rough = recording(1, patch_factor=4.0)
-    figure = new_figure(11.0, 3.2)
-    grid = figure.subplots(1, 3)
+    figure = new_figure(7.5, 3.2)
+    grid = figure.subplots(1, 2)
     x, place = across_the_strip()
-    for axes, kernel in zip(grid, ("squared-exponential", "matern-3/2", "deep"), strict=True):
+    for axes, kernel in zip(grid, ("squared-exponential", "matern-3/2"), strict=True):
         posterior = fitted(rough, ContactFriction(viscous=True, inputs=("position",), kernel=kernel), 100)
         tangents, visited_x = plane_of(posterior)
         curve = posterior.curve("sliding", place @ tangents)

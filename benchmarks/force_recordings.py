@@ -39,9 +39,11 @@ def with_force(data: Dataset, prior: Unknown, *laws: Law, seed: int = 5) -> Data
     return replace(data, a=a + NOISE * np.random.default_rng(seed).standard_normal(a.shape), truth={"a": a})
 
 
-def fitted(data: Dataset, prior: Unknown, points: int, mean: str = "analytical", **options: Any) -> Any:
+def fitted(
+    data: Dataset, prior: Unknown | tuple[Unknown, ...], points: int, mean: str = "analytical", **options: Any
+) -> Any:
     assert data.model is not None
-    model = data.model.with_forces(prior)
+    model = data.model.with_forces(*(prior if isinstance(prior, tuple) else (prior,)))
     return fit(model if mean == "analytical" else model.without_mean(), data, points=points, restarts=1, **options)  # type: ignore[arg-type]  # one of the names in Mean
 
 
@@ -82,14 +84,14 @@ def roughness(x: torch.Tensor) -> torch.Tensor:
 
 def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
     """The two tangents (3, 2) of the plane, of which the first is x, and where the tool was in x."""
-    dynamics = posterior.likelihood.dynamics()
+    dynamics = posterior.likelihood.dynamics
     tool = dynamics.state.kinematics.frame_pose(TOOL)
     points = tool[:, :3, 3] + 0.1 * tool[:, :3, 2]
     return surface_axes(dynamics.normals[:1, 0, :])[0, :, :2], points[:, 0].numpy()
 
 
 def visited(posterior: Any, latent: int, feature: int = 0) -> np.ndarray:
-    features = posterior.model.unknown.features(posterior.likelihood.dynamics())
+    features = posterior.model.unknown.features(posterior.likelihood.dynamics)
     return features[latent][:, feature].numpy()
 
 

@@ -93,7 +93,7 @@ def deletion_speed(data: Dataset) -> float:
     kept = rows_to_keep(latent, BUDGET)
     rank = latent.system.deflation.rank
     entries = (kept[:, None] * rank + torch.arange(rank)).reshape(-1)
-    anew = with_only(latent, kept).model.factor.lower.tril()
+    anew = with_only(latent, kept).system.factor.lower.tril()
     lower = latent.system.factor.lower.tril()
     by_update = left_out_of_factor(lower, entries)
     torch.testing.assert_close(by_update @ by_update.mT, anew @ anew.mT, rtol=1e-9, atol=1e-9)

@@ -50,7 +50,8 @@ def fitted(train: Dataset, prior: str, points: int) -> Posterior:
     if points == 100:
         return first
     rows = TrainingData.of(farthest_rows(train, points), model.robot.device)
-    return first.model.condition(rows, first.hyperparameters, first.result, {**first.settings, "points": points})
+    settings = {**first.settings, "points": points}
+    return Posterior.conditioned(first.trained, rows, first.hyperparameters, first.result, settings)
 
 
 def seconds(call: Callable[[], Any], repeats: int) -> float:

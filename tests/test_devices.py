@@ -26,7 +26,7 @@ PRIORS = (
     "gp:load-friction,gp:joint-friction",
     "gp:tool-friction",
     "gp:joint-ripple",
-    "gp:joint:kernel=deep",
+    "gp:joint:kernel=matern-3/2",
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::forcegp.errors.NumericalWarning", "ignore::forcegp.errors.DataWarning")
@@ -160,7 +160,7 @@ def likelihood_and_gradients(model, data, device, trips=None):
     ("prior", "integrators"),
     [
         ("gp:load-friction:expected=0.1,gp:joint-friction", ["symplectic-euler"]),
-        ("gp:joint:kernel=deep", ["rk4", "projected"]),
+        ("gp:joint:kernel=matern-3/2", ["rk4", "projected"]),
     ],
 )
 def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path):

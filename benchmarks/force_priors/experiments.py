@@ -1,4 +1,4 @@
-"""The experiments on force priors: data efficiency, friction as it is, other contacts, one that opens, deep kernels."""
+"""The experiments on force priors: data efficiency, friction as it is, other contacts, one that opens."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -291,42 +291,3 @@ class UnilateralContact(ForceExperiment):
             f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
             "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.\n\n"
         ) + score_table(summary["trials"], columns)
-
-
-KERNELS = {
-    "squared exponential": "gp:friction-map",
-    "Matérn 3/2": "gp:friction-map:kernel=matern-3/2",
-    "deep": "gp:friction-map:kernel=deep",
-}
-STRIP = ("patch", "viscous")
-
-
-@dataclass(frozen=True)
-class DeepKernel(ForceExperiment):
-    """A map of friction over the table, on a strip of other friction and without one."""
-
-    name, title = "deep-kernel", "Deep kernels"
-
-    @override
-    def trials(self) -> list[Trial]:
-        return [
-            Trial(f"{label} kernel", scenario, prior, points)
-            for scenario in STRIP
-            for points in self.points
-            for label, prior in KERNELS.items()
-        ]
-
-    @override
-    def section(self, summary: Mapping[str, Any]) -> str:
-        parts = [
-            "`friction-map`: viscous friction whose coefficient depends on the place, analytical mean, "
-            f"{len(self.seeds)} seeds. Leave-one-out: log density of a training row given all others, in nats per row, "
-            "from the same fit; the higher, the better. `forcegp score --split leave-out` takes stretches of time."
-        ]
-        columns = ("mae_noise_free", "nlpd", "coverage_95")
-        for scenario in STRIP:
-            trials = trials_on(scenario, summary)
-            densities = [f"{t['label']}, N={t['points']}: {formatted(t['leave_one_out'], 3)}" for t in trials]
-            texts = (heading(LABELS[scenario]), score_table(trials, columns))
-            parts += [*texts, f"Leave-one-out: {'; '.join(densities)}."]
-        return "\n\n".join(parts)

@@ -6,7 +6,6 @@ from typing import Any
 
 from benchmarks.force_priors.experiments import (
     DataEfficiency,
-    DeepKernel,
     Friction,
     OtherLaws,
     Transfer,
@@ -33,11 +32,10 @@ PRESETS: dict[str, tuple[ForceExperiment, ...]] = {
         OtherLaws(points=(200,), **{**FORCES, "seeds": SEEDS[:3]}),
         Transfer(points=(100,), **FORCES),
         UnilateralContact(points=(200,), **FORCES),
-        DeepKernel(points=(200,), **FORCES),
     ),
     TRIAL: (
         DataEfficiency(points=(10, 20), region_points=20, **SMALL),
-        *(kind(points=(20,), **SMALL) for kind in (Friction, OtherLaws, Transfer, UnilateralContact, DeepKernel)),
+        *(kind(points=(20,), **SMALL) for kind in (Friction, OtherLaws, Transfer, UnilateralContact)),
     ),
 }
 

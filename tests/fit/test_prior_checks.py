@@ -196,7 +196,7 @@ def test_equal_terms_are_refused(data):
     [
         ((JointFriction(), JointFriction(("lift",))), "'joint-friction-1 lift' and 'joint-friction-2 lift'"),
         ((JointFriction(("pan",)), JointFriction(("pan",), kernel="linear")), "'joint-friction-1 pan' and"),
-        ((JointForces(("v",)), JointForces(("v",), kernel="deep")), "'joint-forces-1 pan' and 'joint-forces-2 pan'"),
+        ((JointForces(("v",)), JointForces(("v",), kernel="linear")), "'joint-forces-1 pan' and 'joint-forces-2 pan'"),
         ((PeriodicJointForces(1.0), PeriodicJointForces(2.0)), "'periodic-joint-forces-1 pan'"),
         ((JointFriction(), Drive()), "'joint-friction pan' and 'drive pan'"),
         (

@@ -6,13 +6,12 @@ import gpytorch.kernels as gk
 import pytest
 import torch
 from tests.forces.kernel_conformance import KernelConformance
-from tests.inference.dense import squared_exponential
 from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from tests.inference.problems import normal
 
 from forcegp.errors import InvalidInput
 from forcegp.forces.kernels import KERNELS, check_kernel, kernel_of
-from forcegp.inference import ExactPosterior, LatentKernels, Terms, minimize_objective, negative_log_likelihood
+from forcegp.inference import LatentKernels
 
 
 class TestSquaredExponential(KernelConformance):
@@ -51,10 +50,6 @@ class TestFriction(KernelConformance):
     expression = "friction"
     dimensions = (1,)
     variance_at_the_start = False  # tanh^2 is a little below 1
-
-
-class TestDeep(KernelConformance):
-    expression = "deep"
 
 
 class TestDeviation(KernelConformance):
@@ -201,7 +196,7 @@ def test_a_product_has_one_variance():
         ("()", "'\\)' stands where a name is expected"),
         ("liner", "no kernel 'liner' in the registry; did you mean 'linear'"),
         ("constant + perodic", "no kernel 'perodic' in 'constant \\+ perodic'; did you mean 'periodic'"),
-        ("matern", "Valid kernels: constant, deep, deviation, friction, linear, matern-1/2"),
+        ("matern", "Valid kernels: constant, deviation, friction, linear, matern-1/2"),
     ],
 )
 def test_wrong_expressions_say_what_is_allowed(expression, message):
@@ -258,76 +253,3 @@ def test_the_width_of_friction_has_a_hyperprior():
         assert float(start[name].exp()) == pytest.approx(0.1)
         moved = latent.log_prior(start | {name: start[name] + 1.5})
         assert float(latent.log_prior(start) - moved) == pytest.approx(1.125)
-
-
-# ---------------------------------------------------------------- the kernel that learns where a force changes
-
-
-def test_deep_without_changes_is_the_squared_exponential_and_a_change_separates_two_sides():
-    kernel = kernel_of("deep", 2, 1.5)
-    base = kernel.base_kernel
-    z = normal(6, 2)
-    base.change.data.zero_()
-    expected = squared_exponential(z, z, base.lengthscale.detach(), 1.5)
-    torch.testing.assert_close(matrix(kernel, z), expected, rtol=1e-12, atol=1e-14)
-    base.change.data.copy_(float64([1.2, 0.0]))
-    base.slope.data.copy_(float64([[3.0, 0.0], [1.0, 0.0]]))
-    base.bias.data.copy_(float64([-1.5, 0.0]))  # the plane z_0 = 1/2
-    pair = float64([[0.0, 0.3], [1.0, 0.3]])
-    near = squared_exponential(pair, pair, base.lengthscale.detach(), 1.5)
-    side = math.tanh(4.0 * 1.5)
-    across = float(near[0, 1]) * math.exp(-0.5 * (2.0 * 1.2 * side) ** 2)
-    assert float(matrix(kernel, pair)[0, 1]) == pytest.approx(across, rel=1e-12)
-
-
-def test_the_hyperpriors_of_deep():
-    """Student t of the changes, (1 + a^2 / s^2)^-(0.3 parameters of the unit); normal bias and logarithm of |w|."""
-    latent = LatentKernels([kernel_of("deep", 3, 0.6)])
-    start = latent.initial_parameters()
-
-    def fall(name, moved):
-        full = f"kernels.0.base_kernel.{name}"
-        return float(latent.log_prior(start) - latent.log_prior(start | {full: moved(start[full])}))
-
-    ratio = (1.0 + (1.0 / 0.01) ** 2) / (1.0 + (0.5 / 0.01) ** 2)
-    assert fall("change", lambda a: 2.0 * a) == pytest.approx(2 * 0.3 * 5 * math.log(ratio), rel=1e-9)
-    assert fall("slope", lambda w: 1.5 * w) == pytest.approx(2 * 0.5 * (math.log(1.5) / 0.3) ** 2, rel=1e-9)
-    bias = start["kernels.0.base_kernel.bias"]
-    expected = 0.5 * float(((bias + 1.0).square() - bias.square()).sum())
-    assert fall("bias", lambda b: b + 1.0) == pytest.approx(expected, rel=1e-9)
-
-
-def neg_log_posterior(kernel, z, y, noise):
-    latent = LatentKernels([kernel])
-    W = torch.ones(len(z), 1, 1, dtype=torch.float64)
-
-    def objective(parameters):
-        value = negative_log_likelihood(W, y, float64([[noise]]), latent.matrices(parameters, [z]))
-        return value - latent.log_prior(parameters)
-
-    result = minimize_objective(objective, latent.initial_parameters())
-    return ExactPosterior.condition(latent.at(result.parameters), Terms([z], W, y, float64([[noise]]))), result
-
-
-def test_deep_finds_a_step_that_the_squared_exponential_smears():
-    z = torch.linspace(-2.0, 2.0, 40, dtype=torch.float64)[:, None]
-    new = z[:-1] + 0.5 * (z[1] - z[0])
-
-    def truth(z):
-        return 0.3 * torch.sin(2.0 * z) + 1.5 * (z > 0.3)
-
-    y = truth(z) + 0.05 * normal(40, 1)
-    errors = {}
-    for name in ("squared-exponential", "deep"):
-        posterior, result = neg_log_posterior(kernel_of(name, 1, 1.0), z, y, 0.05**2)
-        away = ((new - 0.3).abs() > 0.15)[:, 0]
-        errors[name] = float((posterior.mean([new]) - truth(new))[away].square().mean().sqrt())
-    assert errors["deep"] < 0.75 * errors["squared-exponential"]
-    assert float(result.parameters["kernels.0.base_kernel.change"].abs().max()) > 0.5
-
-
-def test_deep_forgets_its_units_where_a_function_is_smooth():
-    z = torch.linspace(-2.0, 2.0, 30, dtype=torch.float64)[:, None]
-    y = torch.sin(1.5 * z) + 0.1 * normal(30, 1)
-    _, result = neg_log_posterior(kernel_of("deep", 1, 1.0), z, y, 0.1**2)
-    assert float(result.parameters["kernels.0.base_kernel.change"].abs().max()) < 0.02

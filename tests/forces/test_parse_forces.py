@@ -76,10 +76,10 @@ EXPRESSIONS = {
     ),
     "gp:tool-friction:torque=true:contact=0": ToolForces(torque=True),
     "gp:load-friction:load=false": ContactFriction(),
-    "gp:tool-friction:kernel=(linear + deep)": ToolForces(kernel="linear + deep"),
-    "gp:tool-friction:kernel=linear*deep": ToolForces(kernel="linear*deep"),
-    "gp:tool-friction:kernel=(linear + deep) * (linear + constant)": ToolForces(
-        kernel="(linear + deep) * (linear + constant)"
+    "gp:tool-friction:kernel=(linear + matern-3/2)": ToolForces(kernel="linear + matern-3/2"),
+    "gp:tool-friction:kernel=linear*matern-3/2": ToolForces(kernel="linear*matern-3/2"),
+    "gp:tool-friction:kernel=(linear + matern-3/2) * (linear + constant)": ToolForces(
+        kernel="(linear + matern-3/2) * (linear + constant)"
     ),
     "viscous:0.3": Viscous(0.3),
     "coulomb:level=0.3/0.4/0.5": Coulomb((0.3, 0.4, 0.5)),
@@ -96,7 +96,7 @@ MISTAKES = {
     "gp:viscous": "'viscous' in 'gp:viscous' is a law with coefficients; write viscous",
     "gp:joint:color=red": "force 'joint' cannot take 'color=red'; write FIELD=VALUE with one of: inputs, ",
     "gp:joint:inptus=q": "did you mean 'inputs'",
-    "gp:joint:kernel=deep:q": "force 'joint' cannot take 'q'; write FIELD=VALUE",
+    "gp:joint:kernel=matern-3/2:q": "force 'joint' cannot take 'q'; write FIELD=VALUE",
     "gp:joint:": "force 'joint' cannot take ''; write FIELD=VALUE",
     "gp:load-friction:load=yes": "force 'load-friction' has load=yes; give true or false",
     "gp:contact-friction:contact=first": "force 'contact-friction' has contact=first; give a whole number",
@@ -112,7 +112,7 @@ MISTAKES = {
     "gp:joint-friction:kernel=frictoin": "did you mean 'friction'",
     "gp:joint-friction:kernel=(linear + ": "a parenthesis is not closed|ends where a name is expected",
     "gp:joint-friction:joints=pan/pan": "each once, or None for all",
-    "gp:deep": "'deep' in 'gp:deep' is a kernel, not a force; write it as an option",
+    "gp:matern-3/2": "'matern-3/2' in 'gp:matern-3/2' is a kernel, not a force; write it as an option",
 }
 
 
@@ -130,8 +130,10 @@ def test_expressions(expression):
 
 
 def test_several_are_written_with_commas():
-    several = parse_forces("viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + deep),torque=true, payload:hand")
-    wanted = (Viscous(), Coulomb(0.1), ToolForces(kernel="linear + deep", torque=True), Payload("hand"))
+    several = parse_forces(
+        "viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + matern-3/2),torque=true, payload:hand"
+    )
+    wanted = (Viscous(), Coulomb(0.1), ToolForces(kernel="linear + matern-3/2", torque=True), Payload("hand"))
     assert list(map(described_force, several)) == list(map(described_force, wanted))
     assert [force.title for force in parse_forces(["viscous", "gp:joint-friction"])] == ["viscous", "joint-friction"]
 

@@ -34,7 +34,7 @@ EXACT = [
     "linear * matern-5/2 + constant",
     "friction * (constant + linear) + matern-3/2 + matern-1/2",
 ]
-TABLES = ["squared-exponential", "rational-quadratic", "periodic", "deep", "squared-exponential * linear + matern-3/2"]
+TABLES = ["squared-exponential", "rational-quadratic", "periodic", "squared-exponential * linear + matern-3/2"]
 
 # the macros of the C writer, for one state and for eight
 ONE = """#include <math.h>

@@ -11,7 +11,7 @@ from forcegp.posterior.storage import load_posterior, save_posterior
 
 PRIORS = {
     "a sum": JointForces(kernel="linear + matern-5/2"),
-    "a product": JointForces(("q", "v"), kernel="deep * (constant + linear)"),
+    "a product": JointForces(("q", "v"), kernel="rational-quadratic * (constant + linear)"),
     "friction": JointFriction(),
 }
 
