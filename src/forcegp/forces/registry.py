@@ -168,9 +168,13 @@ def _one(text: str, expression: Any) -> Any:
     if name not in (*SHORT, *FORCES) or is_unknown(name) != unknown:
         _refuse(name, unknown, expression)
     kind, given = SHORT.get(name, (name, {}))
-    make = force_class(kind)
-    given = dict(given)
-    allowed = {key: field for key, field in signature(make).parameters.items()}
+    return called(f"force {name!r}", force_class(kind), options, given)
+
+
+def called(what: str, make: Callable[..., Any], options: Sequence[str], fixed: Mapping[str, Any] | None = None) -> Any:
+    """`make` with options FIELD=VALUE; the first may leave its field out. Raises InvalidInput, naming `what`."""
+    given = dict(fixed or {})
+    allowed = signature(make).parameters
     for option in options:
         key, equals, value = (part.strip() for part in option.partition("="))
         if not equals and option is options[0]:
@@ -178,12 +182,12 @@ def _one(text: str, expression: Any) -> Any:
         if key not in allowed or not value:
             close = difflib.get_close_matches(key, allowed, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close and close[0] != key else ""
-            what = f"write FIELD=VALUE with one of: {', '.join(allowed)}" if allowed else "it has no options"
-            raise InvalidInput(f"force {name!r} cannot take {option.strip()!r}{hint}; {what}")
-        given[key] = _value(name, key, value, make, allowed[key].default)
+            remedy = f"write FIELD=VALUE with one of: {', '.join(allowed)}" if allowed else "it has no options"
+            raise InvalidInput(f"{what} cannot take {option.strip()!r}{hint}; {remedy}")
+        given[key] = _value(what, key, value, make, allowed[key])
     missing = [key for key, field in allowed.items() if field.default is Parameter.empty and key not in given]
     if missing:
-        raise InvalidInput(f"force {name!r} needs {', '.join(missing)}: write {name}:{missing[0]}=...")
+        raise InvalidInput(f"{what} needs {', '.join(missing)}: write {missing[0]}=...")
     return make(**given)
 
 
@@ -203,13 +207,14 @@ def _refuse(name: str, unknown: bool, expression: Any) -> None:
     require_known("force", name, whole, names)
 
 
-def _value(name: str, key: str, text: str, make: Callable[..., Any], default: Any) -> Any:
+def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Parameter) -> Any:
     """The text as what the option is by default: truth, number, numbers, names, or text."""
-    if key in getattr(make, "coefficients", {}):
+    default = field.default
+    if key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None"):
         default = 0.0
     if isinstance(default, bool):
         if text not in ("true", "false"):
-            raise InvalidInput(f"force {name!r} has {key}={text}; give true or false")
+            raise InvalidInput(f"{what} has {key}={text}; give true or false")
         return text == "true"
     several = default if isinstance(default, tuple) else ()
     numbers = bool(several) and all(isinstance(entry, int | float) for entry in several)
@@ -219,13 +224,11 @@ def _value(name: str, key: str, text: str, make: Callable[..., Any], default: An
             return type(default)(text)
         if numbers or isinstance(default, int | float):
             return tuple((number if numbers else float)(part) for part in text.split("/"))
-        if key == "mass":
-            return float(text)
     except ValueError:
         example = "/".join(map(str, several))
         whole = "whole " if (number if numbers else type(default)) is int else ""
         kind = f"{whole}numbers as in {example}" if numbers else f"a {whole}number"
-        raise InvalidInput(f"force {name!r} has {key}={text}; give {kind}") from None
+        raise InvalidInput(f"{what} has {key}={text}; give {kind}") from None
     if key == "learn":
         return "all" if text == "all" else tuple(part.strip() for part in text.split("/"))
     if isinstance(default, tuple) or key == "joints":
