@@ -13,6 +13,7 @@ from forcegp.forces import (
     JointAccelerations,
     JointForces,
     JointFriction,
+    JointPositionForces,
     PeriodicJointForces,
     ToolForces,
 )
@@ -104,6 +105,10 @@ class TestContactFrictionUnderLoadWithJointFriction(UnknownConformance):
 class TestContactFrictionOfTwoAxes(UnknownConformance):
     prior = ContactFriction(axes="two-axis", load=True, kernel="linear")
     acts_at = TIP
+
+
+class TestJointPositionForces(UnknownConformance):
+    prior = JointPositionForces(("lift",), "matern-5/2")
 
 
 class TestPeriodicJointForces(UnknownConformance):

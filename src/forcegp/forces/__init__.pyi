@@ -6,7 +6,7 @@ from .force import Force as Force, JointLaw as JointLaw, Law as Law
 from .joint_forces import (
     IndependentAccelerations as IndependentAccelerations, JointAccelerations as JointAccelerations,
     JointForces as JointForces, JointFriction as JointFriction,
-    PeriodicJointForces as PeriodicJointForces,
+    JointPositionForces as JointPositionForces, PeriodicJointForces as PeriodicJointForces,
 )
 from .kernels import KERNELS as KERNELS, kernel_of as kernel_of
 from .offset import Offset as Offset, Spring as Spring

@@ -263,6 +263,24 @@ class JointFriction(PerJoint, ExpressedKernels):
         return ("scale",) * len(self.latent_names(robot))
 
 
+@dataclass(frozen=True)
+class JointPositionForces(PerJoint, ExpressedKernels):
+    """Q_U,j = f_j(q_j): what pushes joint j where it is, an independent function per joint.
+
+    Springs of motors and cables that harden, counterweights, hoses. `joints` restricts the prior to some joints, by
+    name; `kernel` is an expression of `forcegp.forces.kernel_of`.
+    """
+
+    depends_on: ClassVar[Literal["q", "v"]] = "q"
+
+    joints: tuple[str, ...] | None = None
+    kernel: str = "squared-exponential"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joints", chosen_joints(type(self).__name__, self.joints))
+        check_kernel(self.kernel)
+
+
 PERIOD_SPREAD = 0.02
 """Standard deviation of the prior on the logarithm of a period: likelihoods of periods have many narrow optima."""
 

@@ -36,6 +36,7 @@ FORCES: dict[str, str | type[Force]] = {
     "joint-accelerations": "joint_forces.JointAccelerations",
     "independent": "joint_forces.IndependentAccelerations",
     "joint-friction": "joint_forces.JointFriction",
+    "joint-position": "joint_forces.JointPositionForces",
     "periodic-joint-forces": "joint_forces.PeriodicJointForces",
     "tool-forces": "tool_forces.ToolForces",
     "contact-friction": "contact_friction.ContactFriction",
