@@ -61,13 +61,13 @@ def test_learned_noise_is_not_lost_in_smooth_errors():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found, alike = (
-            fit(arm_model(0).with_forces(JointForces()), filtered(cutoff=cutoff), points=200, restarts=1)
+            fit(arm_model(0).with_forces(JointForces()), filtered(cutoff=cutoff), points=120, restarts=1)
             for cutoff in (CUTOFF, None)
         )
     assert float(found.noise_std.min()) > 0.2
     assert float(alike.noise_std.max()) < 0.1
     assert len(found.training) == found.settings["points"] < 80
-    assert len(alike.training) == 200
+    assert len(alike.training) == 120
 
 
 def test_rows_that_are_left_out_are_warned_of():

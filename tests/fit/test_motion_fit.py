@@ -204,12 +204,11 @@ def test_derivatives_in_every_unknown(contacts):
     here = fit.at(x, fit.start, one, one, None)
     assert bool(here.motions.found.all())
     scale = float(here.motions.in_parameters.abs().max())
-    for k in (*range(0, len(x), 7), len(x) - 1):
-        step = torch.zeros_like(x)
-        step[k] = small
-        ends = [fit.at(x + sign * step, fit.start, one, one, here.motions).motions.q for sign in (1.0, -1.0)]
+    for _ in range(2):  # a direction shows a fault in any of its entries
+        step = torch.randn(len(x), generator=generator, dtype=torch.float64)
+        ends = [fit.at(x + sign * small * step, fit.start, one, one, here.motions).motions.q for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1]) / (2.0 * small)
-        torch.testing.assert_close(here.motions.in_parameters[..., k], expected, rtol=1e-4, atol=1e-6 * scale)
+        torch.testing.assert_close(here.motions.in_parameters @ step, expected, rtol=1e-4, atol=1e-6 * scale)
 
 
 def test_what_cannot_be_refined_is_refused(along_the_law):

@@ -62,6 +62,7 @@ def test_widths_between_horizons_are_linear_and_grow_beyond_the_last():
     np.testing.assert_allclose(both.numpy(), expected)
 
 
+@pytest.mark.parametrize("calibrated", ["analytical"], indirect=True)
 def test_they_are_stored_and_go_with_the_system(calibrated, tmp_path):
     save_posterior(calibrated, tmp_path / "run")
     for again in (load_posterior(tmp_path / "run"), calibrated.to("cpu")):
@@ -96,8 +97,8 @@ def test_recordings_that_cannot_teach_it_are_refused(log):
 @pytest.fixture(scope="module")
 def floating():
     """A model of a satellite whose arm has friction that no law describes, and a recording."""
-    log = floating_arm.recording(1, 6.0, floating_arm.satellite())
-    return fit(log.model, log, points=40, restarts=1), log
+    log = floating_arm.recording(1, 3.0, floating_arm.satellite())
+    return fit(log.model, log, points=20, restarts=1), log
 
 
 @pytest.mark.nightly
