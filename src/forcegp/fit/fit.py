@@ -319,20 +319,19 @@ class _Functions:
         model = with_payloads_placed(self.model, [dataset], typical)
         space = ParameterSpace(model, typical)
         x = space.start
-        again, found, change = self, None, np.inf
-        for number in range(MOST_ROUNDS):
+        again, found, change, rounds = self, None, np.inf, 0
+        while rounds < MOST_ROUNDS and change >= CHANGE:
             with warnings.catch_warnings():
-                if number:
+                if rounds:
                     warnings.simplefilter("ignore", DataWarning)  # the first search gave it, of the same rows
                 posterior = again._beside_numbers(rows, dataset, space, x)
             again = replace(self, search=replace(self.search, restarts=1, start=posterior.hyperparameters))
             x, found, change = numbers_beside(posterior, space, x)
-            if change < CHANGE:
-                break
+            rounds += 1
         assert found is not None, "there was a round"
         posterior = again._beside_numbers(rows, dataset, space, x)
         estimates = replace(estimates_beside(space, found, len(rows)), settled=change < CHANGE)
-        return replace(posterior, estimates=estimates)
+        return replace(posterior, estimates=estimates).with_settings(rounds=rounds)
 
     def _beside_numbers(
         self, rows: Dataset | WindowedRows, dataset: Dataset, space: ParameterSpace, x: np.ndarray

@@ -34,7 +34,7 @@ from forcegp.inference.linear_functionals import Functionals
 from forcegp.posterior import Posterior
 from forcegp.posterior.estimates import Estimates
 
-MOST_ROUNDS = 6
+MOST_ROUNDS = 10
 """Searches, each about the numbers of the last one."""
 CHANGE = 0.1
 """They end where numbers change by fewer of their standard deviations."""
