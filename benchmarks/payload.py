@@ -93,11 +93,11 @@ def payloads(ur5: Any) -> dict[str, float]:
 def answer(ur5: Any) -> dict[str, float]:
     """CPU seconds of `forcegp auto` on the example's log, and how many of its seven faults the answer names."""
     with tempfile.TemporaryDirectory() as place, contextlib.chdir(place):
-        names = ["Zeit"] + [f"{name}_A{k}" for name in ("Winkel", "Drehzahl", "Moment") for k in range(1, 7)]
+        names = ["time"] + [f"{name}_A{k}" for name in ("angle", "speed", "torque") for k in range(1, 7)]
         header = {"header": ";".join(names), "comments": "", "delimiter": ";", "fmt": "%.7g"}
         np.savetxt("log.csv", ur5.faulty(ur5.recorded()), **header)
         Path("ur5.urdf").write_text(ur5.URDF, encoding="utf-8")
-        columns = ["--time", "Zeit", "--q", "Winkel_A{1..6}", "--v", "Drehzahl_A{1..6}", "--u", "Moment_A{1..6}"]
+        columns = ["--time", "time", "--q", "angle_A{1..6}", "--v", "speed_A{1..6}", "--u", "torque_A{1..6}"]
         words, shown = (
             ["auto", "log.csv", *columns, "--robot", "ur5.urdf", "--correct", "--out", "answer"],
             io.StringIO(),

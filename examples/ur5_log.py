@@ -54,6 +54,6 @@ def faulty(rows, seed=1):
 
 if __name__ == "__main__":
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "log.csv")
-    names = ["Zeit"] + [f"{name}_A{k}" for name in ("Winkel", "Drehzahl", "Moment") for k in range(1, 7)]
+    names = ["time"] + [f"{name}_A{k}" for name in ("angle", "speed", "torque") for k in range(1, 7)]
     np.savetxt(out, faulty(recorded()), delimiter=";", header=";".join(names), comments="", fmt="%.7g")
     out.with_name("ur5.urdf").write_text(URDF)
