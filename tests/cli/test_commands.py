@@ -8,7 +8,6 @@ import pty
 import re
 import signal
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -139,25 +138,3 @@ def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path)
     assert b"forcegp: interrupted; no partial output was kept." in seen.splitlines()[-1]
     assert b"Traceback" not in seen
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.nightly
-def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable, tmp_path):
-    pytest.importorskip("pybullet")
-    command = [executable, "reproduce", "fig2b", "--preset", "smoke", "--jobs", "1", "--out", "out"]
-    group = {
-        "start_new_session": True,
-        "preexec_fn": interruptible,
-    }  # as in a terminal, which interrupts the workers, too
-    finished = "[!.]*/[!.]*/job.json"  # a job at work has a hidden folder
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **group) as process:
-        while not list((tmp_path / "out" / "jobs").glob(finished)):
-            assert process.poll() is None
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=600)  # a guard against a hang
-    assert process.returncode == 130
-    last = told.decode().splitlines()[-1]
-    assert last == "forcegp: interrupted; finished pieces are kept, and the same command resumes."
-    assert b"Traceback" not in told
-    assert list((tmp_path / "out" / "jobs").glob(finished))

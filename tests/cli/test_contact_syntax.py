@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts, parse_feet, parse_wheels
+from forcegp.cli.robot_options import EXAMPLE, parse_contact, parse_contacts, parse_feet, parse_wheels
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_frame, fixed_point, rolling
 

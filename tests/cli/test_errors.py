@@ -10,7 +10,7 @@ import pytest
 from tests.cli.one_line import assert_refused
 from tests.posterior.arm import URDF, arm_data, arm_model
 
-from forcegp.cli.main import main, one_line
+from forcegp.cli.main import main
 from forcegp.data import Dataset, units_for
 from forcegp.model import Model
 from forcegp.posterior import load_posterior
@@ -213,14 +213,3 @@ def test_noise_of_forces_beside_that_of_every_row(folder, capfd, noise):
 def test_more_points_than_rows_means_all_rows(folder, capfd):
     assert main(["fit", "arm.h5", "--points", "500", *QUICK[3:], "--out", "run"]) == 0
     assert "learned from 20 points" in capfd.readouterr().out
-
-
-def test_a_box_becomes_a_sentence():
-    box = """╭─ Unrecognized options ─────────────────╮
-│ Unrecognized options: --pionts         │
-│ ────────────────────────────────────── │
-│ Perhaps you meant:                     │
-│     --points N                         │
-│         Train on so many rows.         │
-╰────────────────────────────────────────╯"""
-    assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."

@@ -24,7 +24,7 @@ def folder(forcegp, tmp_path_factory):
 
 
 def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
-    words = ("excite", "run", *FEW, "--task", "arm.h5", "--out", "next.csv")
+    words = ("excite", "run", *FEW, "--out", "next.csv")
     done = forcegp(*words, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

@@ -30,13 +30,11 @@ FOLDERS = {
     "fit": "fit arm.h5 --overwrite --out OUT",
     "payload": "payload arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
-    "check": "check arm.h5 --overwrite --plots OUT",
-    "demo": "demo --out OUT",
+    "check": "check arm.h5 --overwrite --out OUT",
+    "demo": "demo --overwrite --out OUT",
 }
 STORES = {
     "score": "score arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
-    "reproduce": "reproduce fig2b --out OUT",
-    "docs": "reproduce fig2b --out runs --docs OUT",
 }
 COMMANDS = FILES | FOLDERS | STORES
 
@@ -183,7 +181,7 @@ OVER_INPUTS = [
     "payload arm.h5 --baseline run/inner.h5 --out run",
     "score run arm.h5 --out run",
     "score run arm.h5 --report arm.h5",
-    "check arm.h5 --plots arm.h5",
+    "check arm.h5 --out arm.h5",
     "score arm.h5 --out arm.h5",
 ]
 
@@ -207,7 +205,6 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     [
         f"{IMPORT} --out x.h5 --write-mapping x.h5",
         f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
-        "reproduce fig2b --out x --docs x",
     ],
 )
 def test_two_outputs_are_two_places(folder, capfd, words):

@@ -79,9 +79,9 @@ def test_every_command_with_a_robot_takes_its_base(tmp_path):
     path = tmp_path / "dog.urdf"
     path.write_text(LOOSE["legs"])
     command = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path), "--base", "fixed"])
-    recorded = command.chosen()
+    recorded = command.robot.chosen()
     assert recorded.robot.base == "fixed"
-    again = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path)]).chosen(recorded).robot
+    again = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path)]).robot.chosen(recorded).robot
     assert again.base == "fixed"  # as recorded
     assert isinstance(again, Robot)
 
@@ -91,8 +91,8 @@ def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
     recorded = Model(Robot.from_urdf_text(CHAIN))
     recorded.robot.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
     words = ["fit", "log.h5", "--out", "run", "--robot", str(tmp_path / "identified.urdf")]
-    assert parse_arguments(words).chosen(recorded).robot.armature.tolist() == [0.0, 0.3, 0.0, 0.0]
-    assert parse_arguments([*words, "--armature", "tilt=1"]).chosen(recorded).robot.armature.tolist() == [0, 0, 0, 1]
+    assert parse_arguments(words).robot.chosen(recorded).robot.armature.tolist() == [0.0, 0.3, 0.0, 0.0]
+    assert parse_arguments([*words, "--armature", "tilt=1"]).robot.chosen(recorded).robot.armature.tolist() == [0, 0, 0, 1]
 
 
 def test_an_undefined_root_is_named(tmp_path, forcegp):

@@ -98,8 +98,9 @@ def test_the_viewer_serves_and_moves(swinging, friction):
 
 
 def test_controls_show_the_row_of_the_time(swinging, friction):
-    from forcegp.report.scene import viser_server
     from forcegp.report.viewer import Controls
+
+    from forcegp.report.scene import viser_server
 
     recorded = recorded_scene(swinging, friction, seconds=1.0)
     with viser_server() as server:

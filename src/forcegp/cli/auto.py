@@ -5,12 +5,11 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from typing_extensions import override
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.checks
@@ -27,11 +26,11 @@ from forcegp.cli.auto_answer import (
     payload_text,
     short_name,
 )
-from forcegp.cli.command import CONFIG, URDF, Resuming, unless_given
+from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
-from forcegp.cli.import_log import LogOptions
-from forcegp.cli.input_options import CandidateOptions, forces_of
+from forcegp.cli.log_options import ColumnOptions, FilterOptions, with_delay_that_shows
 from forcegp.cli.payload import payload_dict, with_payload
+from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, facts, findings_table
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 
@@ -41,7 +40,7 @@ SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Auto(CandidateOptions, Resuming, LogOptions):
+class Auto(Command):
     """From logs and a robot to a validated model: import, check, prepare, identify, learn, score, report.
 
     Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
@@ -56,9 +55,13 @@ class Auto(CandidateOptions, Resuming, LogOptions):
       forcegp auto flight.csv --mapping columns.yaml --identified drone.json --out answer
     """
 
-    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "that of --identified", Path)] = None
-    """The robot that was recorded. Thrusters, actuators and contacts of another kind come with --identified."""
-    out: Annotated[Path, arg(metavar="FOLDER")] = field()
+    interrupted = "finished pieces are kept, and the same command resumes"
+    replaces = False
+
+    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
+    """Files, or folders of ROS 2 bags, of the robot of --robot. Thrusters, actuators and contacts of another kind come
+    with --identified."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder of results; an unfinished one resumes."""
     correct: bool = False
     """Correct mistakes in units, signs and the order of joints, and continue."""
@@ -66,29 +69,25 @@ class Auto(CandidateOptions, Resuming, LogOptions):
     """Continue although the log contains mistakes."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """Where a payload may be."""
-    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Low-pass filter. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
-    """Delay of u in the log, in s. auto: estimated where u are the torques of all joints and nothing is touched, else
-    0."""
-    lag: Annotated[str, arg(metavar="S|auto")] = "auto"
-    """Time constant in s with which actuators follow u. auto: estimated for thrusters, 0 for joints."""
-    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
-    """Keep every N-th row, after the filter."""
+    robot: RobotOptions = RobotOptions()
+    columns: ColumnOptions = ColumnOptions()
+    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto", lag="auto")
+    models: CandidateOptions = CandidateOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        if self.robot is None and self.identified is None:
+        if self.robot.robot is None and self.robot.identified is None:
             raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
-        begin, preparation = time.process_time(), self._preparation()
+        begin = time.process_time()
+        preparation = (self.filter if self.filter.lag != "auto" else replace(self.filter, lag="0")).preparation()
         present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
         if self.out.is_file() or (present and "log.h5" not in present):
             raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-        model, mapping = self._model(), self._mapping(terminal)
+        model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
         assert model is not None
         for note in forces_of(model):
             terminal.note(note)
@@ -114,10 +113,11 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
         with terminal.progress("preparing"):
-            if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
-                timed = self.with_delay_that_shows(terminal, preparation, dataset)
+            if self.filter.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
+                timed = with_delay_that_shows(terminal, preparation, dataset)
             else:
-                timed = replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
+                delay = 0.0 if self.filter.delay == "auto" else preparation.delay
+                timed = replace(preparation, lag="auto", delay=delay)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
         named = forcegp.scores.named_model
@@ -165,7 +165,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress:
-                    how: dict[str, Any] = {"model": model, "options": self._options(), "report": progress}
+                    how: dict[str, Any] = {"model": model, "options": self.columns.options(), "report": progress}
                     dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
@@ -197,16 +197,10 @@ class Auto(CandidateOptions, Resuming, LogOptions):
 
     def _command(self, mapping: forcegp.ColumnMapping) -> str:
         """The same command with the columns, units and signs of the mapping."""
-        stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "robot", "out"}
-        others = [name for name in self.options if name not in stated]
-        robot = [] if self.robot is None else ["--robot", str(self.robot)]
-        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *robot]
-        return shlex.join([*words, *self.words(*(name for name in others if hasattr(type(self), name))),
-                           "--out", str(self.out)])  # fmt: skip
-
-    @override
-    def _preparation(self) -> forcegp.Preparation:
-        return super()._preparation() if self.lag != "auto" else replace(self, lag="0")._preparation()
+        stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "out"}
+        others = [name for name in options_of(Auto) if name not in stated]
+        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *self.words(*others)]
+        return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
@@ -216,14 +210,14 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         try:
             chosen = first.apply(raw)
         except DatasetError as error:
-            if self.lag != "auto" or wanted.lag != "auto":
+            if self.filter.lag != "auto" or wanted.lag != "auto":
                 raise
             terminal.note(f"rotors are taken to follow at once: {error}")
             chosen = replace(first, lag=0.0).apply(raw)
         numbers = chosen.preparation
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
-        numbers = replace(numbers, trim=max(self.trim, period), stance=wanted.stance)
-        every = numbers.thinning(raw) if self.every is None else wanted.every
+        numbers = replace(numbers, trim=max(self.filter.trim, period), stance=wanted.stance)
+        every = numbers.thinning(raw) if self.filter.every is None else wanted.every
         rows = replace(numbers, every=every).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.dataset.save(temporary)
@@ -235,7 +229,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         """The scores of the models, and the recommended one, learned from all rows and stored."""
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
-        models = self.candidates() or default_models(model)
+        models = self.models.names() or default_models(model)
         with terminal.progress("scoring") as report:
             scores = forcegp.score(
                 models, rows, split="auto", seeds=1, folder=self.out / "validation", overwrite=self.overwrite,
@@ -279,7 +273,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
                 },
-                shapes=self.robot,
+                shapes=self.robot.robot,
                 progress=progress,
             )
             forcegp.report.write_page(self.out / "report.html", page)

@@ -10,7 +10,7 @@ import forcegp.checks
 import forcegp.data
 from forcegp.cli.import_log import stance_text
 from forcegp.cli.payload import DRY, LAWS
-from forcegp.cli.terminal import number
+from forcegp.scores.tables import number
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported

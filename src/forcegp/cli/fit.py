@@ -21,10 +21,19 @@ import forcegp.posterior
 import forcegp.robots
 import forcegp.scores
 from forcegp.atomic_files import file_digest, write_json, write_text
-from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Overwriting, listed, numbers_of, unless_given
-from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
+from forcegp.cli.command import (
+    DATASET,
+    FIELDS,
+    NUMBERS,
+    Command,
+    listed,
+    numbers_of,
+    options_of,
+    unless_given,
+    values_of,
+)
 from forcegp.cli.estimates import estimates_table, what_is_open
-from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of
+from forcegp.cli.robot_options import CONTACTS, SYSTEM_FILE, RobotOptions, SearchOptions, forces_of, parse_contacts
 from forcegp.cli.terminal import Terminal, facts, with_option_names
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
@@ -39,7 +48,7 @@ LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torqu
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(RobotOptions, Overwriting):
+class Fit(Command):
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown forces.
 
     The dataset carries its robot, contacts and forces; --robot, --contact and --forces replace or add to them. The
@@ -54,22 +63,22 @@ class Fit(RobotOptions, Overwriting):
       forcegp fit raw.h5 --forces gp:joint --evidence windows:.1 --points 100 --out run
     """
 
-    data: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
-    forces: Annotated[tuple[str, ...], listed("FORCE,...", USUAL_FORCES, goes_on=FIELDS)] = ()
+    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), unless_given("FORCE,...", USUAL_FORCES)] = ()
     """What is found, beside the forces that the model has. Laws: viscous, coulomb, rotor, offset, spring,
     payload:LINK, bodies; their numbers are estimated unless they are given, as in viscous:.1. Unknown forces: gp:joint,
     gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
     gp:independent is without physics, none the noise alone. See docs/how-to/forces.md."""
-    evidence: Annotated[tuple[str, ...], listed("EVIDENCE,...", LEARNED_FROM)] = ()
+    evidence: Annotated[tuple[str, ...], listed(), unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
     """What is learned from: accelerations, torques (torques:both where accelerations are noisy, too, torques:mean=.4
     of means), or windows:S of raw positions, where nothing is differentiated. Beside it motions:S refines the
     numbers on recorded positions, over windows of S seconds."""
     baseline: Annotated[Path | None, DATASET, unless_given("LOG", "none", Path)] = None
     """A second log, of the same robot without the payloads that are estimated."""
-    contact: Annotated[tuple[str, ...], listed(CONTACTS, "the dataset's", goes_on=NUMBERS)] = ()
+    contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME.
     SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
     none is no contact at all."""
@@ -80,24 +89,13 @@ class Fit(RobotOptions, Overwriting):
     """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
     measured_torque: bool = False
     """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""
-    points: Annotated[int | None, unless_given("N", "200; all for functions of one or two inputs", int)] = None
-    """Learn unknown forces from N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube
-    of N as far as --engine is exact. Numbers of laws are found from all rows."""
     engine: Literal["auto", "exact", "inducing"] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points. auto: by
     their number, the features and the free memory, with the reason. See docs/how-to/large-data.md."""
     learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
     """Find the hyper-parameters on N of the points; the posterior is that of all points."""
-    iterations: Annotated[int, arg(metavar="N")] = 200
-    """Most L-BFGS iterations of each start."""
-    restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
-    """Starts of the search; the best is kept."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the starts of the search after the first."""
-    jobs: Annotated[int, arg(metavar="J")] = 1
-    """Restarts at once, each on one core."""
-    hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
-    """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
     rows: Literal["auto", "in-contact", "all"] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
@@ -105,16 +103,18 @@ class Fit(RobotOptions, Overwriting):
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
+    robot: RobotOptions = RobotOptions()
+    search: SearchOptions = SearchOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, save and show."""
         self.require_free(self.out)
-        forcegp.parallel.checked_jobs(self.jobs)  # refused now, not after the data are read
+        forcegp.parallel.checked_jobs(self.search.jobs)  # refused now, not after the data are read
         noise = self._noise()
         forcegp.robots.usable_device(self.device)
         evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
         start, notes = time.monotonic(), []
-        dataset = forcegp.Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.log)
         given = self._known(dataset)
         windows = any(isinstance(each, forcegp.evidence.Windows) for each in evidence)
         self._check(terminal, dataset, given, not windows)
@@ -138,7 +138,8 @@ class Fit(RobotOptions, Overwriting):
                 recording=recording,
                 baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
                 report=report,
-                **{name: getattr(self, name) for name in SAME},
+                **vars(self.search),
+                **{name: getattr(self, name) for name in ("engine", "learning_points", "seed")},
             )
         summary = fit_summary(posterior, time.monotonic() - start)
         tables = fit_report(self.out, posterior, summary)
@@ -148,7 +149,7 @@ class Fit(RobotOptions, Overwriting):
         for doubt in forcegp.scores.unfinished_search(posterior):
             terminal.warn(doubt)
         terminal.show(*tables)
-        return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
+        return {"run": str(self.out), "data": str(self.log), **summary, "settings": dict(posterior.settings)}
 
     def _noise(self) -> forcegp.Noise | None:
         """The noise that the options ask for; None where the dataset states it. Raises InvalidInput."""
@@ -165,7 +166,7 @@ class Fit(RobotOptions, Overwriting):
     def _known(self, dataset: forcegp.Dataset) -> forcegp.Model:
         """The dataset's own model, with the robot and contacts that the options give."""
         contacts = parse_contacts(self.contact)
-        model = self.chosen_model(dataset, self.data)
+        model = self.robot.chosen_model(dataset, self.log)
         return model.with_contacts((*contacts, *model.loops)) if self.contact else model
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model, accelerations: bool) -> None:
@@ -181,7 +182,7 @@ class Fit(RobotOptions, Overwriting):
             of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
             used = [each for each in found if each.subject not in of_accelerations]
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
-                see = f"See {shlex.join(['forcegp', 'check', str(self.data), *self.words(*ROBOT_OPTIONS)])}"
+                see = f"See {shlex.join(['forcegp', 'check', str(self.log), *self.words(*options_of(RobotOptions))])}"
                 terminal.warn(findings_in_one_line(used, used[0].remedy.rstrip(".") if self.contact else see))
         warnings.simplefilter("ignore", ContactWarning)
 
@@ -212,19 +213,15 @@ class Fit(RobotOptions, Overwriting):
         """The model, how it was made and what was estimated; what is known also as a robot's file."""
         options = {
             name: str(value) if isinstance(value, Path) else value
-            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+            for name, value in values_of(self).items()
             if name not in ("json", "debug", "overwrite")
         }
-        data = {"path": str(self.data), "sha256": file_digest(self.data)}
+        data = {"path": str(self.log), "sha256": file_digest(self.log)}
         content = {"options": options, "data": data, "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
             if posterior.estimates:
                 write_estimates(folder, posterior)
-
-
-SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed", "jobs", "hyperprior")
-"""Options that `forcegp.scores.learn` takes by the same names."""
 
 
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:

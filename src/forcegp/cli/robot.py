@@ -14,8 +14,8 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.report
 import forcegp.scores
-from forcegp.cli.command import URDF, Overwriting, unless_given
-from forcegp.cli.input_options import RobotFileOptions
+from forcegp.cli.command import URDF, Command, unless_given
+from forcegp.cli.robot_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import RobotFileWarning
 
@@ -24,7 +24,7 @@ NONE = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Robot(RobotFileOptions, Overwriting):
+class Robot(Command):
     """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
     Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, MJCF where
@@ -37,10 +37,11 @@ class Robot(RobotFileOptions, Overwriting):
       forcegp robot identified/identified.urdf --out arm.xml
     """
 
-    file: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
+    robot: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
     """The robot file."""
     out: Annotated[Path | None, unless_given("FILE.png|xml|urdf", "no file")] = None
     """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
+    reading: RobotFileOptions = RobotFileOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
@@ -52,12 +53,12 @@ class Robot(RobotFileOptions, Overwriting):
         self.require_free_file(self.out, own, "a PNG or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
-            model = forcegp.Model.from_file(self.file, inertias=self.inertias, **self._changes())
+            model = forcegp.Model.from_file(self.robot, inertias=self.reading.inertias, **self.reading.changes())
             robot = model.robot
         repaired = [str(warning.message) for warning in caught]
         for text in repaired:
             terminal.warn(text)
-        content = _content(robot) | {"file": str(self.file), "repaired": repaired}
+        content = _content(robot) | {"file": str(self.robot), "repaired": repaired}
         content["inputs"] = list(model.inputs)
         content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in model.loops))
         terminal.show(*_shown(robot, content))
@@ -70,7 +71,7 @@ class Robot(RobotFileOptions, Overwriting):
             if model.loops and self.out.suffix == ".urdf":
                 terminal.warn("URDF has no closed loops: the file holds the open chain.")
         if drawn is not None:
-            scene = forcegp.report.still_scene(robot, self.file)
+            scene = forcegp.report.still_scene(robot, self.robot)
             if scene.doubts:
                 terminal.note(f"{len(scene.doubts)} meshes are drawn as capsules, for example: {scene.doubts[0]}")
             forcegp.scores.save_figure(forcegp.report.robot_figure(scene), drawn)

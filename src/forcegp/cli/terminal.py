@@ -26,7 +26,6 @@ OTHERWISE = {
     "contacts": "contact",
     "folder": "out",
     "locked": "lock",
-    "most_rows": "max_rows",
     "model": "robot",
 }
 """Options whose argument has another name in Python."""
@@ -262,23 +261,6 @@ def findings_table(findings: Sequence[forcegp.checks.Finding], worded: Callable[
     return table
 
 
-def number(value: float | None) -> str:
-    """Four decimals for numbers of ordinary size, a power of ten for others, a dash for none."""
-    if value is None:
-        return NONE
-    return f"{value:.4f}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.0e}"
-
-
 def shown(value: float | None, pattern: str = "{:.3g}", factor: float = 1.0) -> str:
     """The number times a factor in this pattern, a dash for none."""
     return NONE if value is None else pattern.format(factor * value)
-
-
-def nats(value: float | None) -> str:
-    """Two decimals: differences below a hundredth of a nat are not significant."""
-    return shown(value, "{:.2f}")
-
-
-def percent(value: float | None) -> str:
-    """`94.6 %`."""
-    return shown(value, "{:.1f} %", 100.0)

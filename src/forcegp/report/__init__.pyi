@@ -8,4 +8,3 @@ from .results import (
 )
 from .robot_picture import robot_figure as robot_figure, still_scene as still_scene
 from .scene import recording as recording
-from .viewer import serve as serve

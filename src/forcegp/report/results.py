@@ -10,7 +10,7 @@ from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene
 from forcegp.report.page import Finding, Page, Picture, Table
 from forcegp.report.scene import recording
-from forcegp.scores import Scores, figures_of, model_figures, overall
+from forcegp.scores import Scores, figures_of, model_figures, overall, unit_of
 
 SECONDS = 10.0
 """Of the recording in the scene."""
@@ -69,11 +69,11 @@ def scene_notes(recorded: RecordedScene) -> list[str]:
     return ([f"{meaning}. {'; '.join(arrows)}."] if arrows else []) + recorded.doubts
 
 
-def scores_sentence(scores: Scores, unit: str) -> str:
+def scores_sentence(scores: Scores) -> str:
     """What was found of one model, in one sentence."""
     error, known = scores.value("mae") or 0.0, scores.value("known_physics_mae") or 0.0
     better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
-    held, unit = 100.0 * (scores.value("coverage_95") or 0.0), f"in {unit}" if unit.startswith("the ") else unit
+    held, unit = 100.0 * (scores.value("coverage_95") or 0.0), unit_of(scores, "a")
     return (
         f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit}{better}; "
         f"95 % intervals contain {held:.0f} %."

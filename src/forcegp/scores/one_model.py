@@ -6,11 +6,12 @@ from typing import Any
 from forcegp.data import Dataset, contact_doubts
 from forcegp.posterior import observing
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.accuracy import Matrices, row_scores
-from forcegp.scores.doubts import doubts, overlap_warnings
+from forcegp.scores.accuracy import CONTACT_FORCE, Matrices, row_scores
+from forcegp.scores.doubts import doubts, normal_force_rests_on_prior, overlap_warnings
 from forcegp.scores.motions import HeldOutMotions, motion_scores
 
 OBSERVED = "wind, and the force that stays unexplained, were observed from the rows before each."
+NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
 
 
 def scored(
@@ -36,4 +37,5 @@ def scored(
     told = [str(doubt) for doubt in contact_doubts(test, posterior.model)]
     told = ([] if fitted_here else [*overlap_warnings(alone, recorded), *told]) + list(doubts(posterior, test, table))
     told += [] if posterior is alone else [OBSERVED]
+    told += [NORMAL_FORCES] if CONTACT_FORCE in table and normal_force_rests_on_prior(alone) else []
     return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Preparation, preparation_report
-from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE
+from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE, TRUE_ACCELERATION
 from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference
 from forcegp.scores.scores import Scores
 from forcegp.scores.tables import formatted, markdown_table, number, rendered
@@ -50,6 +50,45 @@ def page(scores: Scores, figures: Collection[str] = ()) -> str:
         failures=scores.failures,
         warnings=scores.warnings,
     )  # fmt: skip
+
+
+BY_JOINT: tuple[Column, ...] = (
+    ("MAE", ACCELERATION, "mae", 4),
+    ("noise-free", TRUE_ACCELERATION, "mae", 4),
+    ("RMSE", ACCELERATION, "rmse", 4),
+    ("NLPD", ACCELERATION, "nlpd", 2),
+    ("in 95 %", ACCELERATION, "coverage_95", 1),
+    ("MAE of known physics", ACCELERATION, "known_physics_mae", 4),
+)
+OF_QUANTITIES = (
+    ("MAE", "mae", 4),
+    ("RMSE", "rmse", 4),
+    ("RMSE / size", "relative_rmse", 3),
+    ("in 95 %", "coverage_95", 1),
+)
+
+
+def joint_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of one model: errors of the acceleration by joint, then of all together (NLPD: jointly)."""
+    held, columns = scores.quantities(model), [[*scores.joint_names, "all joints"]]
+    for _, quantity, score, digits in BY_JOINT:
+        known = score in held.get(quantity, ())
+        each = scores.columns(score, quantity, model) if known else [None] * len(scores.joint_names)
+        whole = scores.value(score, ALL_JOINTS if score == "nlpd" else quantity, model) if known else None
+        columns.append([_cell(value, score, digits, None, "") for value in (*each, whole)])
+    return ["joint", *(title for title, *_ in BY_JOINT)], [list(row) for row in zip(*columns, strict=True)]
+
+
+def quantity_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of one model: what was scored beside accelerations, all columns together, in their units."""
+    rows = []
+    for name, held in scores.quantities(model).items():
+        found = [
+            (scores.value(score, name, model) if score in held else None, score, n) for _, score, n in OF_QUANTITIES
+        ]
+        if name not in (ACCELERATION, ALL_JOINTS) and any(value is not None for value, *_ in found):
+            rows.append([name, *(_cell(value, score, digits, None, "") for value, score, digits in found)])
+    return ["of all joints", *(title for title, *_ in OF_QUANTITIES)], rows
 
 
 def columns_of(scores: Scores) -> list[Column]:
@@ -138,7 +177,8 @@ def _difference(found: PairedDifference | None) -> str:
 def unit_of(scores: Scores, quantity: str) -> str:
     """`Nm`, or `Nm or N` where joints differ."""
     units = scores.units.get(quantity, "")
-    return units if isinstance(units, str) else " or ".join(dict.fromkeys(units))
+    each = [units] if isinstance(units, str) else list(dict.fromkeys(units))
+    return " or ".join(each).replace("^2", "²")
 
 
 def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:

@@ -32,7 +32,6 @@ from forcegp.scores.candidates import (
 )
 from forcegp.scores.experiment import Experiment, fingerprint
 from forcegp.scores.jobs import jobs_of, kept
-from forcegp.scores.leave_out import leave_out
 from forcegp.scores.motions import STARTS, held_out_motions
 from forcegp.scores.one_model import scored
 from forcegp.scores.page import page, preparation_lines
@@ -41,7 +40,6 @@ from forcegp.scores.splits import Split, split_named
 
 KIND = "forcegp score"
 RESULTS, PAGE = "results.json", "report.md"
-LEAVE_OUT = "leave-out"
 
 
 def score(
@@ -76,8 +74,7 @@ def score(
     ----------
     models: a posterior; or by name posteriors, models to fit, functions of a `Training` that fit one, and names of
         models FORCES[@EVIDENCE] (`scores.candidates`), of which a list will do. None takes some of every kind.
-    split: text of `split_named` or its result; None is "auto" where anything is fitted. "leave-out" fits every model
-        once, to all rows, and leaves stretches of time out in closed form: densities alone, of models to fit.
+    split: text of `split_named` or its result; None is "auto" where anything is fitted.
     horizons: of predicted motions in s; none with (). None takes .1, .2, .5 and 1 s, as far as the log lasts, where
         anything is fitted, else none.
     folder: where everything is kept, with the page report.md, its figures and results.json; None keeps nothing.
@@ -122,8 +119,6 @@ def score(
     robot = log.model if model is None else model
     if robot is None:
         raise InvalidInput("the log does not carry its robot; give model=Model(robot, contacts).")
-    if split == LEAVE_OUT:
-        return leave_out(given, log, robot, points=points, restarts=restarts, iterations=iterations, about=about)
     splits = split_named(log, split or "auto") if split is None or isinstance(split, str) else tuple(split)
     settings: Any = (points, horizons, starts, integrator, identification, restarts, iterations)
     experiment = Experiment(log, recording or log, robot, splits, *settings)

@@ -207,7 +207,8 @@ class Scores(Summary):
     @property
     def verdicts(self) -> list[str]:
         """A sentence for every other model and criterion: is it better than the rival?"""
-        return [each.sentence for found in self.differences.values() for each in found.values() if each is not None]
+        found = [(by, each) for pairs in self.differences.values() for by, each in pairs.items() if each is not None]
+        return [f"By the {CRITERIA[by]}: {each.sentence}" for by, each in found]
 
     # ------------------------------------------------------------------ to show
 
