@@ -259,22 +259,23 @@ class Auto(Command):
         posterior, recording = forcegp.posterior.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
         names = {name: short_name(name) for name in scores.models}
-        following = [forcegp.report.Finding("Record the most informative motion:", command)]
+        following = [("Record the most informative motion:", command)]
         with terminal.progress("writing the report") as progress:
+            pictures, missing = forcegp.scores.model_pictures(posterior, recording, progress)
             page = forcegp.report.model_page(
                 posterior,
                 recording,
+                [*forcegp.scores.scores_pictures(scores)[:-1], *pictures],
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
-                findings=[forcegp.report.Finding(*line) for line in answer],
-                pictures=forcegp.report.scores_pictures(scores),
+                findings=answer,
                 tables=[forcegp.report.scores_table(scores, names)],
                 next_steps=following if command.startswith("forcegp") else [],
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
                 },
                 shapes=self.robot.robot,
-                progress=progress,
+                missing=missing,
             )
             forcegp.report.write_page(self.out / "report.html", page)
 

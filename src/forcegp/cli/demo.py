@@ -104,28 +104,26 @@ class Demo(Command):
         scores = forcegp.score(posterior, test)
         best = forcegp.report.scores_sentence(scores)
         with terminal.progress("writing the report") as progress:
+            pictures, missing = forcegp.scores.model_pictures(posterior, test, progress)
             page = forcegp.report.model_page(
                 posterior,
                 test,
+                pictures,
                 title=f"forcegp demo: a tool slides on a surface, friction learned from {self.search.points} points",
                 best=best,
                 findings=[
-                    forcegp.report.Finding("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
-                    forcegp.report.Finding("model", "S-GP with analytical mean of Rath, Geist and Trimpe (CoRL 2021)"),
-                    forcegp.report.Finding("tested on", f"{len(test)} rows of a trajectory with another seed"),
+                    ("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
+                    ("model", "S-GP with analytical mean of Rath, Geist and Trimpe (CoRL 2021)"),
+                    ("tested on", f"{len(test)} rows of a trajectory with another seed"),
                 ],
                 tables=[forcegp.report.scores_table(scores)],
                 next_steps=[
-                    forcegp.report.Finding(
-                        "The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"
-                    ),
-                    forcegp.report.Finding(
-                        "The robot live:", f"forcegp view {self.out}/s-gp-analytical-mean {self.out}/test.h5"
-                    ),
+                    ("The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"),
+                    ("More of the motion:", f"forcegp view {self.out}/s-gp-analytical-mean {self.out}/test.h5"),
                 ],
                 details=results,
                 shapes=forcegp.simulation.kuka_file(),
-                progress=progress,
+                missing=missing,
             )
             forcegp.report.write_page(folder / "report.html", page)
         return best

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Mapping
@@ -29,7 +28,7 @@ from forcegp.cli.robot_options import (
     require_same_joints,
 )
 from forcegp.cli.terminal import Terminal, columns
-from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.errors import InvalidInput
 
 IDENTIFICATION = "bodies+viscous+coulomb+rotor@accelerations, @torques:both where the base moves"
 
@@ -211,20 +210,26 @@ class Score(Command):
         where = ", carried to another robot or contacts" if trained != here else ""
         title = f"{scores.models[name]['summary']}{where}; {len(rows)} rows of {self.paths[-1]}"
         posterior, rows = forcegp.posterior.observing(posterior, rows)
+        pictures, missing = [], []
+        if self.out is not None or self.report is not None:
+            with terminal.progress("drawing") as progress:
+                pictures, missing = forcegp.scores.model_pictures(posterior, rows, progress)
         if self.out is not None:
-            draw(terminal, self.out, posterior, rows)
+            for picture in pictures:
+                picture.save(self.out)
         if self.report is not None:
-            with terminal.progress("writing the report") as progress:
+            with terminal.progress("writing the report"):
                 page = forcegp.report.model_page(
                     posterior,
                     rows,
+                    pictures,
                     title=f"{name} on {self.paths[-1].name}: {posterior.description}",
                     best=forcegp.report.scores_sentence(scores),
-                    findings=[forcegp.report.Finding("warning", each) for each in content["warnings"]],
+                    findings=[("warning", each) for each in content["warnings"]],
                     tables=[forcegp.report.scores_table(scores)],
                     details={key: value for key, value in content.items() if key != "runs"},
+                    missing=missing,
                     shapes=self.shapes,
-                    progress=progress,
                 )
                 forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
             terminal.note(f"report: {self.report}")
@@ -233,16 +238,6 @@ class Score(Command):
             columns(f"{title}; errors in {forcegp.scores.unit_of(scores, 'a')}", header, joints[:-1], last=joints[-1]),
             columns("", *forcegp.scores.quantity_table(scores)),
         )
-
-
-def draw(terminal: Terminal, folder: Path, posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset) -> None:
-    """Write every plot of one model that these data allow to `folder`."""
-    figures = forcegp.scores.model_figures(posterior, dataset)
-    with terminal.progress("drawing") as report:
-        for done, (name, (_, figure)) in enumerate(figures.items()):
-            report(done, len(figures), name)
-            with contextlib.suppress(ForceGPError):  # what these data do not allow
-                forcegp.scores.save_figure(figure(), folder / f"{name}.png")
 
 
 def comparison(scores: forcegp.Scores, title: str) -> list[Any]:

@@ -1,7 +1,6 @@
 """One self-contained HTML page: what was found, the robot in motion, pictures, tables, and how it was made."""
 
 import base64
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,35 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from matplotlib.figure import Figure
 
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
-from forcegp.scores.figures import style
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the answer: its subject and what was found."""
-
-    subject: str
-    text: str
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A figure, with a caption that says what is to be seen and `alt` for those who cannot see it."""
-
-    caption: str
-    figure: Figure
-    alt: str = ""
-
-    @property
-    def data(self) -> str:
-        """The PNG as base64."""
-        stream = io.BytesIO()
-        style.rendered(self.figure).save(stream, format="png", optimize=True)
-        return base64.b64encode(stream.getvalue()).decode()
+from forcegp.scores.figures.style import Picture
 
 
 @dataclass(frozen=True)
@@ -57,14 +31,15 @@ class Page:
     title: str
     best: str
     """The one sentence to remember."""
-    findings: Sequence[Finding] = ()
+    findings: Sequence[tuple[str, str]] = ()
+    """Subjects, and what was found."""
     scene: str = ""
     """An HTML document with the robot (`scene.recording`)."""
     scene_notes: Sequence[str] = ()
     """What the arrows are; or why there is no robot."""
     pictures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
-    next_steps: Sequence[Finding] = ()
+    next_steps: Sequence[tuple[str, str]] = ()
     """What to do next, and the command for it."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """The resolved configuration, for those who want to repeat it."""
@@ -84,6 +59,7 @@ def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
     Raises InvalidInput if the folder does not exist, or the file does and may not be replaced.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["base64"] = lambda png: base64.b64encode(png).decode()
     template = environment.from_string(files("forcegp.report").joinpath("page.html").read_text(encoding="utf-8"))
     details = json.dumps(page.details, indent=1, default=str) if page.details else ""
     with atomic_file(path, overwrite=overwrite) as temporary:

@@ -1,61 +1,46 @@
 """The page of one model on one recording: the robot, the friction curves, motions ahead, and errors."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, MissingExtra
+from forcegp.errors import MissingExtra
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene
-from forcegp.report.page import Finding, Page, Picture, Table
+from forcegp.report.page import Page, Table
 from forcegp.report.scene import recording
-from forcegp.scores import Scores, figures_of, model_figures, overall, unit_of
+from forcegp.scores import Picture, Scores, overall, unit_of
 
 SECONDS = 10.0
 """Of the recording in the scene."""
-
-Progress = Callable[[int, int, str], None]
 
 
 def model_page(
     posterior: Posterior,
     dataset: Dataset,
+    pictures: Sequence[Picture],
     *,
     title: str,
     best: str,
-    findings: Sequence[Finding] = (),
+    findings: Sequence[tuple[str, str]] = (),
     tables: Sequence[Table] = (),
-    pictures: Sequence[Picture] = (),
-    next_steps: Sequence[Finding] = (),
+    missing: Sequence[str] = (),
+    next_steps: Sequence[tuple[str, str]] = (),
     details: Mapping[str, Any] | None = None,
     shapes: str | Path | None = None,
-    progress: Progress | None = None,
 ) -> Page:
-    """A page with the robot in motion and the pictures that this model and recording allow.
+    """A page with the robot in motion, and pictures.
 
-    `pictures` of the caller come first. What cannot be drawn is named on the page with the reason: without viser the
-    robot, and motions of a recording with uneven time steps. `shapes` is a URDF with
-    visual elements.
+    What is `missing` (`scores.model_pictures`) is named on the page with the reason, and without viser the robot.
+    `shapes` is a URDF with visual elements.
     """
-    steps, drawn, notes = model_figures(posterior, dataset), list(pictures), []
-    for done, (name, (caption, draw)) in enumerate(steps.items()):
-        if progress is not None:
-            progress(done, len(steps) + 1, name)
-        try:
-            drawn.append(Picture(caption, draw()))
-        except ForceGPError as error:
-            notes.append(f"{name.replace('_', ' ')}: not drawn, because {error}")
-    if progress is not None:
-        progress(len(steps), len(steps) + 1, "the robot")
-    scene = ""
     try:
         recorded = recorded_scene(dataset, posterior, seconds=SECONDS, shapes=shapes)
-        scene = recording(recorded)
-        notes = [*scene_notes(recorded), *notes]
+        scene, notes = recording(recorded), scene_notes(recorded)
     except MissingExtra as error:
-        notes.insert(0, f"The robot is not shown: {error}.")
-    return Page(title, best, findings, scene, notes, drawn, tables, next_steps, details or {})
+        scene, notes = "", [f"The robot is not shown: {error}."]
+    return Page(title, best, findings, scene, [*notes, *missing], pictures, tables, next_steps, details or {})
 
 
 def scene_notes(recorded: RecordedScene) -> list[str]:
@@ -78,16 +63,6 @@ def scores_sentence(scores: Scores) -> str:
         f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit}{better}; "
         f"95 % intervals contain {held:.0f} %."
     )
-
-
-def scores_pictures(scores: Scores) -> list[Picture]:
-    """The figures of several models that are worth a page: errors of motions, and by joint."""
-    figures = figures_of(scores)
-    captions = {
-        "motions": "How the error of predicted positions grows, on time that no model has seen.",
-        "errors": "Errors of every model by joint, on time that none has seen.",
-    }
-    return [Picture(caption, figures[name]) for name, caption in captions.items() if name in figures]
 
 
 def scores_table(scores: Scores, names: Mapping[str, str] | None = None) -> Table:

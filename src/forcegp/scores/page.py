@@ -1,6 +1,6 @@
 """The page of scores in Markdown, and the same tables as rows of text for terminals and reports."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,12 @@ from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference
 from forcegp.scores.scores import Scores
 from forcegp.scores.tables import formatted, markdown_table, number, rendered
 
-ALT_TEXTS = {
-    "errors": "Errors of accelerations and in force space, by joint and model",
-    "calibration": "Calibration of the intervals",
-    "motions": "Errors of predicted motions against their length",
-}
 Column = tuple[str, str, str, int]
 """Title, quantity, score and decimals; of a coverage in percent."""
 
 
-def page(scores: Scores, figures: Collection[str] = ()) -> str:
-    """Markdown: what was done, the model to take, tables with the best marked, and what failed."""
+def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
+    """Markdown: what was done, the model to take, tables, and what failed; `figures` have names and captions."""
     finished = [name for name in scores.models if scores.finished(name)]
     by_joint = [
         (title, markdown_table(["model", *scores.joint_names], joint_rows(scores, title, quantity, score, digits)))
@@ -44,7 +39,7 @@ def page(scores: Scores, figures: Collection[str] = ()) -> str:
         overall=markdown_table(*overall(scores, "**")) if finished else "",
         at_rest=", ".join(f"{name} {number(x, 3)}" for name, x in zip(scores.joint_names, at_rest, strict=False) if x),
         by_joint=by_joint,
-        figures=[(name, ALT_TEXTS[name]) for name in figures],
+        figures=figures,
         listed=[[name, each["kind"], each["summary"], str(len(scores.finished(name)))]
                 for name, each in scores.models.items()],
         failures=scores.failures,

@@ -157,15 +157,14 @@ def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: 
 
 def write(scores: Scores, folder: Path) -> None:
     """The page, its figures and all numbers into a folder."""
-    from forcegp.scores.figures.scores import figures_of
-    from forcegp.scores.figures.style import save_figure
+    from forcegp.scores.figures.scores import scores_pictures
 
     folder.mkdir(parents=True, exist_ok=True)
-    figures = figures_of(scores)
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
+    pictures = scores_pictures(scores)
+    for picture in pictures:
+        picture.save(folder)
     write_json(folder / RESULTS, scores.to_dict())
-    write_text(folder / PAGE, page(scores, figures))
+    write_text(folder / PAGE, page(scores, [(picture.name, picture.caption) for picture in pictures]))
 
 
 def _fitted_before(

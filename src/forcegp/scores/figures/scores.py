@@ -23,13 +23,15 @@ MOST_COLUMNS = 7
 """Panels beside each other that a page still shows large enough to read."""
 
 
-def figures_of(scores: Scores) -> dict[str, Figure]:
-    """File name without ending -> figure; those for which there are numbers."""
+def scores_pictures(scores: Scores) -> list[style.Picture]:
+    """Those for which there are numbers."""
     models = [name for name in scores.models if ACCELERATION in scores.quantities(name)]
     if not models:
-        return {}
-    figures = {"errors": errors_figure(scores, models), "calibration": calibration_figure(scores, models)}
-    return figures | ({"motions": motions_figure(scores, models)} if scores.horizons else {})
+        return []
+    moved, errors = "How the error of predicted positions grows, on time that no model has seen.", "Errors by joint."
+    found = [style.Picture("motions", moved, motions_figure(scores, models))] if scores.horizons else []
+    covered = style.Picture("calibration", "Calibration of the intervals.", calibration_figure(scores, models))
+    return [*found, style.Picture("errors", errors, errors_figure(scores, models)), covered]
 
 
 def errors_figure(scores: Scores, models: list[str]) -> Figure:
