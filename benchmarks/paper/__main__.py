@@ -12,6 +12,7 @@ from pathlib import Path
 
 from benchmarks.paper.reproduction import ALL, PAPER_PAGE, experiments_of, reproduce
 from forcegp.errors import ForceGPError
+from forcegp.parallel import checked_jobs
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -36,6 +37,7 @@ def main(words: Sequence[str] | None = None) -> int:
     command = [PAPER_PAGE.program, given.figure, "--preset", given.preset]
     out = given.out or Path(f"reproduction-{given.preset}")
     try:
+        checked_jobs(given.jobs)
         experiments = experiments_of(given.preset, given.figure)
         for option, change in (("points", "with_points"), ("seed_list", "with_seeds")):
             numbers = getattr(given, option)

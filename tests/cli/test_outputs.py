@@ -58,7 +58,7 @@ def no_work(monkeypatch) -> None:
     def begun(*_, **__):
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr("forcegp.jobs.running._Run", begun)
+    monkeypatch.setattr("forcegp.jobs._compute_all", begun)
     monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
     monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
     monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)

@@ -127,7 +127,7 @@ def test_only_what_depends_on_changed_code_of_somebody_else_is_computed_anew(dat
     scored(models, data, tmp_path / "out")
     before, digest = changed(tmp_path / "out"), code_digest
     own = fit_broken.__module__
-    monkeypatch.setattr("forcegp.jobs.job.code_digest", lambda *modules: "new" if own in modules else digest(*modules))
+    monkeypatch.setattr("forcegp.jobs.code_digest", lambda *modules: "new" if own in modules else digest(*modules))
     with pytest.warns(OutdatedWarning, match="1 of the results in .* by other code"):
         scored(models, data, tmp_path / "out")
     after = changed(tmp_path / "out")

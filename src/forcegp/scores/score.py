@@ -16,8 +16,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
-from forcegp.jobs import JobStore, Progress, run_jobs
-from forcegp.jobs.job import machine
+from forcegp.jobs import JobStore, Progress, machine, run_jobs
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior.posterior import Posterior
