@@ -23,7 +23,7 @@ QUICK = ("--points", 8, "--iterations", 2, "--restarts", 1)
 RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "simulate": (("kuka-surface", "--seconds", 0.1, "--out", "simulated.h5"), "simulated.h5"),
     "import": (("log.csv", *FLAGS, "--out", "imported.h5"), "imported.h5"),
-    "robot": (("arm.urdf", "--out", "arm.png"), "arm.png"),
+    "robot": (("arm.urdf", "--out", "arm.html"), "arm.html"),
     "check": (("log.h5", "--out", "look"), "look/check.png"),
     "fit": (("arm.h5", *QUICK, "--out", "new"), "new/model.json"),
     "payload": (("log.h5", "--cutoff", "none", "--delay", 0, "--out", "held"), "held/payload.json"),

@@ -148,7 +148,7 @@ def test_an_identification_that_fails_leaves_the_mass_matrix_as_given(data, tmp_
     def fail(name, model, rows):
         raise InvalidInput("too still")
 
-    monkeypatch.setattr("forcegp.scores.jobs.identified_model", fail)
+    monkeypatch.setattr("forcegp.scores.experiment.identified_model", fail)
     scores = scored(["given", "identified+gp:joint-friction"], data, tmp_path / "out")
     assert scores.about["mass_matrix"] == ["the model as given, because its identification failed (too still)"]
     assert len(scores.failures) == 2

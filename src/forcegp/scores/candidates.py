@@ -273,8 +273,12 @@ def checked_identification(name: str, model: Model) -> tuple[Model, Acceleration
     return opened, chosen
 
 
-def identified_model(name: str, model: Model, rows: Dataset) -> Model:
-    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out."""
+def identified_model(name: str, model: Model, rows: Dataset) -> tuple[Model, list[str]]:
+    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out.
+
+    And the rotors that no row shows, whose inertias are those of the prior.
+    """
     opened, evidence = checked_identification(name, model)
     found: Any = fit(opened, rows, evidence)
-    return replace(found.model, noise=held_out_noise(opened, rows, evidence))
+    unseen = [name for name, each in found.estimates.items() if name.startswith("rotor") and each.decided_by == "prior"]
+    return replace(found.model, noise=held_out_noise(opened, rows, evidence)), unseen

@@ -29,10 +29,8 @@ from forcegp.scores.candidates import (
     identified_model,
     kind_and_summary,
 )
-from forcegp.scores.experiment import Experiment, fingerprint
-from forcegp.scores.jobs import jobs_of, kept
+from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
 from forcegp.scores.motions import STARTS, held_out_motions
-from forcegp.scores.one_model import scored
 from forcegp.scores.page import page, preparation_lines
 from forcegp.scores.scores import Scores
 from forcegp.scores.splits import Split, split_named
@@ -125,8 +123,8 @@ def score(
     checked_jobs(jobs)
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere, "scores") if folder is None else Path(folder)
-        store = JobStore.open(place, KIND, experiment.configuration(), overwrite=overwrite)
-        identifications, fits = jobs_of(experiment, chosen, seeds)
+        store = JobStore.open(place, KIND, experiment.configuration, overwrite=overwrite)
+        identifications, fits = experiment.jobs(chosen, seeds)
         run_jobs(store, [*identifications, *fits], jobs, progress)
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
@@ -134,9 +132,10 @@ def score(
         found = [kept(store, job.name) for job in identifications]
         about |= {
             "splits": [_split_facts(experiment, each) for each in splits],
-            "configuration": experiment.configuration(),
+            "configuration": experiment.configuration,
             "seeds": list(range(seeds)),
             "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
+            "notes": _unseen(found),
         }
         kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
         scores = replace(_scores(log, runs, kinds, about), fit=partial(_on_all_rows, experiment, chosen))
@@ -150,8 +149,17 @@ def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: 
     work, rows = chosen[name], experiment.rows
     if isinstance(work.fit, Posterior):
         return work.fit
-    identified = None if work.identification is None else identified_model(work.identification, experiment.model, rows)
+    identified = (
+        None if work.identification is None else identified_model(work.identification, experiment.model, rows)[0]
+    )
     return work.fit(experiment.training(rows, experiment.recording, identified, 0))
+
+
+def _unseen(identifications: Sequence[Mapping[str, Any]]) -> list[str]:
+    """That errors of forces mean little at joints whose inertia no row shows."""
+    names = dict.fromkeys(name.partition(".")[2] for each in identifications for name in each.get("unseen", ()))
+    told = f"the rows do not show the inertia of the rotors of {', '.join(names)}; errors of forces mean little there."
+    return [told] if names else []
 
 
 def write(scores: Scores, folder: Path) -> None:
