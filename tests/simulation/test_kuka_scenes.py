@@ -150,7 +150,7 @@ def test_equal_seeds_give_equal_data(scenes):
     ("changes", "message"),
     [
         ({"friction": "wet"}, "no friction .wet. in the tool"),
-        ({"surface": "cone"}, "one of plane, tilted, sphere, none"),
+        ({"surface": "cone"}, "no surface 'cone'"),
         ({"contact": "bullet", "surface": "none"}, "needs a surface"),
         ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),
         ({"contact": "bullet", "patch_factor": 2.0}, "ideal contact"),

@@ -11,7 +11,7 @@ from forcegp.data import REVOLUTE_UNITS, Dataset, require_disjoint
 from forcegp.errors import DatasetError, InvalidInput, SimulationError
 from forcegp.mechanics import Plane
 from forcegp.robots import Robot
-from forcegp.simulation import SCENARIOS, KukaSurfaceConfig, simulate_kuka_surface
+from forcegp.simulation import KukaSurfaceConfig, simulate, simulate_kuka_surface
 from forcegp.simulation.kuka_motion import TOOL_LINK, kuka_urdf
 
 pytest.importorskip("pybullet")
@@ -220,16 +220,14 @@ def test_data_of_no_use_are_not_returned(changes, message):
 
 
 def test_scenarios_are_found_by_name(short):
-    scenario = SCENARIOS["kuka-surface"]
-    assert scenario.config is KukaSurfaceConfig
-    assert_equal(scenario.simulate(SHORT), short)
-    with pytest.raises(InvalidInput, match="takes KukaSurfaceConfig"):
-        scenario.simulate({"seconds": 5})
+    assert_equal(simulate("kuka-surface", **dataclasses.asdict(SHORT)), short)
+    with pytest.raises(InvalidInput, match="no scenario 'mars'"):
+        simulate("mars")
 
 
 def test_listing_scenarios_and_their_options_loads_no_library():
     code = (
-        "import sys; from forcegp.simulation import SCENARIOS; SCENARIOS['kuka-surface'].config(); "
+        "import sys; from forcegp.simulation import SCENARIOS; SCENARIOS['kuka-surface'][0](); "
         "print(*{name.partition('.')[0] for name in sys.modules})"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

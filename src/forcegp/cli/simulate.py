@@ -98,8 +98,7 @@ class Simulate(Command):
         for word in self.words(*sorted(others)):
             raise InvalidInput(f"{word} means nothing to {self.scenario}; leave it out.")
         if self.scenario != "kuka-surface":
-            arm = {} if self.scenario.startswith("quad") else {"arm": self.scenario}
-            return fields | arm
+            return fields
         law, given, number = (self.tool_friction or "viscous").partition(":")
         if given:
             complaint = f"--tool-friction {self.tool_friction}: {number!r} is no number; give a law, as in coulomb:.2."
@@ -110,12 +109,10 @@ class Simulate(Command):
 
 def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
-    chosen = forcegp.simulation.SCENARIOS[scenario]
-    config = chosen.config(**options)
     if scenario == "kuka-surface":
         _import_silently("pybullet")
-    with terminal.progress(f"simulating seed {config.seed}") as report:
-        return chosen.simulate(config, report)
+    with terminal.progress(f"simulating seed {options['seed']}") as report:
+        return forcegp.simulation.simulate(scenario, report, **options)
 
 
 def _import_silently(name: str) -> None:

@@ -23,4 +23,4 @@ from .page import joint_table as joint_table, overall as overall, quantity_table
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows
 from .score import score as score
 from .scores import Scores as Scores
-from .splits import Split as Split, Stretch as Stretch, split_named as split_named
+from .splits import Split as Split, split_named as split_named

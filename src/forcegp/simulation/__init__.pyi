@@ -9,5 +9,5 @@ from .scenarios import (
     QuadrotorConfig as QuadrotorConfig,
     QuadrupedConfig as QuadrupedConfig,
     SCENARIOS as SCENARIOS,
-    Scenario as Scenario,
+    simulate as simulate,
 )
