@@ -33,7 +33,7 @@ def test_the_engine_is_said_and_stored(forcegp, folder):
     told = forcegp(*FIT, "--forces", "gp:joint-friction", *INDUCING, "--json", "--out", "friction", folder=folder)
     summary = json.loads(told.stdout)
     assert (summary["points"], summary["learning_points"]) == (40, 20)
-    assert summary["refined"].startswith("on all rows")
+    assert summary["settings"]["refined"].startswith("on all rows")
     scored = forcegp("score", "run", "arm.h5", folder=folder)
     assert scored.returncode == 0, scored.stderr
 

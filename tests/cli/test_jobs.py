@@ -23,7 +23,7 @@ def test_a_fit_in_processes_is_the_fit_in_one(forcegp, folder):
         done = forcegp(*FIT, "--jobs", jobs, "--out", jobs, "--json", folder=folder)
         assert done.returncode == 0, done.stderr
         assert [line for line in done.stderr.splitlines() if "did not converge" not in line] == []
-        assert json.loads(done.stdout)["restarts"] == 2
+        assert json.loads(done.stdout)["settings"]["restarts"] == 2
     one, two = (load_posterior(folder / name) for name in ("1", "2"))
     assert one.settings["restart_objective"] == pytest.approx(two.settings["restart_objective"], rel=1e-9)
 

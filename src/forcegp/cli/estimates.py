@@ -23,13 +23,13 @@ def estimates_table(title: str, estimates: Mapping[str, forcegp.Estimate]) -> An
         low, high = (factor * end for end in each.interval)
         # decimals that show two digits of the interval, and four of the value where there is none
         size = factor * each.std if 0.0 < each.std < math.inf else 1e-3 * abs(factor * each.value)
-        digits = min(9, max(0, 1 - math.floor(math.log10(size)))) if size > 0.0 else 4
+        digits = max(0, 1 - math.floor(math.log10(size))) if size > 0.0 else 4
+        show = (f"{{:.{digits}f}}" if digits < 10 else "{:.2g}").format
         of, part = owner_and_part(name)
         rows += [[of]] if of != owner else []
         owner = of
-        numbers = [f"{factor * x:.{digits}f}" for x in (each.start, each.value)]
-        interval = f"{low:.{digits}f} … {high:.{digits}f}"
-        rows.append([f"  {part}", *numbers, interval, "" if unit == "1" else unit, each.decided_by])
+        numbers = show(factor * each.start), show(factor * each.value), f"{show(low)} … {show(high)}"
+        rows.append([f"  {part}", *numbers, "" if unit == "1" else unit, each.decided_by])
     return columns(title, ["parameter", "start", "estimate", "95 % interval", "unit", "decided\nby the"], rows)
 
 

@@ -248,79 +248,62 @@ def findings_in_one_line(findings: Sequence[forcegp.checks.Finding], following: 
 
 def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
-    result, settings = posterior.result, posterior.settings
-    force_noise, unknown = posterior.hyperparameters.get("noise.log_force"), posterior.model.unknown_forces
-    air = [each for each in unknown if isinstance(each, forcegp.AerodynamicForce)]
+    result, settings, unknown = posterior.result, posterior.settings, posterior.model.unknown_forces
+    force_noise = posterior.hyperparameters.get("noise.log_force")
     looked = not {"air", "observe"} & set(settings) and not posterior.model.held_inputs  # not for wind in windows
     return {
         "model": posterior.description,
-        "objective_is": posterior.objective,
         "points": len(posterior.training),
         "learning_points": settings.get("learning_points", len(posterior.training)),
-        "objective_start": result.history[0],
+        "objective_is": posterior.objective,
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
-        **({"engine": settings["engine_reason"]} if "engine_reason" in settings else {}),
-        **({"refined": settings["refined"]} if "refined" in settings else {}),
-        "restarts": settings.get("restarts", 1),
         "iterations": len(result.history) - 1,
-        "evaluations": result.evaluations,
         "converged": result.converged,
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
-        "wind": settings.get("air", {}).get("wind"),
-        "wind_not_found": looked and any(each.observe != 0.0 for each in air),
-        "steady_forces": settings.get("steady_forces"),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
+        "wind": settings.get("air", {}).get("wind"),
+        "wind_not_found": looked and any(getattr(each, "observe", 0.0) != 0.0 for each in unknown),
         "estimates": posterior.estimates.to_dict()["parameters"],
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
     }
 
 
-def fit_report(run: Path, posterior: Any, summary: Mapping[str, Any]) -> list[Any]:
+def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]:
     """What was learned from what, and the numbers that were estimated."""
-    forces, air = summary["force_noise_std"], summary["wind"]
-    still = "learned as still air" + (", with a force in each episode" if summary["steady_forces"] else "")
-    points, learning = summary["points"], summary["learning_points"]
-    refined = " and refined on all" if "refined" in summary else ""
-    fewer = f" (parameters: from {learning} of them{refined})" if learning != points else ""
+    settings, air = posterior.settings, found["wind"]
+    refined = " and refined on all" if "refined" in settings else ""
+    fewer = "" if found["learning_points"] == found["points"] else (
+        f" (parameters: from {found['learning_points']} of them{refined})"
+    )  # fmt: skip
     # the status counts failed evaluations, too, and the starts
-    status = with_option_names(summary["status"], ("iterations",))
-    unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
-    objective = f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}"
+    status = with_option_names(found["status"], ("iterations",))
+    wind = None if air is None else f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"
+    if found["wind_not_found"]:
+        each = ", with a force in each episode" if settings.get("steady_forces") else ""
+        wind = f"not found; learned as still air{each}"
     values = {
-        **({"engine": summary["engine"]} if "engine" in summary else {}),
-        **({"objective": objective} if posterior.model.unknown_forces else {}),
-        "negative log likelihood": f"{summary['nll']:.1f} nats",
-        "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
-        "search": status if summary["converged"] else f"not converged: {status}",
-        "noise std": _per_joint(summary["noise_std"]),
-        **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
-        **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
-        **({"wind of these rows": f"not found; {still}"} if summary["wind_not_found"] else {}),
-        "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
+        "engine": settings.get("engine_reason"),
+        "negative log likelihood": f"{found['nll']:.1f} nats",
+        "search": f"{found['iterations']} iterations; {'' if found['converged'] else 'not converged: '}{status}",
+        "noise std": _per_joint(found["noise_std"]),
+        "noise std of forces": found["force_noise_std"] and _per_joint(found["force_noise_std"]),
+        "wind of these rows": wind,
+        "time": f"{found['cpu_seconds']:.1f} s CPU for the search, {found['wall_seconds']:.1f} s in all",
     }
-    shown: list[Any] = [facts(f"{run}: {summary['model']}, learned from {points} points{fewer}", values)]
+    title = f"{run}: {found['model']}, learned from {found['points']} points{fewer}"
+    shown: list[Any] = [facts(title, {name: text for name, text in values.items() if text is not None})]
     if posterior.estimates:
-        shown.append(estimates_table("estimates", posterior.estimates))
-        shown += what_is_open(posterior.estimates)
-    motions = posterior.settings.get("motions")
-    if motions is not None:
+        shown += [estimates_table("estimates", posterior.estimates), *what_is_open(posterior.estimates)]
+    if motions := settings.get("motions"):
         units = ["mm" if joint.type == "prismatic" else "mrad" for joint in posterior.model.robot.joints]
-        each = zip(motions["rms"], units, strict=False)
-        error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in each)
-        shown.append(
-            f"{motions['windows']} windows of {motions['seconds']:g} s, whose initial states are estimated, too; "
-            f"rms of q by joint: {error}."
-        )
+        error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in zip(motions["rms"], units, strict=False))
+        told = f"{motions['windows']} windows of {motions['seconds']:g} s, whose initial states are estimated, too"
+        shown.append(f"{told}; rms of q by joint: {error}.")
     return [*shown, f"Next: forcegp score {run} TEST.h5"]
 
 
 def _per_joint(values: list[float]) -> str:
     return f"{values[0]:.4g}" if len(set(values)) == 1 else " ".join(f"{value:.3g}" for value in values)
-
-
-def _short(value: float) -> str:
-    """One decimal for nats of a likelihood, three digits for small losses."""
-    return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
