@@ -40,7 +40,7 @@ from forcegp.forces import RigidBodies, Rotor
 from forcegp.forces.registry import usual_friction
 from forcegp.posterior import Posterior
 from forcegp.simulation.joint_friction import JointFrictionLaw
-from forcegp.simulation.kuka_motion import kuka_urdf
+from forcegp.simulation.kuka_surface import kuka_urdf
 
 SEEDS = (1, 2, 3, 4, 5)
 RATE, FINE, NOISE, ROWS = 240, 4, 0.1, 100

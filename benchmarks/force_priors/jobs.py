@@ -23,7 +23,7 @@ from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
 from forcegp.simulation.joint_friction import JointFrictionLaw
-from forcegp.simulation.kuka_motion import tool_friction_of
+from forcegp.simulation.kuka_surface import tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]
 TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first, test rows above the second [m]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.auto_answer import best_sentence
+from forcegp.cli.auto import best_sentence
 from forcegp.cli.main import parse_arguments
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from forcegp.errors import NumericalError
-from forcegp.scores import metrics
+from forcegp.scores import predicted_rows as metrics
 
 ROWS, K = 30, 4
 

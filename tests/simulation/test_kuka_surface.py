@@ -12,7 +12,7 @@ from forcegp.errors import DatasetError, InvalidInput, SimulationError
 from forcegp.mechanics import Plane
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig, simulate, simulate_kuka_surface
-from forcegp.simulation.kuka_motion import TOOL_LINK, kuka_urdf
+from forcegp.simulation.kuka_surface import TOOL_LINK, kuka_urdf
 
 pytest.importorskip("pybullet")
 

@@ -14,8 +14,7 @@ import forcegp.posterior
 import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, FIELDS, Command, listed, unless_given
-from forcegp.cli.estimates import estimates_table
-from forcegp.cli.fit import write_estimates
+from forcegp.cli.fit import estimates_table, write_estimates
 from forcegp.cli.log_options import FilterOptions, with_delay_that_shows
 from forcegp.cli.robot_options import RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal

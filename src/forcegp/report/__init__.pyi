@@ -4,7 +4,7 @@ from .motion import (
 from .page import (
     Page as Page, Table as Table, is_page as is_page, write_page as write_page,
 )
-from .results import (
+from .page import (
     model_page as model_page, scene_notes as scene_notes,
     scores_sentence as scores_sentence, scores_table as scores_table,
 )

@@ -12,7 +12,12 @@ from jinja2 import Environment, StrictUndefined
 
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
-from forcegp.scores.figures.style import Picture
+from forcegp.data import Dataset
+from forcegp.errors import MissingExtra
+from forcegp.posterior.posterior import Posterior
+from forcegp.report.motion import RecordedScene, recorded_scene
+from forcegp.report.scene import recording
+from forcegp.scores import Picture, Scores, overall, unit_of
 
 
 @dataclass(frozen=True)
@@ -66,3 +71,63 @@ def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
         temporary.write_text(
             template.render(page=page, details=details, version=__version__, mark=MARK) + "\n", encoding="utf-8"
         )
+
+
+SECONDS = 10.0
+"""Of the recording in the scene."""
+
+
+def model_page(
+    posterior: Posterior,
+    dataset: Dataset,
+    pictures: Sequence[Picture],
+    *,
+    title: str,
+    best: str,
+    findings: Sequence[tuple[str, str]] = (),
+    tables: Sequence[Table] = (),
+    missing: Sequence[str] = (),
+    next_steps: Sequence[tuple[str, str]] = (),
+    details: Mapping[str, Any] | None = None,
+    shapes: str | Path | None = None,
+) -> Page:
+    """A page with the robot in motion, and pictures.
+
+    What is `missing` (`scores.model_pictures`) is named on the page with the reason, and without viser the robot.
+    `shapes` is a URDF with visual elements.
+    """
+    try:
+        recorded = recorded_scene(dataset, posterior, seconds=SECONDS, shapes=shapes)
+        scene, notes = recording(recorded), scene_notes(recorded)
+    except MissingExtra as error:
+        scene, notes = "", [f"The robot is not shown: {error}."]
+    return Page(title, best, findings, scene, [*notes, *missing], pictures, tables, next_steps, details or {})
+
+
+def scene_notes(recorded: RecordedScene) -> list[str]:
+    """What the arrows of a scene mean, and what of the robot could not be drawn."""
+    arrows = [
+        f"{group.title}: {group.largest:.3g} {group.unit} would be {recorded.arrow_length:.2g} m long"
+        for group in recorded.arrows
+        if group.largest > 0.0
+    ]
+    meaning = "Arrows are forces that the model found, torques along the axes of joints; pale ends are 95 % intervals"
+    return ([f"{meaning}. {'; '.join(arrows)}."] if arrows else []) + recorded.doubts
+
+
+def scores_sentence(scores: Scores) -> str:
+    """What was found of one model, in one sentence."""
+    error, known = scores.value("mae") or 0.0, scores.value("known_physics_mae") or 0.0
+    better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
+    held, unit = 100.0 * (scores.value("coverage_95") or 0.0), unit_of(scores, "a")
+    return (
+        f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit}{better}; "
+        f"95 % intervals contain {held:.0f} %."
+    )
+
+
+def scores_table(scores: Scores, names: Mapping[str, str] | None = None) -> Table:
+    """Models side by side, by these names if given."""
+    header, rows = overall(scores)
+    shown = [[(names or {}).get(name, name), *(cell.partition(" (")[0] for cell in cells)] for name, *cells in rows]
+    return Table("Models on time that none of them has seen", header, shown)

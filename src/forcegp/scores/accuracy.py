@@ -16,8 +16,7 @@ from forcegp.data import Dataset, time_blocks
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.prediction import Gaussian
-from forcegp.scores.metrics import interval_coverage
-from forcegp.scores.predicted_rows import PredictedRows, in_blocks, predict_rows
+from forcegp.scores.predicted_rows import PredictedRows, in_blocks, interval_coverage, predict_rows
 from forcegp.summary import plain
 
 Rows = Float[np.ndarray, "rows nv"]
