@@ -73,7 +73,7 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert len({len(line.split()) for line in lines}) == 1
     assert re.search(r"contact force +\S+ +\S+ +\S+ +\S+ %", done.stdout)
     assert "contact normal rest on the prior alone" in " ".join(done.stderr.split())
-    for name in ("prediction.png", "normal_force.png", "errors.png", "calibration.png"):
+    for name in ("prediction.png", "normal_force.png", "errors.png"):
         assert (tmp_path / "out" / name).read_bytes().startswith(PNG)
     assert json.loads((tmp_path / "out" / "results.json").read_text())["rows"] == 60
     assert "95 % intervals contain" in (tmp_path / "report.html").read_text()

@@ -49,7 +49,7 @@ RUNS: dict[str, tuple[tuple[object, ...], str]] = {
     "monitor": (("free-run", "pushed.h5", "--free", "free.h5", "--out", "touched"), "touched/contacts.csv"),
     "excite": (
         ("run", "--seconds", 1, "--tries", 2, "--clearance", 0.001, "--avoid", "none", "--out", "next.csv"),
-        "next.png",
+        "next.csv",
     ),
     "export": (("run", "--to", "c", "--out", "deployed"), "deployed/self_test.c"),
 }

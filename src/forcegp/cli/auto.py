@@ -259,7 +259,7 @@ class Auto(Command):
             page = forcegp.report.model_page(
                 posterior,
                 recording,
-                [*forcegp.scores.scores_pictures(scores)[:-1], *pictures],
+                [*forcegp.scores.scores_pictures(scores), *pictures],
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
                 findings=answer,

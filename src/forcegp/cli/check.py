@@ -33,7 +33,7 @@ class Check(Command):
     log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The dataset to check (HDF5)."""
     out: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
-    """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
+    """Also draw torques and spectra into this folder, with the findings as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
     robot: RobotOptions = RobotOptions()

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-import forcegp.scores
 from forcegp.cli.command import MODEL, NUMBERS, Command, begins, listed, numbers_of, unless_given
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts
 from forcegp.cli.terminal import Terminal, columns
@@ -32,7 +31,7 @@ class Excite(Command):
     model: Annotated[Positional[Path | None], MODEL, arg(metavar="[RUN]")] = None
     """The folder that `forcegp fit --out` wrote."""
     out: Annotated[Path, arg(metavar="FILE.csv")]
-    """t, q, v, a and u to write, 100 rows per second, as `forcegp import` reads them; and a picture, FILE.png."""
+    """t, q, v, a and u to write, 100 rows per second, as `forcegp import` reads them."""
     seconds: Annotated[float, arg(metavar="S")] = 10.0
     """How long the motion lasts."""
     limits: Annotated[
@@ -56,9 +55,7 @@ class Excite(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Choose, write, draw and show."""
-        picture = self.out.with_suffix(".png")
-        for path, mark in ((self.out, b"t,q_"), (picture, b"\x89PNG")):
-            self.require_free_file(path, begins(mark), "what forcegp writes there")
+        self.require_free_file(self.out, begins(b"t,q_"), "a motion of forcegp")
         model, limits = self.robot.chosen(), {}
         if (model is None) == (self.model is None):
             raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
@@ -78,8 +75,6 @@ class Excite(Command):
                 progress=report,
             )
         chosen.save_csv(self.out)
-        forcegp.scores.save_figure(forcegp.scores.excitation_figure(chosen), picture)
-        terminal.note(f"figure: {picture}")
         usage = {name: values.tolist() for name, values in chosen.usage.items()}
         table = {f"{name}\nover limit": values for name, values in usage.items()}
         spread = None if chosen.spread is None else chosen.spread.tolist()

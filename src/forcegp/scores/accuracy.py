@@ -28,7 +28,7 @@ ACCELERATION, TRUE_ACCELERATION, ALL_JOINTS = "acceleration", "true acceleration
 FORCE, TRUE_FORCE, UNKNOWN_FORCE = "force", "true force", "unknown force"
 CONTACT_FORCE, CONSTRAINT = "contact force", "constraint"
 
-LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+LEVELS = (0.5, 0.95)
 """Of the central intervals whose coverage is scored, as `coverage_95`."""
 STRETCHES = 20
 """Parts of the time in which models are compared by themselves."""
