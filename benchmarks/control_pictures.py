@@ -18,6 +18,7 @@ from PIL import Image
 import forcegp
 from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
 from benchmarks.excitation import LIMITS, Learner
+from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -53,7 +54,6 @@ from forcegp.scores.figures.style import (
     save_figure,
     short_joint_names,
 )
-from forcegp.simulation.joint_friction import JointFrictionLaw
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
 SEED, SECONDS, FRAMES_PER_SECOND = 1, 10.0, 12

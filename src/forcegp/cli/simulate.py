@@ -59,8 +59,7 @@ class Simulate(Command):
     """Unmodelled friction of the tool: viscous, with 1 N/(m/s) unless given, or a law of dry friction by name, with 0.3
     of the normal force while it slides."""
     joint_friction: Annotated[str | None, JOINT_FRICTION] = None
-    """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces; of kuka-surface also
-    exponential, asymmetric, load, lugre and drift, which no model has."""
+    """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
     """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
     wind: Annotated[float | None, unless_given("M/S", "4; only of quadrotor", float)] = None

@@ -28,7 +28,6 @@ from forcegp.simulation.contact_forces import (
     ViscousFriction,
     with_tool_sphere,
 )
-from forcegp.simulation.joint_friction import JointFrictionLaw
 from forcegp.simulation.recording import recorded
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
@@ -115,7 +114,7 @@ def simulate_episode(
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
-    joint_law = None if config.joint_friction == "none" else JointFrictionLaw(config, robot)
+    joint_law = config.joint_law(robot)
     columns: dict[str, np.ndarray] = {}
     if config.contact == "bullet":
         urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
@@ -145,7 +144,7 @@ def simulate_episode(
             commanded = np.clip(asked, -limits, limits)
             u = commanded - config.joint_damping * v
             now = step * config.time_step
-            joint_torques = np.zeros(7) if joint_law is None else joint_law.step(v, u, state.mass, now)
+            joint_torques = joint_law(v, u, state.mass, now)
             forces = contact.step(arm, state, u + joint_torques)
             row = {"q": state.q, "v": v, "u": u, "joint_torques": joint_torques, "gap": table.distance(state.position)}
             row |= {**forces._asdict(), "saturated": (commanded != asked).any()}

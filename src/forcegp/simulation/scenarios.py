@@ -48,8 +48,6 @@ def usual_dry_friction(config: Any) -> None:
     require_joint_friction(config.joint_friction)
 
 
-OF_PLANTS = ("exponential", "asymmetric", "load", "lugre", "drift")
-"""Joint friction that no model has (`JointFrictionLaw`)."""
 Surface = Literal["plane", "tilted", "sphere", "none"]
 ContactKind = Literal["ideal", "bullet"]
 
@@ -125,13 +123,11 @@ class KukaSurfaceConfig(CommonConfig):
     """How many times as large friction is on the patch; 1 for no patch."""
     joint_friction: str = "none"
     """Friction of the joints that is not part of `u`, besides the force at the tool: viscous friction and laws of
-    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below; or one
-    that no model has: "exponential" (more near rest), "asymmetric" (another force backwards, a hard sign), "load",
-    "lugre" (bristles that yield before they slide) or "drift" (`JointFrictionLaw`)."""
+    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below."""
     joint_breakaway_velocity: float = 0.2
     """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
     joint_smoothing: float = 0.1
-    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign, see `JointFrictionLaw`."""
+    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign."""
 
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
@@ -148,10 +144,7 @@ class KukaSurfaceConfig(CommonConfig):
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
-    joint_asymmetry: ClassVar[float] = 0.7  # Coulomb friction backwards over that forwards
-    joint_load: ClassVar[tuple[float, float]] = (0.04, 0.015)  # per torque of a joint that drives, that is driven back
-    joint_presliding: ClassVar[float] = 0.01  # how far a joint gives before it slides (lugre)
-    joint_drift: ClassVar[tuple[float, float]] = (0.3, 60.0)  # of Coulomb friction lost as gears warm up; in s
+    own_laws: ClassVar[tuple[str, ...]] = ()  # names of joint friction that a subclass has by `joint_law`
     baumgarte_omega: ClassVar[float] = 10.0
     baumgarte_zeta: ClassVar[float] = 1.0
     start_degrees: ClassVar[Numbers] = (85, 50, -10, -100, -170, -25, -100)  # also the posture of the null space
@@ -180,7 +173,7 @@ class KukaSurfaceConfig(CommonConfig):
             from forcegp.forces.registry import dry_laws
 
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
-        require_joint_friction(self.joint_friction, OF_PLANTS)
+        require_joint_friction(self.joint_friction, self.own_laws)
         if self.contact == "bullet":
             if self.surface == "none":
                 raise InvalidInput("surface is 'none'; contact 'bullet' needs a surface: plane, tilted or sphere.")
@@ -191,6 +184,20 @@ class KukaSurfaceConfig(CommonConfig):
                 f"patch_factor is {self.patch_factor}; a patch needs a surface and an ideal contact (PyBullet has one "
                 "coefficient for a whole body). Use 1, or surface plane, tilted or sphere and contact ideal."
             )
+
+    def joint_laws(self, robot: Any) -> Any:
+        """The laws that `joint_friction` names (`LawsOfJoints`), with the numbers above where it gives none."""
+        from forcegp.simulation.joint_friction import LawsOfJoints
+
+        more = tuple(near - level for near, level in zip(self.joint_static, self.joint_coulomb, strict=True))
+        numbers: dict[str, Any] = {"damping": self.joint_viscous, "level": self.joint_coulomb, "breakaway": more}
+        numbers |= {"velocity_scale": self.joint_smoothing, "velocity": self.joint_breakaway_velocity}
+        return LawsOfJoints.named(self.joint_friction, robot, numbers)
+
+    def joint_law(self, robot: Any) -> Callable[..., Any]:
+        """Torques of friction [Nm] in the next step, of velocities [rad/s], applied torques, inertias and the time."""
+        laws = self.joint_laws(robot)
+        return lambda v, u, mass, time: laws(v, u)
 
     @property
     def pressing_force(self) -> float:
