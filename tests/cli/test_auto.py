@@ -34,7 +34,7 @@ COLUMNS = (
 def folder(tmp_path_factory):
     """A log of a double pendulum in ms, degrees and degrees per second, with one torque turned, and its URDF."""
     place = tmp_path_factory.mktemp("auto")
-    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=12.0, seed=1, noise=0.0))
+    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=8.0, seed=1, noise=0.0))
     (place / "arm.urdf").write_text(data.model.robot.urdf_text)
     rng = np.random.default_rng(0)
     q = data.q + 1e-5 * rng.standard_normal(data.q.shape)
@@ -72,7 +72,7 @@ def test_the_corrected_command_gives_a_model_that_works(folder, answered):
     model = load_posterior(folder / "answer" / "model")
     error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()
     assert error < 0.1 * np.abs(motion_residuals(test, test.model)[1]).mean()  # of the URDF
-    assert len(Dataset.load(folder / "answer" / "log.h5")) == 2880
+    assert len(Dataset.load(folder / "answer" / "log.h5")) == 1920
     identified = Robot.from_urdf(folder / "answer" / "identified.urdf")
     assert identified.joint_names == test.joint_names
     assert (folder / "answer" / "validation" / "report.md").is_file()
@@ -111,7 +111,7 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     assert "reached" in done.stderr
     rows = Dataset.load(folder / "other" / "log.h5")
     assert np.abs(rows.q).max() < 4.0
-    assert rows.time[-1] == pytest.approx(12.0, abs=0.01)
+    assert rows.time[-1] == pytest.approx(8.0, abs=0.01)
 
 
 def test_the_printed_command_keeps_every_option():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from tests.posterior.arm import arm_data
 
-from forcegp.cli.main import main
 from forcegp.posterior import load_posterior
 
 INDUCING = ("--engine", "inducing", "--learning-points", 20)
@@ -51,19 +50,4 @@ def test_more_rows_than_memory_holds_is_one_line(forcegp, folder):
     (line,) = refused.stderr.strip().splitlines()
     assert "N=100000 rows needs" in line
     assert "use engine='inducing'" in line
-    assert not (folder / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--engine", "fast"), "engine"),
-        (("--learning-points", "1"), "learning_points is 1"),
-    ],
-)
-def test_what_is_wrong_is_one_line(capsys, folder, monkeypatch, words, message):
-    monkeypatch.chdir(folder)
-    assert main([*map(str, FIT[:4]), *words, "--out", "run"]) == 2
-    error = capsys.readouterr().err
-    assert message in error
     assert not (folder / "run").exists()
