@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.auto import best_sentence
+from forcegp.cli.auto import best_sentence, far_worse
 from forcegp.cli.main import parse_arguments
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
@@ -166,6 +166,8 @@ def test_a_model_that_is_worse_than_none_is_not_trusted():
         about = {"given": {"kind": "given", "summary": ""}}
         return Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
 
+    assert far_worse(scores([0.1, 0.1, 0.5], 0.01, 1e-4), "given").startswith("; wrist is predicted far worse")
+    assert far_worse(scores([0.1, 0.1, 0.3], 0.01, 1e-4), "given") == ""
     lost = scores([328.2] * 3, None, 1.0)  # motions are there, and none of them lasted
     assert best_sentence(lost, dataset).startswith("Trust none of these models: on unseen time, accelerations")
     told = best_sentence(scores([0.1, 0.16, 2.8], 0.01, 1e-4), dataset)  # noise of a alone

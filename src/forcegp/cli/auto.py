@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import statistics
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -285,6 +286,7 @@ class Auto(Command):
 
 
 INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
+FAR_WORSE = 4.0  # times the error of the joint in the middle, from which a joint is named
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 
 
@@ -366,10 +368,20 @@ def answer_lines(
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
         ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {errors}"),
-        ("trust", f"{short_name(best)}{intervals}"),
+        ("trust", f"{short_name(best)}{intervals}{far_worse(scores, best)}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]
+
+
+def far_worse(scores: forcegp.Scores, model: str) -> str:
+    """The joint whose acceleration is predicted far worse than that of the joint in the middle, if there is one."""
+    errors = zip(scores.joint_names, scores.columns("nrmse", model=model), strict=True)
+    known = {name: error for name, error in errors if error is not None}
+    worst = max(known, key=known.__getitem__, default="")
+    if not known or known[worst] <= FAR_WORSE * statistics.median(known.values()):
+        return ""
+    return f"; {worst} is predicted far worse than the others (nRMSE {known[worst]:.2g}): look at it"
 
 
 def best_sentence(scores: forcegp.Scores, dataset: forcegp.Dataset) -> str:

@@ -111,7 +111,7 @@ def _against_measurements(
         "mae": np.abs(mean - a).mean(axis=0),
         "rmse": rmse,
         "nrmse": rmse / _spread(a),
-        "nlpd": -norm.logpdf(a, mean, np.sqrt(variance)).mean(axis=0),
+        "nlpd": -np.asarray(norm.logpdf(a, mean, np.sqrt(variance))).mean(axis=0),
         **{f"coverage_{100 * at:.0f}": interval_coverage(mean, variance, a, at) for at in LEVELS},
         "known_physics_mae": np.abs(predicted.known_physics - a).mean(axis=0),
         "noise_std": posterior.noise_std.detach().cpu().numpy(),
