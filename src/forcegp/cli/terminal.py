@@ -236,7 +236,11 @@ def columns(
     table = Table(title=title, box=box.SIMPLE_HEAD, collapse_padding=True, **PLAIN)
     for place, name in enumerate(header):
         folded = long_names and not place
-        table.add_column(Text(name), justify="right" if place else "left", no_wrap=not folded, overflow="fold")
+        # rich counts the longest word, where a cell must not be folded at all
+        cells = [cell for row in (header, *rows, last) for cell in row[place : place + 1]]
+        widest = max(len(line) for cell in cells for line in cell.split("\n"))
+        how: Any = {} if folded else {"no_wrap": True, "min_width": widest}
+        table.add_column(Text(name), justify="right" if place else "left", overflow="fold", **how)
     for row in rows:
         table.add_row(*map(Text, row))  # as a str, "[Nm]" would be a style
     if last:

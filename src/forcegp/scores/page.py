@@ -53,7 +53,7 @@ BY_JOINT: tuple[Column, ...] = (
     ("RMSE", ACCELERATION, "rmse", 4),
     ("NLPD", ACCELERATION, "nlpd", 2),
     ("in 95 %", ACCELERATION, "coverage_95", 1),
-    ("MAE of known physics", ACCELERATION, "known_physics_mae", 4),
+    ("known physics", ACCELERATION, "known_physics_mae", 4),
 )
 OF_QUANTITIES = (
     ("MAE", "mae", 4),

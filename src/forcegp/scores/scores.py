@@ -156,13 +156,13 @@ class Scores(Summary):
         The one rule of verdicts. A criterion that no model has is missing.
         """
         out = {}
-        for criterion, words in CRITERIA.items():
+        for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
             if simple is None or other is None:
                 if (only := simple or other) is not None:
                     second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
                     found = None if second is None else self.difference(criterion, only, second)
-                    why = f"the lowest {words}" if found is None else found.sentence
+                    why = "no other model was scored" if found is None else found.sentence
                     out[criterion] = {"model": only, "why": why}
                 continue
             found = self.difference(criterion, other, simple)
