@@ -14,7 +14,7 @@ from tests.posterior.arm import URDF, arm_data
 import forcegp
 import forcegp.scores
 from forcegp import Dataset, load_posterior
-from forcegp.atomic_files import atomic_folder, write_digests
+from forcegp.atomic_files import write_digests
 from forcegp.cli.main import main
 
 QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
@@ -223,21 +223,6 @@ def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
     assert Path(name).read_bytes() == before
 
 
-def test_links_stay_and_what_they_point_to_is_written(folder):
-    Path("elsewhere").mkdir()
-    for link, target in (("data", "elsewhere/data.h5"), ("model", "elsewhere/model")):
-        Path(link).symlink_to(target)
-    for again in ([], ["--overwrite"]):
-        assert main([*IMPORT.split(), "--out", "data", *again]) == 0
-        assert main(["fit", "arm.h5", *QUICK.split(), "--out", "model", *again]) == 0
-    assert Path("data").is_symlink()
-    assert Path("model").is_symlink()
-    assert sorted(entry.name for entry in Path("elsewhere").iterdir()) == ["data.h5", "model"]
-    assert len(Dataset.load("elsewhere/data.h5")) == 300
-    load_posterior("elsewhere/model")
-    assert not hidden(folder)
-
-
 @pytest.mark.parametrize("name", ["import", "fit"])
 @pytest.mark.nightly
 def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, limited_file_size, name):
@@ -252,18 +237,6 @@ def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, 
     assert {file: file.read_bytes() for file in [Path("out"), *Path("out").rglob("*")] if file.is_file()} == old
     assert not hidden(folder)
     assert main(words) == 0
-
-
-def test_the_next_run_removes_what_a_killed_one_left(folder):
-    for name in (".out.0123456789ab.tmp", ".data.h5.0123456789ab.tmp"):
-        Path(name).mkdir()
-        (Path(name) / "half").write_text("half")
-    with atomic_folder("out") as living:
-        assert main([*IMPORT.split(), "--out", "data.h5"]) == 0
-        assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
-        assert hidden(folder) == [living.parent, living.parent / ".lock"] or hidden(folder) == [living.parent]
-        living.mkdir()
-    assert not hidden(folder)
 
 
 def test_a_changed_model_of_an_identification_is_refused(folder, capfd):

@@ -1,8 +1,5 @@
 """A folder of jobs: whole or not at all, one configuration, one process at a time."""
 
-import subprocess
-import sys
-
 import pytest
 
 from forcegp.atomic_files import atomic_folder, remove_leftovers, write_json
@@ -93,26 +90,3 @@ def test_a_run_killed_before_its_description_does_not_block_the_folder(tmp_path)
     with results.locked():
         remove_leftovers(results.folder)
     assert sorted(entry.name for entry in folder.iterdir()) == [".lock", "jobs", "jobs.json"]
-
-
-def test_only_one_at_a_time_where_the_system_has_no_fcntl(tmp_path):
-    script = """
-import sys, warnings
-sys.modules["fcntl"] = None  # as on systems that are neither Unix nor WindowedRows
-warnings.simplefilter("ignore")
-from pathlib import Path
-from forcegp.errors import InvalidInput
-from forcegp.jobs import JobStore
-store = JobStore.open(Path(sys.argv[1]), "a test", {})
-for _ in range(2):
-    with store.locked():
-        try:
-            with JobStore(store.folder, "another").locked():
-                print("both")
-        except InvalidInput as error:
-            print(error)
-"""
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=True)
-    told = done.stdout.splitlines()
-    assert len(told) == 2
-    assert all(line.startswith("another `another` is at work in") for line in told)

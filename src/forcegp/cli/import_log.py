@@ -108,21 +108,23 @@ def _is_mapping(path: Path) -> bool:
     return True
 
 
+REPAIRED = {
+    "repeated_stamps_dropped": "rows dropped for a repeated time stamp",
+    "rows_in_stretches_too_short": "rows left out in stretches of fewer than 5",
+}
+
+
 def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:
     """What was guessed, repaired and left out, as notes, and what came out."""
     for found in done["guessed"]:
         terminal.note(f"found by name: {found}")
     for recording in done["recordings"]:
-        notes = list(recording["notes"])
-        if recording["repeated_stamps_dropped"]:
-            notes.append(f"{_counted(recording['repeated_stamps_dropped'], 'row')} with a repeated time stamp dropped")
-        if recording["gaps"]:
-            count, longest = len(recording["gaps"]), max(recording["gaps"])
-            notes.append(f"{_counted(count, 'gap')} of up to {longest:.4g} s {'splits' if count == 1 else 'split'} it")
-        if recording["rows_in_stretches_too_short"]:
-            notes.append(
-                f"{_counted(recording['rows_in_stretches_too_short'], 'row')} in stretches of fewer than 5 left out"
-            )
+        notes = [
+            *recording["notes"],
+            *(f"{text}: {recording[name]}" for name, text in REPAIRED.items() if recording[name]),
+        ]
+        if gaps := recording["gaps"]:
+            notes.append(f"gaps that split it: {len(gaps)}, of up to {max(gaps):.4g} s")
         if notes:
             terminal.note(f"{recording['name']}: {'; '.join(notes)}")
     if done["resampled_to_step"] is not None:
@@ -134,12 +136,7 @@ def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:
     if done.get("preparation", {}).get("cutoff") is not None:
         how = "filtered and differentiated anew"
     seconds = sum(recording["seconds"] for recording in done["recordings"])
-    rows, episodes = _counted(done["rows"], "row"), _counted(len(done["episodes"]), "episode")
-    return f"{out}: {rows} in {episodes} ({seconds:.4g} s); {how}"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+    return f"{out}: rows: {done['rows']}, episodes: {len(done['episodes'])} ({seconds:.4g} s); {how}"
 
 
 def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> Any:
