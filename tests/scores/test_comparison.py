@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from tests.fit.test_motion_fit import bump, recording
@@ -12,8 +13,8 @@ from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
 from forcegp.fit import fit as fit_model
 from forcegp.jobs import JobStore, code_digest
 from forcegp.scores import Candidate, Training
-from forcegp.scores.candidates import candidate
-from forcegp.scores.score import KIND
+from forcegp.scores.candidates import candidate, identified_model
+from forcegp.scores.score import KIND, unseen_rotors
 
 USUAL = "bodies+viscous+coulomb+rotor@accelerations"
 QUICK = {"points": 15, "horizons": (0.1, 0.2), "starts": 2, "restarts": 1, "iterations": 5, "split": "episodes:1"}
@@ -248,3 +249,12 @@ def test_what_a_name_stands_for(name, kind, identification, all_rows):
 def test_models_without_anything_to_refine_are_refused(name):
     with pytest.raises(InvalidInput, match="nothing to refine on motions"):
         candidate(name, name, given_system(), "bodies")
+
+
+def test_force_errors_name_joints_whose_rotors_no_row_shows(data):
+    still = replace(data, a=0.0 * data.a)
+    _, unseen = identified_model("rotor+viscous@torques", given_system(), still)
+    assert unseen == [f"rotor.{name}" for name in data.joint_names]
+    (told,) = unseen_rotors([{"unseen": ["rotor.lift"]}, {"unseen": ["rotor.lift", "rotor.pan"]}])
+    assert "the rotors of lift, pan;" in told
+    assert unseen_rotors([{"unseen": []}, {"error": "no"}]) == []

@@ -27,7 +27,8 @@ from forcegp.errors import InvalidInput
 NOISE = 0.1  # rad/s^2, as in the paper
 SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
 
-MODELS = {"S-GP": ("s-gp", False), "S-GP + analytical mean": ("s-gp-analytical-mean", True)}
+BEST = "S-GP + analytical mean"
+MODELS = {"S-GP": ("s-gp", False), BEST: ("s-gp-analytical-mean", True)}
 """Name in the paper -> (folder, whether known forces are the mean)."""
 
 
@@ -82,7 +83,7 @@ class Demo(Command):
                 "wall_seconds": time.monotonic() - start,
             }
             write_json(folder / "results.json", results)
-            sentence = self._write_report(terminal, folder, models["S-GP + analytical mean"], test, results)
+            sentence = self._write_report(terminal, folder, models[BEST], test, scores, results)
         title = f"{self.search.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
         terminal.show(
             *comparison(scores, title),
@@ -98,11 +99,11 @@ class Demo(Command):
         folder: Path,
         posterior: forcegp.posterior.Posterior,
         test: forcegp.Dataset,
+        scores: forcegp.Scores,
         results: Mapping[str, Any],
     ) -> str:
         """The page with everything, whose best sentence is returned."""
-        scores = forcegp.score(posterior, test)
-        best = forcegp.report.scores_sentence(scores)
+        best = forcegp.report.scores_sentence(scores, BEST)
         with terminal.progress("writing the report") as progress:
             pictures, missing = forcegp.scores.model_pictures(posterior, test, progress)
             page = forcegp.report.model_page(

@@ -115,14 +115,13 @@ def scene_notes(recorded: RecordedScene) -> list[str]:
     return ([f"{meaning}. {'; '.join(arrows)}."] if arrows else []) + recorded.doubts
 
 
-def scores_sentence(scores: Scores) -> str:
+def scores_sentence(scores: Scores, model: str | None = None) -> str:
     """What was found of one model, in one sentence."""
-    error, known = scores.value("mae") or 0.0, scores.value("known_physics_mae") or 0.0
+    error, known, held = (scores.value(x, model=model) or 0.0 for x in ("mae", "known_physics_mae", "coverage_95"))
     better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
-    held, unit = 100.0 * (scores.value("coverage_95") or 0.0), unit_of(scores, "a")
     return (
-        f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit}{better}; "
-        f"95 % intervals contain {held:.0f} %."
+        f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit_of(scores, 'a')}{better}; "
+        f"95 % intervals contain {100.0 * held:.0f} %."
     )
 
 

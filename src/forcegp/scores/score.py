@@ -135,7 +135,7 @@ def score(
             "configuration": experiment.configuration,
             "seeds": list(range(seeds)),
             "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
-            "notes": _unseen(found),
+            "notes": unseen_rotors(found),
         }
         kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
         scores = replace(_scores(log, runs, kinds, about), fit=partial(_on_all_rows, experiment, chosen))
@@ -155,7 +155,7 @@ def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: 
     return work.fit(experiment.training(rows, experiment.recording, identified, 0))
 
 
-def _unseen(identifications: Sequence[Mapping[str, Any]]) -> list[str]:
+def unseen_rotors(identifications: Sequence[Mapping[str, Any]]) -> list[str]:
     """That errors of forces mean little at joints whose inertia no row shows."""
     names = dict.fromkeys(name.partition(".")[2] for each in identifications for name in each.get("unseen", ()))
     told = f"the rows do not show the inertia of the rotors of {', '.join(names)}; errors of forces mean little there."
@@ -199,7 +199,7 @@ def _fitted_before(
         run |= {"mass_matrix": "the model itself", "training_rows": len(posterior.training)}
         runs[name], models[name] = [run], kind_and_summary(posterior)
     about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
-    return replace(_scores(log, runs, models, about), posteriors=dict(given))
+    return replace(_scores(log, runs, models, about), fit=given.__getitem__)
 
 
 def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:

@@ -36,7 +36,6 @@ class Scores(Summary):
         "stretches" and "motions" for differences, "warnings", and "error" where it failed.
     joint_names, units: of the log.
     about: what was done, for the page.
-    posteriors: models that were fitted only once, and those that were given.
     fit: how a model by this name is fitted to all rows.
     """
 
@@ -45,7 +44,6 @@ class Scores(Summary):
     joint_names: tuple[str, ...]
     units: Mapping[str, Any]
     about: Mapping[str, Any] = field(default_factory=dict)
-    posteriors: Mapping[str, Posterior] = field(default_factory=dict)
     fit: Callable[[str], Posterior] | None = field(default=None, compare=False)
 
     # ------------------------------------------------------------------ numbers
@@ -188,7 +186,9 @@ class Scores(Summary):
         name = self.recommended if model is None else self._named(model)
         if name is None:
             raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
-        return self.posteriors[name] if self.fit is None else self.fit(name)
+        if self.fit is None:
+            raise FitError("these scores came without their models.")
+        return self.fit(name)
 
     @cached_property
     def rival(self) -> str | None:
