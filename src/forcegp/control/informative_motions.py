@@ -21,7 +21,7 @@ from scipy.interpolate import BSpline
 from typing_extensions import override
 
 from forcegp.atomic_files import atomic_file
-from forcegp.control.controller import per_joint
+from forcegp.control.tracking import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.data.row_selection import farthest_point_sampling
