@@ -15,15 +15,12 @@ from forcegp.codegen.library import (
     NOT_POSITIVE,
     OPTIONS,
     RESULT_NOT_FINITE,
-    Purpose,
     RowFunction,
     VectorUnit,
     compile_library,
 )
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
-
-PURPOSE = Purpose("a test", "MOVE", "give up")
 
 
 @pytest.fixture(params=[1, "here"], ids=["C99", "vectors"])
@@ -38,8 +35,8 @@ def compiled(tmp_path, lanes):
     def build(program: Program) -> RowFunction:
         strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1", "-fPIC", "-shared")
         options = strict if lanes == 1 else (*OPTIONS, *VectorUnit.of_this_processor().options)
-        library = compile_library(write_program(program, lanes, 60), options, tmp_path / "x.so", "evaluate", PURPOSE)
-        return RowFunction(library, list(program.inputs.values()), [len(x) for x in program.outputs.values()])
+        library = compile_library(write_program(program, lanes, 60), options, tmp_path / "x.so", "evaluate")
+        return RowFunction(library, len(program.inputs), [len(x) for x in program.outputs.values()])
 
     return build
 

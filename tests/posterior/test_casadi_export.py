@@ -11,7 +11,7 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp.codegen.library import Purpose, compile_library
+from forcegp.codegen.library import compile_library
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
@@ -101,7 +101,7 @@ def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypa
     function = casadi_function(posterior, name="arm")
     function.generate("arm.c", {"with_header": False})
     source, library = (tmp_path / "arm.c").read_text(encoding="utf-8"), tmp_path / "arm.so"
-    compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm", Purpose("a test", "MOVE", "give up"))
+    compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm")
     external = casadi.external("arm", str(library))
     state = [x[2].numpy() for x in states]
     np.testing.assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)

@@ -117,7 +117,7 @@ def test_rollouts_of_a_posterior_are_compiled_where_they_are_long(friction, star
     monkeypatch.setattr(rollout, "STEPS_TO_COMPILE", 1)
     called = []
     fused = rollout.fused
-    monkeypatch.setattr(rollout, "fused", lambda *given: called.append(given[0]) or fused(*given))
+    monkeypatch.setattr(rollout, "fused", lambda *given, **how: called.append(given[0]) or fused(*given, **how))
     found = rolled_out(friction, starts, samples=2)
     assert [len(loops) for loops in called] == [1, 2]
     close(found, expected)

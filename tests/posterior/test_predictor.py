@@ -180,7 +180,7 @@ def test_the_rank_keeps_the_tolerance_and_no_more(posterior):
 
 def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch):
     posterior = fitted(arm_model().with_forces(JointFriction()), rows=60)
-    monkeypatch.setattr("forcegp.posterior.predictor_preparation.SAMPLES", 30)
+    monkeypatch.setattr("forcegp.posterior.preparation.SAMPLES", 30)
     predictor = posterior.predictor(compile=False)  # without a warning; of ten rows it is 97 times too large at others
     rows = posterior.training
     ratio = predictor(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
@@ -272,7 +272,7 @@ def test_forward_mode_derivatives_are_not_lost(posterior, means, states):
 def test_errors_name_the_remedy(posterior, means, states):
     predictor = means
     q, v, u = states
-    with pytest.raises(InvalidInput, match=r"u \(5, 2\); give all three \(3,\)"):
+    with pytest.raises(InvalidInput, match=r"u \(5, 2\); give q \(\.\.\., 3\)"):
         predictor.mean(q, v, u[:, :2])
     with pytest.raises(InvalidInput, match=r"v \(3,\)"):
         predictor.mean(q, v[0], u)

@@ -133,20 +133,6 @@ def test_other_numbers_are_converted_exactly_as_predict_does(smooth, states, kin
         predictor.mean(*(x.to(torch.complex128) for x in states))
 
 
-def test_forces_are_the_components_of_the_posterior(posterior, states):
-    predictor = posterior.predictor(covariance="none", compile=False)
-    found, expected = predictor.forces(*states), posterior.predict(*states)
-    pairs = [(found.total, expected.unknown_force)]
-    pairs += [(getattr(found, name), getattr(expected, name)) for name in ("multiplier", "contact_force")]
-    for force, same in pairs:
-        torch.testing.assert_close(force.mean, same.mean)
-        torch.testing.assert_close(force.covariance, same.covariance)
-    assert list(found) == list(posterior.components(*states))
-    alone = predictor.forces(*(x[1] for x in states), covariance=False)
-    assert alone.multiplier.mean.shape == (1,)
-    assert alone.total.covariance is None
-
-
 def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     q, v, u = states
     predictor = posterior.predictor(covariance="exact", compile=False)

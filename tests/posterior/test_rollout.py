@@ -13,8 +13,6 @@ from forcegp.forces import BaseWrench, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
 from forcegp.model import Model
-from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.rollout import roll_out
 from forcegp.robots import Robot
 
 DT, STEPS = 1 / 240, 12
@@ -55,16 +53,6 @@ def test_symplectic_euler_is_a_loop_over_predict(data, start):
     assert rollout.samples is None
     assert (rollout.diverged_at == -1).all()
     assert (rollout.initial_correction == 0).all()
-
-
-@pytest.mark.parametrize("integrator", ["rk4", "projected"])
-def test_the_black_box_way_through_predict_gives_the_same_motion(data, start, integrator):
-    posterior = fit(arm_model(baumgarte=None).with_forces(JointForces()).without_mean(), data, points=15, **QUICK)
-    q, v, u = start
-    direct = posterior.rollout(q, v, u[:, :4], DT, integrator=integrator)
-    through = roll_out(Posterior.accelerations(posterior, None), q, v, u[:, :4], DT, integrator=integrator)
-    torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
-    torch.testing.assert_close(direct.a, through.a, rtol=1e-9, atol=1e-9)
 
 
 def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posterior, start):

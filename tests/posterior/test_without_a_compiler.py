@@ -38,7 +38,7 @@ def empty_cache(tmp_path, monkeypatch):
 
 def test_everything_is_the_same_after_one_warning(posterior, states, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.warns(NumericalWarning, match=SLOWER + ".*no-such-compiler.*give compile=False") as given:
+    with pytest.warns(NumericalWarning, match=SLOWER + ".*no-such-compiler.*compile=False") as given:
         predictor = posterior.predictor()
     assert len(given) == 1
     assert "\n" not in str(given[0].message)

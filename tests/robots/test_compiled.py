@@ -18,7 +18,7 @@ from forcegp.codegen.c_writer import write_program
 from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
-from forcegp.robots.compiled import PURPOSE, trace_dynamics
+from forcegp.robots.compiled import trace_dynamics
 from forcegp.robots.unrolled import UnrolledRobot
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
@@ -105,8 +105,8 @@ def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, stat
     inputs, outputs = list(random(3, 13, 3)), [torch.full((13, 3), torch.nan, dtype=torch.float64)]
     source = write_program(trace_dynamics(UnrolledRobot(robot), "forward_dynamics"), lanes, statements)
     options = ("-std=gnu11", "-O1", "-fPIC", "-shared")
-    library = compile_library(source, options, tmp_path / "one.so", "evaluate", PURPOSE)
-    assert RowFunction(library, [3, 3, 3], [3]).rows(13, inputs, outputs) == 0
+    library = compile_library(source, options, tmp_path / "one.so", "evaluate")
+    assert RowFunction(library, 3, [3]).rows(13, inputs, outputs) == 0
     torch.testing.assert_close(outputs[0], robot.forward_dynamics(*inputs))
 
 
@@ -215,7 +215,7 @@ def test_no_compiler(robot, tmp_path, monkeypatch):
         robot.compile(tmp_path).gravity_forces(random(3))
     monkeypatch.delenv("CC")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(CompilerError, match="looked for cc, gcc or clang"):
+    with pytest.raises(CompilerError, match="looked for cc, gcc, clang"):
         robot.compile(tmp_path).gravity_forces(random(3))
 
 

@@ -1,6 +1,6 @@
 """A fitted model as C99 that needs nothing but <math.h>: `export_c`.
 
-The program is that of a compiled predictor (`predictor_code`) for one state, with its tables inside as constants; what
+The program is that of a compiled predictor (`programs`) for one state, with its tables inside as constants; what
 is written (`c_files`) is compiled and compared with `posterior.predict` before the folder appears.
 """
 
@@ -17,16 +17,13 @@ import torch
 from torch import Tensor
 
 from forcegp.atomic_files import atomic_folder, require_writable
-from forcegp.codegen.library import Purpose, compile_library
-from forcegp.codegen.tracing import trace
+from forcegp.codegen.library import compile_library, compiler
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, require_type
 from forcegp.inference.posterior import ExactPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.posterior.c_files import CFiles, Check, identifier
-from forcegp.posterior.fused_rollouts import require_step
 from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.predictor_code import PredictorCode
-from forcegp.posterior.predictor_preparation import rows_for, sample_states
+from forcegp.posterior.preparation import rows_for, sample_states
+from forcegp.posterior.programs import Physics, require_step
 
 STATES = 300
 """States at which the program is compared."""
@@ -36,9 +33,6 @@ LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3
 """How many times as much as the mean these may differ: more cancels in them."""
 BETWEEN = ("linearize", "step", "step_jacobian")
 SUFFIXES = {"covariance": "mean_covariance"}
-PURPOSE = Purpose(
-    "the check of an exported model", "the environment variable TMPDIR", "export without it, `unchecked=True`"
-)
 
 
 @dataclass(frozen=True)
@@ -104,7 +98,7 @@ def export_c(
         raise InvalidInput(f"{folder} exists already and is not an empty folder; choose another name.")
     require_writable(folder)
     reference = posterior.predictor(covariance="compressed" if covariance else "none", compile=False)
-    code = exported_code(posterior, reference.compressed)
+    code = posterior.programs(compressed=reference.compressed)
     called = identifier(name or posterior.model.robot.name)
     export = CFiles(posterior, reference, code, called, jacobian, steps, integrator)
     checks = _checks(export)
@@ -122,40 +116,16 @@ def export_c(
     return CExport(export.name, folder, files, differences, inflation)
 
 
-def exported_code(posterior: Posterior, compressed: CompressedCovariance | None = None) -> PredictorCode:
-    """The programs. Raises InvalidInput that names the term of the prior, where one cannot be traced."""
-    try:
-        return posterior.code(compressed=compressed)
-    except InvalidInput as error:
-        raise _named(posterior, error) from None
-
-
-def _named(posterior: Posterior, error: InvalidInput) -> InvalidInput:
-    """The error of a graph that cannot be made, with the term of the prior that is the cause; others as they are."""
-    why, traced, _ = str(error).partition(", which the model's")
-    if not traced:
-        return error
-    rows = rows_for(posterior.training, posterior.trained, posterior.model)
-    states = [x[:1] for x in (rows.q, rows.v, rows.u)]
-
-    def holds(*terms: Any) -> bool:
-        def function(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-            dynamics = posterior.dynamics(q, v, u)
-            return [dynamics.H, *(z for term in terms for z in (term.direction(dynamics), *term.features(dynamics)))]
-
-        try:
-            trace(function, states)
-        except InvalidInput:
-            return False
-        return True
-
-    terms = posterior.trained.unknown.named(posterior.model.robot)
-    found = [f"the force {title!r}" for title, term, _ in terms if not holds(term)]
-    what = "a kernel of the prior" if holds() else "a contact or known force of the system"
-    return InvalidInput(
-        f"{found[0] if found and holds() else what} cannot be exported: {why}; write it with other operations and "
-        "without branches on values, or fit without it."
-    )
+def rounding(posterior: Posterior, q: Tensor, v: Tensor, u: Tensor) -> float:
+    """What rounding of the sums over all points may change in the mean, relative to its largest value there."""
+    physics, latent = Physics.of(posterior, posterior.model), posterior.latent
+    W, features = physics.mixing(q, v, u)
+    if not W.shape[-1]:
+        return 0.0
+    mean = posterior.predict(q, v, u, covariance=False).mean
+    parts = zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
+    terms = torch.stack([kernel.cross(z, centers).abs() @ w.abs() for kernel, z, centers, w in parts], dim=-1)
+    return torch.finfo(mean.dtype).eps * float((W.abs() @ terms[..., None]).max() / mean.abs().max())
 
 
 def _checks(export: CFiles) -> list[Check]:
@@ -171,8 +141,8 @@ def _checks(export: CFiles) -> list[Check]:
     if not space.is_vector_space:
         moved[:, : sizes[0]] = space.normalized(moved[:, : sizes[0]])
     between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
-    rounding = made.rounding(*sampled[finite].split(sizes, dim=-1))
-    tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, rounding)
+    lost = rounding(own, *sampled[finite].split(sizes, dim=-1))
+    tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, lost)
     found = []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]
@@ -198,7 +168,7 @@ def _checks(export: CFiles) -> list[Check]:
 def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str, float]:
     """The largest difference by function. Nothing without a compiler; a warning says so."""
     try:
-        PURPOSE.compiler()
+        compiler()
     except CompilerError as error:
         warnings.warn(f"the exported program was not compared with forcegp: {error}", stacklevel=3)
         return {}
@@ -206,7 +176,7 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
     found = {}
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "checked.so"
-        library = compile_library(f'#include "{export.name}.c"\n', options, path, f"{export.name}_mean", PURPOSE)
+        library = compile_library(f'#include "{export.name}.c"\n', options, path, f"{export.name}_mean")
         for check in checks:
             found[check.function] = worst = _difference(export, library[check.function], check)
             if not worst <= check.tolerance:

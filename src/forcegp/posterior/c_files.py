@@ -12,10 +12,9 @@ from forcegp.codegen.c_text import c_text, filled, sections
 from forcegp.codegen.c_writer import head, write_function
 from forcegp.data import units_for
 from forcegp.inference.one_input_calls import OneInputCall
-from forcegp.posterior.fused_rollouts import step_source
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor import Predictor
-from forcegp.posterior.predictor_code import PredictorCode
+from forcegp.posterior.programs import Programs
 
 STORED = 10
 """States of the self-test."""
@@ -54,7 +53,7 @@ class CFiles:
 
     posterior: Posterior
     reference: Predictor
-    code: PredictorCode
+    code: Programs
     name: str
     jacobian: bool
     dt: float | None
@@ -73,8 +72,7 @@ class CFiles:
         start = [", ".join(map(repr, x.tolist())) for x in self.split(checks[0].states[0])]
         program = sections(__name__, "exported_c/model.c")
         space = self.code.space
-        given = self.integrator, self._stepped, space, self.code.sizes
-        stepped = "" if self.dt is None else step_source(*given)
+        stepped = "" if self.dt is None else self.code.step_source(self.integrator, self._stepped)
         words: dict[str, object] = {"NAME": self.name, "NV": nv, "NQ": nq, "NU": nu, "DT": self.dt}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
@@ -121,7 +119,7 @@ class CFiles:
         slopes = self.jacobian or (self.dt is not None and self._stepped == "slopes")
         wanted |= {"mean": "mean"} | ({"linearize": "slopes"} if slopes else {})
         yield head(1)
-        for k, table in enumerate(code.tables if "covariance" in wanted else code.tables[: len(code.sums)]):
+        for k, table in enumerate(code.tables("covariance" if "covariance" in wanted else "mean")):
             names.append(f"table{k}")
             yield f"static const double table{k}[] = {{\n{_numbers(table.tolist())}}};"
         yield f"static const double *const tables[] = {{{', '.join(names) or '0'}}};"
@@ -129,7 +127,7 @@ class CFiles:
             yield from (part.c_source(1, kind) for part in code.sums)
         if "covariance" in wanted:
             yield from (part.roots_source(1, code.rank) for part in code.sums)
-            yield code._covariance_source().replace("void covariance(", "void covariance_of(")
+            yield code.covariance_source().replace("void covariance(", "void covariance_of(")
         yield from code.motion_source(1)
         for kind, function in wanted.items():
             program = code.program(kind)

@@ -12,7 +12,6 @@ from forcegp.codegen.c_writer import Program, write_program
 from forcegp.codegen.graph import Graph, node_of
 from forcegp.codegen.library import (
     NOT_POSITIVE,
-    Purpose,
     RowFunction,
     VectorUnit,
     are_plain,
@@ -59,25 +58,6 @@ def trace_dynamics(unrolled: UnrolledRobot, function: str) -> Program:
         return [node_of(graph, scalar) for scalar in array]
 
     return Program(graph, inputs, {f"result {k}": nodes(result) for k, result in enumerate(made)}, nodes(positive))
-
-
-PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the robot itself")
-
-
-def compiled_program(unrolled: UnrolledRobot, function: str, folder: Path) -> RowFunction:
-    """From ``folder`` if it is there, else compiled into it. Raises CompilerError as `load_library`."""
-
-    def write(unit: VectorUnit) -> str:
-        return write_program(trace_dynamics(unrolled, function), unit.lanes)
-
-    constants: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in unrolled.joints]
-    constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
-    constants += [unrolled.gravity.tolist(), unrolled.armature.tolist(), [body.tolist() for body in unrolled.inertias]]
-    library, _ = load_library(
-        f"{unrolled.robot.name[:40]}-{function}", f"{constants!r}\0{function}", write, folder, PURPOSE
-    )
-    sizes = [unrolled.robot.nq if name == "q" else unrolled.nv for name in ARGUMENTS[function]]
-    return RowFunction(library, sizes, [unrolled.nv**d for d in DIMENSIONS.get(function, (1,))])
 
 
 class CompiledRobot:
@@ -148,10 +128,17 @@ class CompiledRobot:
 
     def program(self, function: str) -> RowFunction:
         """The machine code of a function."""
-        found = self._programs.get(function)
-        if found is None:
-            found = self._programs[function] = compiled_program(self._unrolled, function, self.folder)
-        return found
+        if function not in self._programs:
+            unrolled, nv = self._unrolled, self._nv
+
+            def write(unit: VectorUnit) -> str:
+                return write_program(trace_dynamics(unrolled, function), unit.lanes)
+
+            name = f"{self.robot.name[:40]}-{function}"
+            library = load_library(name, f"{unrolled.constants!r}\0{function}", write, folder=self.folder)
+            outputs = [nv**d for d in DIMENSIONS.get(function, (1,))]
+            self._programs[function] = RowFunction(library, len(ARGUMENTS[function]), outputs)
+        return self._programs[function]
 
     def _evaluate(self, function: str, **arguments: Tensor) -> tuple[Tensor, ...]:
         nv, given = self._nv, list(arguments.values())

@@ -93,6 +93,13 @@ class UnrolledRobot:
         self.armature = self._scalars(tree.armature, 0.0)
 
     @property
+    def constants(self) -> list[object]:
+        """All that decides the code."""
+        found: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in self.joints]
+        found += [x.tolist() for joint in self.joints for x in (joint.rotation, joint.origin)]
+        return [*found, self.gravity.tolist(), self.armature.tolist(), [body.tolist() for body in self.inertias]]
+
+    @property
     def nv(self) -> int:
         """Number of coordinates."""
         return self.robot.nv
