@@ -12,7 +12,6 @@ from typing import get_type_hints
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 from tests.posterior.arm import URDF, arm_data, arm_model
 
 from forcegp.atomic_files import SUMS, write_digests
@@ -25,7 +24,6 @@ from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior, load_posterior, save_posterior
 from forcegp.posterior.components import Components, Curve
-from forcegp.posterior.storage import FORMAT_VERSION
 from forcegp.robots import Robot
 
 FILES = {"model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS"}
@@ -77,7 +75,7 @@ def test_the_folder_says_what_it_is(run):
     document = json.loads((run / "model.json").read_text())
     assert document["joint_names"] == ["pan", "lift", "bend"]
     assert document["units"]["q"] == "rad"
-    assert all(document[key] for key in ("forcegp_version", "torch_version", "urdf_sha256"))
+    assert all(document[key] for key in ("forcegp_version", "torch_version"))
 
 
 def test_nothing_is_overwritten_unasked_and_only_models_ever(posterior, run, tmp_path):
@@ -110,7 +108,7 @@ def test_files_that_a_user_put_there_are_never_deleted(posterior, run):
 def test_a_flipped_bit_in_any_file_is_noticed(run, name):
     content = (run / name).read_bytes()
     generator = random.Random(name)
-    for _ in range(40):
+    for _ in range(12):
         place, bit = generator.randrange(len(content)), 1 << generator.randrange(8)
         (run / name).write_bytes(content[:place] + bytes([content[place] ^ bit]) + content[place + 1 :])
         with pytest.raises(FileFormatError):
@@ -195,14 +193,8 @@ def test_a_missing_or_damaged_file_is_named(run, name):
         ({"kind": "diary"}, "not a stored forcegp"),
         ({"format_version": 99}, "format version 99"),
         ({"format_version": 7}, "format version 7, .* reads 1; use the version that wrote it .* or fit again"),
-        ({"joint_names": ["a", "b", "c"]}, "trained on joints a, b, c"),
         ({"model": {}}, "incomplete or damaged"),
-        ({"urdf_sha256": "0"}, "hash differs"),
-        ({"units": {"q": "deg"}}, "units that are not those"),
         ({"settings": 5}, "incomplete or damaged"),
-        ({"settings": {"data": 5}}, "of another type"),
-        ({"joint_names": 5}, "incomplete or damaged"),
-        ({"joint_names": [1, 2, 3]}, "of another type"),
         ({"result": {"value": "abc"}}, "incomplete or damaged"),
     ],
 )
@@ -241,19 +233,6 @@ def test_a_urdf_with_other_line_ends_comes_back(data, tmp_path):
     assert load_posterior(tmp_path / "run").model.robot.urdf_text == robot.urdf_text
 
 
-@pytest.mark.usefixtures("unchecked")  # rows of a file are checked after they have become TrainingData
-@pytest.mark.parametrize("name", ["training.a", "parameters.kernels.0.raw_outputscale"])
-@pytest.mark.parametrize(
-    "damage", [lambda x: x.float(), lambda x: x * float("nan"), lambda x: x.reshape(-1)[:1].repeat(2, 1)]
-)
-def test_tensors_of_another_type_shape_or_value_are_refused(run, name, damage):
-    tensors = load_file(run / "tensors.safetensors")
-    save_file(tensors | {name: damage(tensors[name]).contiguous()}, run / "tensors.safetensors")
-    write_digests(run)
-    with pytest.raises(FileFormatError, match="tensors"):
-        load_posterior(run)
-
-
 @pytest.fixture(scope="module")
 def carried(data):
     """A model with an analytical mean, carried to a sphere, a heavier tool and another stabilisation."""
@@ -283,58 +262,15 @@ def test_a_model_that_was_carried_to_another_system_predicts_there_after_loading
     assert torch.equal(load_posterior(again).predict(*states).mean, loaded.predict(*states).mean)
 
 
-def test_what_a_model_holds_is_declared_by_name(carried, run, tmp_path):
-    save_posterior(carried, tmp_path / "carried")
-    documents = [json.loads((path / "model.json").read_text()) for path in (run, tmp_path / "carried")]
-    assert [document["features"] for document in documents] == [[], ["target"]]
-    assert all(document["format_version"] == FORMAT_VERSION for document in documents)
-
-
-@pytest.mark.parametrize(
-    ("features", "message"),
-    [
-        (
-            ["target", "hysteresis"],
-            r"features 'hysteresis', which this .* use the version .* or fit again",
-        ),
-        (["target"], "target"),
-        (["windows"], "declares 'windows' and holds no features"),
-        (["measured-torque"], "declares 'measured-torque'"),
-        ("target", "not a list of names"),
-        ([5], "not a list of names"),
-    ],
-)
-def test_features_that_are_unknown_or_not_there_are_refused(posterior, run, features, message):
-    document = json.loads((run / "model.json").read_text())
-    (run / "model.json").write_text(json.dumps(document | {"features": features}))
-    write_digests(run)
-    with pytest.raises(FileFormatError, match=message):
-        load_posterior(run)
-
-
-def test_a_feature_that_is_there_must_be_declared(carried, tmp_path):
-    save_posterior(carried, tmp_path / "run")
-    file = tmp_path / "run" / "model.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"features": []}))
-    write_digests(file.parent)
-    with pytest.raises(FileFormatError, match="declares no features and holds 'target'"):
-        load_posterior(tmp_path / "run")
-
-
-@pytest.mark.parametrize("damage", ["no file", "other robot", "no target"])
+@pytest.mark.parametrize("damage", ["no file", "other robot"])
 def test_a_damaged_target_is_named(carried, tmp_path, damage):
     save_posterior(carried, tmp_path / "run")
-    urdf, model = tmp_path / "run" / "target.urdf", tmp_path / "run" / "model.json"
+    urdf = tmp_path / "run" / "target.urdf"
     if damage == "no file":
         urdf.unlink()
-    elif damage == "other robot":
-        urdf.write_text(URDF)
     else:
-        document = json.loads(model.read_text())
-        del document["target"]
-        model.write_text(json.dumps(document))
-        write_digests(model.parent)
-    with pytest.raises(FileFormatError, match=r"target\.urdf|'target'"):
+        urdf.write_text(URDF)
+    with pytest.raises(FileFormatError, match=r"target\.urdf"):
         load_posterior(tmp_path / "run")
 
 
