@@ -27,7 +27,6 @@ from forcegp.mechanics.wheels import RollingContact
 from forcegp.noise import Noise
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import JointValues, Positions, is_sequence
-from forcegp.robots.joint_dynamics import with_joint_dynamics
 from forcegp.robots.mjcf import is_mjcf
 from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
@@ -189,7 +188,7 @@ class Model(Summary):
         viscous = [values["damping"] for kind, values in found.items() if kind is Viscous]
         dry = [values["level"] for values in found.values() if "level" in values]
         damping, friction = (torch.stack(each).sum(0) if each else None for each in (viscous, dry))
-        return with_joint_dynamics(robot, damping, friction)
+        return robot.with_joint_dynamics(damping, friction)
 
     @cached_property
     def loaded_robot(self) -> Robot:

@@ -22,8 +22,7 @@ from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior, c_files, casadi_function
-from forcegp.posterior.c_export import rounding
-from forcegp.posterior.c_files import identifier
+from forcegp.posterior.c_export import identifier, rounding
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
 DT = 0.02

@@ -23,7 +23,7 @@ from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, Sphere
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior, load_posterior, save_posterior
-from forcegp.posterior.components import Components, Curve
+from forcegp.posterior.prediction import Components, Curve
 from forcegp.robots import Robot
 
 FILES = {"model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS"}

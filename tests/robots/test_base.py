@@ -8,7 +8,7 @@ from tests.robots.robot_models import CHAIN, MODELS, TREE
 from forcegp.errors import InvalidInput, RobotModelError, UnstatedBase
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.robots.base import BaseChoice
+from forcegp.robots.layout import BaseChoice
 
 BODY = '<inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 

@@ -19,7 +19,7 @@ from forcegp.errors import (
 )
 from forcegp.robots import Robot
 from forcegp.robots.problems import LISTED, Problems
-from forcegp.robots.xml_text import without_comments
+from forcegp.robots.urdf import without_comments
 
 FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'
 FRAME = '<link name="frame"/><joint name="slip" type="prismatic"><parent link="FL_foot"/><child link="frame"/></joint>'

@@ -33,8 +33,8 @@ from forcegp.inference.threads import blas_threads
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact
 from forcegp.model import Model
-from forcegp.posterior.components import inverse_dynamics
 from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import inverse_dynamics
 from forcegp.posterior.update import learn_more_rows
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from forcegp.codegen.c_text import c_text, filled
+from forcegp.codegen.c_writer import c_text, filled
 from forcegp.codegen.library import load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
-from forcegp.posterior.components import require_actuated
+from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import Summary

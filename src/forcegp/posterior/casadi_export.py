@@ -21,8 +21,7 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import MissingExtra, NumericalError, require_type
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
-from forcegp.posterior.c_export import rounding
-from forcegp.posterior.c_files import identifier
+from forcegp.posterior.c_export import identifier, rounding
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.preparation import rows_for, sample_states
 from forcegp.posterior.programs import Programs, require_step

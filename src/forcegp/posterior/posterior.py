@@ -21,18 +21,22 @@ from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import FORCE, Noise
-from forcegp.posterior.components import Components, Curve, components_of, curve_of, quantity_of
 from forcegp.posterior.fitted import Fitted
 from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
     ROWS_PER_BLOCK,
     Array,
+    Components,
+    Curve,
     Gaussian,
     Inputs,
     Positions,
     Prediction,
     Rows,
+    components_of,
+    curve_of,
     join_predictions,
+    quantity_of,
     state_rows,
     state_tensor,
 )

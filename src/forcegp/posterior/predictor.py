@@ -22,8 +22,7 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
-from forcegp.posterior.components import forces_around, inverse_dynamics
-from forcegp.posterior.prediction import Gaussian, JointForces, Linearization
+from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
 from forcegp.posterior.programs import Programs, steps_of
 from forcegp.posterior.rollout import (
     AccelerationFunction,

@@ -26,8 +26,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from forcegp.atomic_files import atomic_file
-from forcegp.codegen.c_text import c_text, filled, sections
-from forcegp.codegen.c_writer import ROWS, Program, head, write_entry, write_function
+from forcegp.codegen.c_writer import ROWS, Program, c_text, filled, head, sections, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph
 from forcegp.codegen.library import (

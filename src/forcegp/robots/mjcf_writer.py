@@ -13,14 +13,12 @@ import numpy as np
 
 from forcegp.errors import RobotModelError
 from forcegp.robots.inertia import inverse, rotation_of_z_onto, transform
-from forcegp.robots.layout import BASE, OUTSIDE, joint_motion
+from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
 from forcegp.robots.manifold import MOTIONS
-from forcegp.robots.mimic import followed
 from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.problems import Problems
 from forcegp.robots.structure import RobotStructure
-from forcegp.robots.urdf import JointDescription, free_joint
-from forcegp.robots.xml_text import numbers
+from forcegp.robots.urdf import JointDescription, free_joint, numbers
 
 SMALLEST = 2e-15
 """kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""

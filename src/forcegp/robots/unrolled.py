@@ -25,9 +25,8 @@ import torch
 
 from forcegp.codegen.graph import Expression, Graph
 from forcegp.codegen.tracing import trace
-from forcegp.robots.layout import WORLD
+from forcegp.robots.layout import WORLD, Drive
 from forcegp.robots.manifold import MOTIONS, pose
-from forcegp.robots.mimic import Drive
 from forcegp.robots.structure import RobotStructure
 
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from forcegp.errors import MissingExtra, RobotModelError, SimulationError
 from forcegp.forces.registry import force_class
 from forcegp.robots import Robot
-from forcegp.robots.xml_text import numbers
+from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import (
     BulletContact,
