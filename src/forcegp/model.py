@@ -19,11 +19,10 @@ from forcegp.forces.of_file import forces_of_file, forces_of_mjcf
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
 from forcegp.forces.thrusters import FADES, OBSERVED, ObservedWrench
+from forcegp.mechanics import LoopClosure, RollingContact
+from forcegp.mechanics.constraints import closing, contact_from_dict, contact_to_dict, described
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
-from forcegp.mechanics.loops import LoopClosure, closing, described
-from forcegp.mechanics.stored_contacts import contact_from_dict, contact_to_dict
 from forcegp.mechanics.surfaces import Held
-from forcegp.mechanics.wheels import RollingContact
 from forcegp.noise import Noise
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import JointValues, Positions, is_sequence

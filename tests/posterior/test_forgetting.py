@@ -64,7 +64,7 @@ def dense(posterior, points, data, horizon, test):
         return (
             features,
             dynamics.H @ posterior.model.unknown.direction(dynamics),
-            dynamics.acceleration_map(True).offset,
+            dynamics.acceleration_map().offset,
         )
 
     (z, W, offset), (at, W_test, mean) = terms(data), terms(test)

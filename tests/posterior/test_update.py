@@ -1,17 +1,14 @@
 """`posterior.update`: against conditioning on all rows at once, with the standardization of the fit."""
 
 import dataclasses
-import json
 import warnings
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp.atomic_files import write_digests
-from forcegp.errors import ContactError, DataWarning, FileFormatError, InvalidInput, NotEnoughMemory
+from forcegp.errors import ContactError, DataWarning, InvalidInput, NotEnoughMemory
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies
 from forcegp.inference import OptimizerOptions, likelihood
@@ -184,15 +181,6 @@ def test_a_budget_is_kept_and_the_result_is_that_of_the_rows_kept(budget):
     assert_same(grown, at_once(posterior, data.rows(rows)), test)
 
 
-def test_another_rule_for_the_rows_that_stay():
-    data = arm_data(20, seed=12)
-    posterior = learned(data)
-    newest = posterior.update(
-        data.rows(slice(12, 20)), 6, keep=lambda latent, budget: torch.arange(len(latent.system.alpha))[-budget:]
-    )
-    assert torch.equal(newest.training.q, torch.tensor(data.q[-6:]))
-
-
 def test_everything_else_works_after_an_update(tmp_path):
     data = arm_data(20, seed=13)
     posterior = learned(data, model=data.model.with_forces(JointFriction()))
@@ -228,22 +216,6 @@ def test_what_comes_back_from_disk_predicts_the_same(tmp_path, prior):
     assert_same(loaded.update(data.rows([11])), grown.update(data.rows([11])), data)
     save_posterior(grown.with_contacts([]), tmp_path / "free")
     assert_same(load_posterior(tmp_path / "free"), grown.with_contacts([]), data)
-
-
-def test_only_updated_models_declare_rows_of_reference(tmp_path):
-    data = arm_data(14, seed=15)
-    posterior = learned(data)
-    for name, saved, features in (("old", posterior, []), ("new", posterior.update(data.rows([12])), ["reference"])):
-        save_posterior(saved, tmp_path / name)
-        assert json.loads((tmp_path / name / "model.json").read_text())["features"] == features
-    assert not any(key.startswith("reference.") for key in load_file(tmp_path / "old" / "tensors.safetensors"))
-    (tmp_path / "old" / "model.json").write_bytes((tmp_path / "new" / "model.json").read_bytes())
-    write_digests(tmp_path / "old")
-    with pytest.raises(FileFormatError, match=r"reference\.q"):
-        load_posterior(tmp_path / "old")
-
-
-# ---------------------------------------------------------------- errors
 
 
 @pytest.fixture(scope="module")

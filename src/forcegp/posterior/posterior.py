@@ -14,7 +14,6 @@ from forcegp.errors import InvalidInput, NumericalError, require_type, usable_ar
 from forcegp.evidence import Accelerations
 from forcegp.evidence.training_data import second_moments, shrunk
 from forcegp.forces import Force
-from forcegp.inference.cholesky_update import rows_to_keep
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import Feedback
 from forcegp.integration.integrators import check_time_step
@@ -44,7 +43,7 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
 from forcegp.posterior.rollout import AccelerationFunction, Rollout, accelerations, remembering, roll_out
-from forcegp.posterior.update import Keep, learn_and_forget, learn_more_rows
+from forcegp.posterior.update import learn_and_forget, learn_more_rows
 from forcegp.robots import Robot
 
 
@@ -286,7 +285,6 @@ class Posterior(Fitted):
         rows: Dataset,
         budget: int | None = None,
         *,
-        keep: Keep = rows_to_keep,
         horizon: float | Mapping[str, float] | None = None,
     ) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
@@ -308,7 +306,7 @@ class Posterior(Fitted):
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, rows)
         if horizon is None:
-            return replace(learn_more_rows(own, rows, budget, keep), target=self.target)
+            return replace(learn_more_rows(own, rows, budget), target=self.target)
         return replace(learn_and_forget(own, rows, budget, horizon), target=self.target)
 
     def with_model(self, model: Model) -> "Posterior":

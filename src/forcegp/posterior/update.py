@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.training_data import TrainingData
 from forcegp.forces import UnknownForces
 from forcegp.inference import ExactPosterior, InducingPosterior, Terms, exact
-from forcegp.inference.cholesky_update import with_only, with_rows
+from forcegp.inference.cholesky_update import rows_to_keep, with_only, with_rows
 from forcegp.inference.engines import ENOUGH, InducingWeights
 from forcegp.inference.memory import require_memory
 from forcegp.inference.threads import blas_threads
@@ -26,8 +26,6 @@ from forcegp.robots.arguments import whole_number
 
 Structured = Any
 """A `Posterior`, whose module imports this one."""
-Keep = Callable[[ExactPosterior, int], Tensor]
-"""(posterior, budget) -> numbers of the rows to keep, ascending."""
 
 SHARE_AT_ONCE = 4
 """With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
@@ -36,7 +34,7 @@ OTHER_NOISE = 0.1
 """Part of the fit's level of noise by which rows may state another one without a warning."""
 
 
-def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, keep: Keep) -> Structured:
+def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None) -> Structured:
     """What `Posterior.update` documents without a horizon."""
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
     budget = None if budget is None else whole_number("budget", budget, 2)
@@ -52,7 +50,7 @@ def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, ke
             latent = with_rows(latent, Terms([z[part] for z in features], W[part], residual[part], variance[part]))
             training = _joined(training, _selected(added, part))
             if budget is not None and len(training.q) > budget:
-                kept = keep(latent, budget)
+                kept = rows_to_keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
     likelihood = replace(more, training=replace(training, reference=reference))
     changes = {"points": len(latent.system.alpha), "budget": budget}
