@@ -17,7 +17,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache, reduce
 from operator import or_
 from pathlib import Path
@@ -113,17 +112,9 @@ VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")
 OPTIONS = ("-std=gnu11", "-O2", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")
 
 
-@dataclass(frozen=True)
-class VectorUnit:
-    """How many doubles are worked on at once, and the options of the compiler for it."""
-
-    lanes: int
-    options: tuple[str, ...]
-
-    @classmethod
-    def of_this_processor(cls) -> "VectorUnit":
-        """What torch found."""
-        return cls(*VECTOR_UNITS.get(torch.backends.cpu.get_cpu_capability(), (2, ())))
+def vector_unit() -> tuple[int, tuple[str, ...]]:
+    """How many doubles are worked on at once, and the options of the compiler for it: what torch found."""
+    return VECTOR_UNITS.get(torch.backends.cpu.get_cpu_capability(), (2, ()))
 
 
 def default_folder() -> Path:
@@ -135,23 +126,23 @@ def default_folder() -> Path:
 def load_library(
     name: str,
     key: str,
-    write: Callable[[VectorUnit], str],
+    write: Callable[[int], str],
     options: Sequence[str] = (),
     folder: Path | None = None,
 ) -> ctypes.CDLL:
-    """The library with the function `evaluate` that `write` gives the C text of.
+    """The library with the function `evaluate` that `write` gives the C text of, for so many lanes.
 
     From ``folder`` (`default_folder`) if a file of that name and key is there, else compiled into it. ``key`` must hold
     everything that decides the text beside the code of this package; ``options`` are more of the compiler's.
     Raises :class:`~forcegp.errors.CompilerError` where there is no C compiler, where it fails, where the folder cannot
     be written to, and where others than the user can write to it or to a folder above it.
     """
-    unit = VectorUnit.of_this_processor()
-    parts = (key, *options, repr(unit), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
+    lanes, of_unit = vector_unit()
+    parts = (key, *options, repr((lanes, of_unit)), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     path = own_folder(folder) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
     if not path.exists():
-        source, compiled = write(unit), (*OPTIONS, *unit.options, *options)
+        source, compiled = write(lanes), (*OPTIONS, *of_unit, *options)
         try:
             with atomic_file(path) as library:  # whoever else compiles the same meanwhile
                 compile_library(source, compiled, library, "evaluate")  # tried before it is kept

@@ -9,6 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import MissingExtra, NumericalError, require_type
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
+from forcegp.integration import integrator_named
 from forcegp.posterior.c_export import identifier, rounding
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.preparation import rows_for, sample_states
@@ -135,22 +137,17 @@ def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: 
 
 
 def _stepped(casadi: Any, code: Programs, acceleration: Any, x: Sequence[Any], dt: float, integrator: str) -> list[Any]:
-    """The formulas of `integration.integrators`."""
-    (q, v, u), space, (nq, nv, _) = x, code.space, code.sizes
-    if space.is_vector_space:
-        moved, rate = operator.add, lambda step, at: at
-    else:
-        moved, rate = _of_space(casadi, space.integrate, (nq, nv)), _of_space(casadi, space.chart_velocity, (nv, nv))
-    if integrator == "symplectic-euler":
-        v = v + dt * acceleration(q, v, u)
-        return [moved(q, dt * v), v]
-    if integrator == "rk4":
-        k = [(v, acceleration(q, v, u))]
-        for share in (0.5 * dt, 0.5 * dt, dt):
-            at, step = v + share * k[-1][1], share * k[-1][0]
-            k.append((rate(step, at), acceleration(moved(q, step), at, u)))
-        step, change = (dt / 6.0 * (a + 2.0 * b + 2.0 * c + d) for a, b, c, d in zip(*k, strict=True))
-        return [moved(q, step), v + change]
+    """The steps of `integration.integrators`; Newton's method of the implicit one is CasADi's."""
+    (q, v, u), space = x, code.space
+    if integrator != "implicit-midpoint":
+        method: Any = integrator_named(integrator, code.physics.model)
+        if not space.is_vector_space:
+            nq, nv, _ = code.sizes
+            made = {"integrate": (nq, nv), "chart_velocity": (nv, nv)}
+            own = {name: _of_space(casadi, getattr(space, name), sizes) for name, sizes in made.items()}
+            method = type(method)(SimpleNamespace(**own))
+        moved = method.step(lambda q, v: acceleration(q, v, u), q, v, dt)
+        return [moved.q, moved.v]
     middle, half = casadi.MX.sym("middle", v.numel()), 0.5 * dt
     rest = middle - v - half * acceleration(q + half * middle, middle, u)
     solve = casadi.rootfinder("solve", "newton", {"x": middle, "p": casadi.vertcat(q, v, u), "g": rest})

@@ -18,7 +18,7 @@ from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress
 from forcegp.model import Model
 from forcegp.posterior.predictor import Predictor
-from forcegp.posterior.programs import Physics, found_record, record_key, written_record
+from forcegp.posterior.programs import Physics, kept_record, record_key
 from forcegp.robots.manifold import ConfigurationSpace
 
 COVARIANCES = ("auto", "compressed", "exact", "none")
@@ -82,14 +82,13 @@ def prepared_predictor(
 
 def _kept(key: str | None, make: Callable[[], CompressedCovariance]) -> CompressedCovariance:
     """A compressed covariance, found or made."""
-    found = found_record(key, "compressed")
-    if found is not None:
-        numbers = found[0]
-        factors = tuple(numbers[str(k)] for k in range(len(numbers) - 1))
-        return CompressedCovariance(factors, numbers["inflation"])
-    made = make()
-    written_record(key, "compressed", {str(k): F for k, F in enumerate(made.factors)} | {"inflation": made.inflation})
-    return made
+
+    def made() -> tuple[dict[str, Tensor], str]:
+        found = make()
+        return {str(k): F for k, F in enumerate(found.factors)} | {"inflation": found.inflation}, ""
+
+    numbers, _ = kept_record(key, "compressed", made)
+    return CompressedCovariance(tuple(numbers[str(k)] for k in range(len(numbers) - 1)), numbers["inflation"])
 
 
 def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingData:

@@ -13,7 +13,7 @@ of the user's own code, have none. The oldest records go where all together grow
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,13 +31,14 @@ from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph
 from forcegp.codegen.library import (
     RowFunction,
-    VectorUnit,
     aligned,
     code_digest,
+    default_folder,
     load_library,
     opened_library,
     own_file,
     own_folder,
+    vector_unit,
 )
 from forcegp.codegen.tracing import trace
 from forcegp.errors import CompilerError, ForceGPError, InvalidInput
@@ -358,15 +359,15 @@ class Programs:
             "mean": [nv],
         }.get(kind, [0] * 4)  # a loop gives as much as it is asked for
         inputs = 3 + (kind in steps_of(self.space))
-        found = found_record(self.key, kind)
-        if found is not None and found[1].is_file():
-            numbers, path = found
-            tables = [aligned(numbers[str(k)].numpy()) for k in range(len(numbers))]
-            return RowFunction(opened_library(path), inputs, outputs, tables)
-        text, tables = self.c_source(kind, VectorUnit.of_this_processor().lanes), self.tables(kind)
-        library = load_library(f"predictor-{kind}", text, lambda _: text)
-        written_record(self.key, kind, {str(k): x for k, x in enumerate(tables)}, Path(library._name).name)
-        return RowFunction(library, inputs, outputs, tables)
+
+        def make() -> tuple[dict[str, Tensor], str]:
+            text = self.c_source(kind, vector_unit()[0])
+            library = load_library(f"predictor-{kind}", text, lambda _: text)
+            return {str(k): x for k, x in enumerate(self.tables(kind))}, Path(library._name).name
+
+        numbers, path = kept_record(self.key, kind, make)
+        tables = [aligned(numbers[str(k)].numpy()) for k in range(len(numbers))]
+        return RowFunction(opened_library(path), inputs, outputs, tables)
 
     def loops(self, integrator: str, samples: int = 0, seed: int = 0) -> list[RowFunction] | None:
         """Over the mean or each drawn function; None where one has no form in pieces, or no such step is written in C.
@@ -387,7 +388,7 @@ def record_key(physics: Physics, options: Sequence[object], numbers: Iterable[Te
     """The hash of a description, of tensors, and of the code; None where the physics holds code of the user's."""
     try:
         parts = [physics.model.to_dict(), *map(force_to_dict, physics.forces.terms), options, torch.__version__]
-        text = json.dumps([*parts, repr(VectorUnit.of_this_processor()), code_digest()])
+        text = json.dumps([*parts, repr(vector_unit()), code_digest()])
     except (ForceGPError, TypeError, ValueError):
         return None
     digest = hashlib.sha256(text.encode())
@@ -398,33 +399,31 @@ def record_key(physics: Physics, options: Sequence[object], numbers: Iterable[Te
     return digest.hexdigest()[:32]
 
 
-def written_record(key: str | None, kind: str, numbers: Mapping[str, Tensor], library: str = "") -> None:
-    """Keep numbers; where they cannot be kept, they are made again."""
-    with contextlib.suppress(OSError, CompilerError):
-        if key is None:
-            return
-        folder = own_folder()
-        data = save({name: x.detach().contiguous() for name, x in numbers.items()}, {"library": library})
-        with atomic_file(folder / f"predictor-{key}-{kind}.safetensors") as path:
-            path.write_bytes(data)
-        left = LARGEST
-        for path in sorted(folder.glob("predictor-*.safetensors"), key=lambda path: -path.stat().st_mtime):
-            left -= path.stat().st_size
-            if left < 0:
-                path.unlink()
-
-
-def found_record(key: str | None, kind: str) -> tuple[dict[str, Tensor], Path] | None:
-    """The numbers and the file of the library, None where there are none or others could have written them."""
+def kept_record(
+    key: str | None, kind: str, make: Callable[[], tuple[Mapping[str, Tensor], str]]
+) -> tuple[Mapping[str, Tensor], Path]:
+    """Numbers and the file of a library in the folder: found, or made and kept where that is possible."""
     with contextlib.suppress(OSError, SafetensorError, CompilerError):
-        if key is None:
-            return None
         path = own_folder() / f"predictor-{key}-{kind}.safetensors"
-        if path.is_file():
+        if key is not None and path.is_file():
             own_file(path)
             with safe_open(path, "pt") as file:  # type: ignore[reportUnknownVariableType]  # no types
                 numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
                 library = path.parent / Path(file.metadata()["library"]).name
-            path.touch()
-            return numbers, library
-    return None
+            if library.exists():
+                path.touch()
+                return numbers, library
+    numbers, name = make()
+    folder = default_folder()
+    with contextlib.suppress(OSError, CompilerError):
+        folder = own_folder()
+        if key is not None:
+            data = save({name: x.detach().contiguous() for name, x in numbers.items()}, {"library": name})
+            with atomic_file(folder / f"predictor-{key}-{kind}.safetensors") as path:
+                path.write_bytes(data)
+            left = LARGEST
+            for path in sorted(folder.glob("predictor-*.safetensors"), key=lambda path: -path.stat().st_mtime):
+                left -= path.stat().st_size
+                if left < 0:
+                    path.unlink()
+    return numbers, folder / name

@@ -13,7 +13,6 @@ from forcegp.codegen.graph import Graph, node_of
 from forcegp.codegen.library import (
     NOT_POSITIVE,
     RowFunction,
-    VectorUnit,
     are_plain,
     default_folder,
     load_library,
@@ -104,8 +103,8 @@ class CompiledRobot(RigidBodyDynamics):
         if function not in self._programs:
             unrolled, nv = self._unrolled, self._nv
 
-            def write(unit: VectorUnit) -> str:
-                return write_program(trace_dynamics(unrolled, function), unit.lanes)
+            def write(lanes: int) -> str:
+                return write_program(trace_dynamics(unrolled, function), lanes)
 
             name = f"{self.robot.name[:40]}-{function}"
             library = load_library(name, f"{unrolled.constants!r}\0{function}", write, folder=self.folder)
