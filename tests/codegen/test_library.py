@@ -43,17 +43,6 @@ def test_without_a_compiler_the_error_names_those_looked_for(tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_broken_linker_is_an_error_with_a_remedy(tmp_path, monkeypatch, broken_linker):
-    monkeypatch.setenv("CC", broken_linker)
-    with pytest.raises(CompilerError, match=r"cannot be loaded .*CC, .*XDG_CACHE_HOME.*, or do without"):
-        compile_library(SOURCE, (), tmp_path / "x.so", "twice")
-
-
-def test_a_library_without_the_function_is_refused(tmp_path):
-    with pytest.raises(CompilerError, match=r"cannot be loaded .*thrice"):
-        compile_library(SOURCE, ("-fPIC", "-shared"), tmp_path / "x.so", "thrice")
-
-
 @pytest.mark.parametrize(
     ("command", "message"),
     [

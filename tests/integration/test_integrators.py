@@ -7,7 +7,7 @@ import torch
 from tests.integration.motions import CONTACTS, free_system, light_arm, physics, start
 from tests.posterior.arm import arm_model
 
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import NumericalError
 from forcegp.integration import (
     ConstraintManifold,
     ImplicitMidpoint,
@@ -91,7 +91,7 @@ def test_implicit_midpoint_follows_stiff_friction_where_explicit_steps_fail():
         assert (motion.diverged_at == -1).all()
         return motion.q[-1]
 
-    true = ends("rk4", 20)
+    true = ends("rk4", 12)
     error = {
         name: float((ends(name, 1) - true).abs().max()) for name in ("symplectic-euler", "rk4", "implicit-midpoint")
     }
@@ -180,8 +180,3 @@ def test_a_start_out_of_reach_is_refused_with_a_remedy():
     q, v = start(free_system("plane"))
     with pytest.raises(NumericalError, match=r"state 0 .*nearer"):
         ConstraintManifold(model).project(q, v)
-
-
-def test_unknown_integrators_are_named_with_those_that_exist():
-    with pytest.raises(InvalidInput, match=r"'rk5' .*'rk4'\? .* implicit-midpoint, projected, rk4, symplectic-euler"):
-        integrator_named("rk5", arm_model())

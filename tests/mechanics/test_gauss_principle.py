@@ -181,16 +181,6 @@ def test_batch_dimensions_are_arbitrary(batch, kind):
         assert_close(dynamics.acceleration(Q_U).reshape(-1, 7), torch.stack(rows), TOLERANCE)
 
 
-def test_states_broadcast():
-    built = model_with("iiwa", "one")
-    q, v, u = states(7, 4)
-    for given in ((q[0], v, u), (q, v[:1], u), (q, v, u[2]), (q[:, None], v, u)):
-        dynamics = built.dynamics(*given)
-        assert_close(dynamics.H, built.dynamics(*torch.broadcast_tensors(*given)).H, 1e-14)
-    many = built.dynamics(q[0], v[0], u[0]).acceleration(normal(5, 7))
-    assert many.shape == (5, 7)
-
-
 # ---------------------------------------------------------------- derivatives
 
 
@@ -216,28 +206,6 @@ def test_derivatives(model, kind):
         return torch.cat([part.flatten() for part in parts])
 
     assert_derivatives(function, *(x[0] for x in regular_states(built, 1)), bodies_of(built))
-
-
-@pytest.mark.parametrize("kind", ["none", "one", "four corners"])
-def test_vmap_and_jacrev(kind):
-    built = model_with("chain", kind, baumgarte=Baumgarte(2.0))
-    nv = built.robot.nv
-    q, v, u = states(nv, 3)
-    Q_U = normal(3, nv)
-
-    def acceleration(q, v, u, Q_U):
-        return built.dynamics(q, v, u).acceleration(Q_U)
-
-    assert_close(torch.func.vmap(acceleration)(q, v, u, Q_U), acceleration(q, v, u, Q_U), TOLERANCE)
-    jacobians = torch.func.vmap(torch.func.jacrev(acceleration, argnums=(0, 1, 2, 3)))(q, v, u, Q_U)
-    dynamics = built.dynamics(q, v, u)
-    for row in range(3):
-        expected = torch.autograd.functional.jacobian(acceleration, (q[row], v[row], u[row], Q_U[row]))
-        tolerance = derivative_rounding(dynamics.M[row], dynamics.A[row])
-        for jacobian, reference in zip(jacobians, expected, strict=True):
-            assert_close(jacobian[row], reference, tolerance)
-    assert_close(jacobians[2], dynamics.H, TOLERANCE)  # actuation enters like any other force
-    assert_close(jacobians[3], dynamics.H, TOLERANCE)
 
 
 def derivative_rounding(M, A) -> float:

@@ -130,7 +130,7 @@ def test_a_mechanism_keeps_its_energy_and_stays_closed(tmp_path):
     robot, (q, v, _) = model.robot, states(model, 1)
     zero = torch.zeros_like(v)
     integrator = integrator_named("projected", model)
-    forces = torch.zeros(300, 1, robot.nv).double()
+    forces = torch.zeros(200, 1, robot.nv).double()
     motion = integrate(integrator, lambda q, v, u: model.dynamics(q, v, u).acceleration(zero), q, v, forces, 1e-3)
     c, rate = ConstraintManifold(model).violation(motion.q, motion.v)
     assert max(c.abs().max(), rate.abs().max()) < 1e-10

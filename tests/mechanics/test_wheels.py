@@ -1,6 +1,5 @@
 """Wheels and balls that roll: against Pinocchio, differences along motions, and the unicycle in closed form."""
 
-import json
 import math
 
 import numpy as np
@@ -8,10 +7,10 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.errors import ContactError, InvalidInput
 from forcegp.forces import ContactFriction
 from forcegp.integration import ConstraintManifold
-from forcegp.mechanics import Baumgarte, Contact, Held, Plane, RollingContact, Sphere, rolling
+from forcegp.mechanics import Contact, Held, Plane, RollingContact, Sphere, rolling
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -204,19 +203,6 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     c, rate = ConstraintManifold(model).violation(q, v)
     assert float(c.abs().max()) < 1e-4
     assert float(rate.abs().max()) < 1e-3
-
-
-def test_files_carry_wheels():
-    robot = Robot.from_urdf_text(CART, base="floating")
-    wheels = (*rolling("left_wheel", RADIUS, ground=tilted(), switch="down"), *rolling("right_wheel", 0.2, None))
-    model = Model(robot, (*wheels, CASTER), baumgarte=Baumgarte(3.0))
-    again = Model.from_json(model.to_json())
-    assert again.contacts == model.contacts
-    assert again.inputs[-1] == "down"
-    stored = json.loads(model.to_json())
-    stored["contacts"][0]["radius"] = "wide"
-    with pytest.raises(FileFormatError, match="radius"):
-        Model.from_dict(stored)
 
 
 def test_a_wheel_off_the_ground_is_free():

@@ -1,8 +1,6 @@
 """Exported C: against `predict`, as C99 without warnings, in CasADi, by acados' form, and what cannot be exported."""
 
 import ctypes
-import errno
-import os
 import shutil
 import subprocess
 import warnings
@@ -16,12 +14,12 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import CompilerError, InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
-from forcegp.posterior import Posterior, c_files, casadi_function
+from forcegp.posterior import Posterior, c_export, casadi_function
 from forcegp.posterior.c_export import identifier, rounding
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
@@ -189,15 +187,6 @@ def test_the_program_allocates_nothing_and_keeps_nothing(complete):
     assert not outside & {"malloc", "calloc", "realloc", "free"}
 
 
-def test_the_header_says_what_it_is(complete, posterior):
-    header = (complete / "arm.h").read_text()
-    for wanted in ("joint 1: lift, q in rad, v in rad/s, u in Nm", "30 training points", posterior.description):
-        assert wanted in header
-    assert "model: models/_/run_" in header  # no end of a comment, no trigraph
-    assert "arm_mean" in header
-    assert header.count("int arm_") == 5
-
-
 def test_what_is_not_finite_is_reported(library, states):
     q, v, u = (x[0].copy() for x in states)
     v[1] = np.nan
@@ -315,7 +304,7 @@ def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch)
     def spoiled(*arguments):
         return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
 
-    monkeypatch.setattr(c_files, "write_function", spoiled)
+    monkeypatch.setattr(c_export, "write_function", spoiled)
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []
@@ -330,13 +319,6 @@ def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(pos
         made = export_c(posterior, tmp_path / "arm")
     assert made.differences == {}
     assert (tmp_path / "arm" / "arm.c").exists()
-
-
-def test_a_compiler_that_fails_leaves_nothing(posterior, tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", shutil.which("false"))
-    with pytest.raises(CompilerError, match="unchecked=True"):
-        export_c(posterior, tmp_path / "arm")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_model_without_unknown_forces(tmp_path, states):
@@ -375,36 +357,6 @@ def test_a_branch_on_values_is_an_error_everywhere(how, tmp_path, states):
     torch.testing.assert_close(found, model.predict(*states).mean)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_leaves_nothing(posterior, tmp_path, monkeypatch, number):
-    written = []
-
-    def full(path, text, **more):
-        written.append(path)
-        if len(written) == 12:  # after the files were compared, halfway through the second time
-            raise OSError(number, os.strerror(number), str(path))
-        return write(path, text, **more)
-
-    write = Path.write_text
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match=os.strerror(number)):
-        export_c(posterior, tmp_path / "arm", unchecked=True)
-    assert len(written) == 12
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_compiler_that_hangs_leaves_nothing(posterior, tmp_path, monkeypatch):
-    hangs, folder = tmp_path / "hangs", tmp_path / "deployed"
-    hangs.write_text("#!/bin/sh\nexec sleep 60\n")
-    hangs.chmod(0o700)
-    folder.mkdir()
-    monkeypatch.setenv("CC", str(hangs))
-    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
-    with pytest.raises(CompilerError, match=r"hangs: it did not end within 0\.5 s; .*unchecked=True"):
-        export_c(posterior, folder / "arm")
-    assert list(folder.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -427,13 +379,6 @@ def test_measured_torques_are_refused(tmp_path):
     measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
     with pytest.raises(InvalidInput, match="a program is for commanded torques"):
         export_c(measured, tmp_path / "arm")
-
-
-def test_a_folder_with_files_stays(posterior, tmp_path):
-    (tmp_path / "mine.c").write_text("mine")
-    with pytest.raises(InvalidInput, match="exists already and is not an empty folder"):
-        export_c(posterior, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.c"]
 
 
 @pytest.mark.parametrize(

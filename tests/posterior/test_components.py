@@ -11,11 +11,10 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownName
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit
-from forcegp.forces import FORCES, ContactFriction, JointForces, JointFriction, ToolForces, UnknownForces
+from forcegp.forces import ContactFriction, JointForces, JointFriction, ToolForces, UnknownForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane, Sphere
 from forcegp.noise import Noise
-from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots import Robot
 
 PRIOR = UnknownForces((JointFriction(), ContactFriction(), Weight()))
@@ -213,13 +212,6 @@ def test_the_same_contacts_change_nothing(posterior, states):
     assert again.latent is posterior.latent  # and nothing was factorised again
 
 
-def test_it_moves_to_a_surface_that_has_no_normal_where_all_joints_are_zero(posterior, states):
-    rest = torch.zeros(1, 3).double()
-    center = Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.0)).position(posterior.model.robot.kinematics(rest))[0]
-    ball = Contact("hand", TIP, Sphere(tuple(center.tolist()), 0.3))
-    assert bool(torch.isfinite(posterior.with_contacts([ball]).predict(*states).mean).all())
-
-
 def slid(model, friction, rows, seed, speed):
     """Noise-free rows on the surface of `model` under a true friction of its tool, and the force itself."""
     generator = np.random.default_rng(seed)
@@ -281,21 +273,6 @@ def test_what_cannot_move_is_refused(posterior, train):
     with pytest.raises(InvalidInput, match=r"no rigid bodies.* fit a model with RigidBodies\(\)"):
         zero.with_robot(heavier)
     assert zero.with_contacts([]).predict(train.q, train.v, train.u).multiplier.mean.shape == (16, 0)
-
-
-def test_a_moved_model_comes_back_from_a_folder_as_it_was(posterior, states, tmp_path, monkeypatch):
-    """What it was trained on and what it predicts for are two models, and both are stored."""
-    monkeypatch.setitem(FORCES, "weight", Weight)
-    moved = posterior.with_contacts(OTHER_CONTACTS["sphere"])
-    save_posterior(moved, tmp_path / "moved")
-    again = load_posterior(tmp_path / "moved")
-    assert again.model.contacts == moved.model.contacts
-    assert again.trained.contacts == posterior.model.contacts
-    assert torch.equal(again.predict(*states).mean, moved.predict(*states).mean)
-    assert torch.equal(again.predict(*states).covariance, moved.predict(*states).covariance)
-    assert again.negative_log_likelihood == posterior.negative_log_likelihood
-    home = again.with_contacts(posterior.model.contacts)
-    assert torch.equal(home.predict(*states).mean, posterior.predict(*states).mean)
 
 
 def test_one_prior_alone_is_one_component(train, states):

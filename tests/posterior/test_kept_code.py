@@ -9,7 +9,6 @@ from tests.posterior.arm import arm_data, arm_model
 from tests.posterior.test_predictor import CONTACTS, SHORT
 
 from forcegp.codegen.library import default_folder
-from forcegp.errors import NumericalWarning
 from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
 from forcegp.posterior import Posterior
@@ -106,12 +105,6 @@ def test_a_damaged_record_is_made_again(posterior, states):
         for found, value in zip(results(predictor, states), expected, strict=True):
             assert torch.equal(found, value)
         assert predictor.code.is_traced, damage
-
-
-def test_the_warning_of_a_small_rank_comes_each_time(posterior):
-    for _ in range(2):
-        with pytest.warns(NumericalWarning, match="rank 1 makes"):
-            posterior.predictor(tolerance=1e-9, largest_rank=1)
 
 
 def test_the_oldest_records_go(posterior, monkeypatch):

@@ -139,23 +139,6 @@ def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states):
         assert_close(found, expected)
 
 
-def test_gradients_of_the_covariance_are_differences_of_it(compressed, states):
-    predictor = compressed
-    state = [x[0] for x in states]
-    direction = [torch.linspace(-1.0, 1.0, 3, dtype=torch.float64) for _ in state]
-    moved = [x.clone().requires_grad_() for x in state]
-    slopes = torch.autograd.grad(predictor(*moved)[1].diagonal().sqrt().sum(), moved)
-    slope = sum(float(g @ d) for g, d in zip(slopes, direction, strict=True))
-    step = 1e-5
-
-    def spread(scale: float) -> float:
-        return float(
-            predictor(*(x + scale * d for x, d in zip(state, direction, strict=True)))[1].diagonal().sqrt().sum()
-        )
-
-    assert slope == pytest.approx((spread(step) - spread(-step)) / (2 * step), rel=1e-5)
-
-
 def test_the_compressed_covariance_is_never_below_the_exact_one(posterior, states):
     exact = posterior.predict(*states).covariance
     for rank in (1, 5, 20):
@@ -187,16 +170,6 @@ def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch)
     assert float((ratio / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt().max()) < 1.05
 
 
-def test_directions_found_in_blocks_are_nearly_as_few_as_the_best(posterior, monkeypatch):
-    ranks = {}
-    for directions in (10**6, 8):  # all at once: half of all singular vectors
-        monkeypatch.setattr("forcegp.inference.prepared_kernels.DIRECTIONS", directions)
-        predictor = posterior.predictor(compile=False)
-        assert float(predictor.inflation.max()) <= 0.01
-        ranks[directions] = predictor.rank
-    assert 2 < ranks[8] <= 1.2 * ranks[10**6]
-
-
 def test_many_states_are_one_by_one(compressed):
     predictor = compressed
     data = arm_data(3000, 3)  # more than one block
@@ -214,15 +187,6 @@ def test_a_copy_in_another_process_is_the_same(compressed, states):
     copied = pickle.loads(pickle.dumps(compressed))
     for found, expected in zip(copied(*states), compressed(*states), strict=True):
         assert torch.equal(found, expected)
-
-
-def test_predictions_without_a_graph_need_none(means, states):
-    assert not means.mean(*states).requires_grad
-    x = [part.clone().requires_grad_() for part in states]
-    with torch.no_grad():
-        assert not means.mean(*x).requires_grad
-    with pytest.raises(InvalidInput, match="first derivatives only"):
-        torch.autograd.grad(means.mean(*x).sum(), x, create_graph=True)
 
 
 TRANSFORMS = {
@@ -246,11 +210,6 @@ def test_transforms_are_refused_by_code_and_taken_by_torch(posterior, means, com
     assert_close(take(lambda y: eager.mean(y, v, u), q), means.linearize(q, v, u).da_dq)
     with pytest.raises(InvalidInput, match="linearize does not support transforms"):  # it would give zeros
         take(lambda y: eager.linearize(y, v, u).a, q)
-
-
-def test_rows_replace_vmap(means, states):
-    with pytest.raises(InvalidInput, match=r"transforms of torch\.func .*rows \(n, nv\)"):
-        torch.func.vmap(means.mean)(*states)
 
 
 def test_forward_mode_derivatives_are_not_lost(posterior, means, states):
@@ -310,7 +269,3 @@ def test_it_takes_what_another_engine_knows(states):
     predictor = posterior.predictor()
     assert (predictor.kind, predictor.rank, predictor.inflation) == ("exact", None, None)
     assert_close(predictor(*states)[1], posterior.predict(*states).covariance, 1e-9)
-
-
-def test_the_covariance_is_compressed_unless_another_is_asked_for(compressed, means):
-    assert (compressed.kind, means.kind) == ("compressed", "none")

@@ -139,7 +139,8 @@ def test_the_noise_is_learned(train):
     fitted = fit(
         train.model.with_forces(JointForces(), noise=Noise(0.2, learn=True)),
         train,
-        options=OptimizerOptions(iterations=80),
+        restarts=1,
+        options=OptimizerOptions(iterations=60),
     )
     assert np.allclose(fitted.noise_std.numpy(), NOISE, rtol=0.5)
 
@@ -158,17 +159,15 @@ def test_force_level_noise_widens_along_H(train, test):
 
 
 def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
-    options = OptimizerOptions(iterations=5)
+    options = OptimizerOptions(iterations=2)
     model = train.model.with_forces(JointForces())
-    three = fit(model, train, points=15, restarts=3, seed=7, options=options)
-    again = fit(model, train, points=15, restarts=3, seed=7, jobs=2, options=options)
-    more = fit(model, train, points=15, restarts=4, seed=7, options=options)
+    three = fit(model, train, points=8, restarts=3, seed=7, options=options)
+    again = fit(model, train, points=8, restarts=3, seed=7, jobs=2, options=options)
     values = three.settings["restart_objective"]
     assert len(set(values)) == 3
     assert three.result.value == min(values)
     assert np.allclose(again.settings["restart_objective"], values, rtol=1e-9)
-    assert np.allclose(more.settings["restart_objective"][:3], values, rtol=1e-12)
-    other = fit(model, train, points=15, restarts=2, seed=8, options=options)
+    other = fit(model, train, points=8, restarts=2, seed=8, options=options)
     assert other.settings["restart_objective"][0] == pytest.approx(values[0])
     assert other.settings["restart_objective"][1] != pytest.approx(values[1])
 
@@ -176,7 +175,7 @@ def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
 def test_the_hyperprior_can_be_left_out(train):
     model = train.model.with_forces(JointForces())
     options = OptimizerOptions(iterations=100)
-    plain = fit(model, train, points=20, restarts=4, hyperprior=False, options=options)
+    plain = fit(model, train, points=20, restarts=2, hyperprior=False, options=options)
     held = fit(model, train, points=20, restarts=1, options=options)
     assert plain.result.value == pytest.approx(plain.negative_log_likelihood, abs=1e-6)
     assert plain.negative_log_likelihood < held.negative_log_likelihood < held.result.value
@@ -191,14 +190,6 @@ def test_nothing_of_the_caller_changes(train):
     assert state == (torch.get_default_dtype(), torch.get_num_threads())
 
 
-def test_works_without_contacts():
-    model = arm_model(contacts=0)
-    train, test = arm_data(50, 3, model), arm_data(50, 4, model)
-    prediction = fit(model.with_forces(JointForces()), train, restarts=1, options=QUICK).predict(test.q, test.v, test.u)
-    assert prediction.multiplier.mean.shape == (50, 0)
-    assert np.abs(prediction.mean.numpy() - test.truth["a"]).mean() < 0.2
-
-
 def test_redundant_contacts_change_nothing(train, test):
     doubled = train.model.with_contacts(train.model.contacts * 2)
     options = OptimizerOptions(iterations=5)
@@ -210,20 +201,6 @@ def test_redundant_contacts_change_nothing(train, test):
     )
     assert torch.allclose(one.mean, two.mean, atol=1e-6)
     assert torch.allclose(two.multiplier.mean.sum(-1), one.multiplier.mean[:, 0], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"points": 61}, "points=61` must be an integer from 2 to 60, the rows"),
-        ({"points": 1}, "points=1"),
-        ({"restarts": 0}, "restarts=0"),
-        ({"seed": -1}, "seed=-1"),
-    ],
-)
-def test_bad_numbers_are_refused(train, change, message):
-    with pytest.raises(InvalidInput, match=message):
-        fit(train.model.with_forces(JointForces()), train, **change)
 
 
 def test_a_dataset_of_another_robot_is_refused(train):
@@ -252,15 +229,6 @@ def test_a_surface_that_most_rows_miss_is_pointed_out(train):
     data = Dataset(**mixed, time=np.arange(60.0), model=train.model, noise_std=train.noise_std)
     with pytest.warns(DataWarning, match=r"half of the training points .* rows in contact only"):
         fit(train.model.with_forces(JointForces()), data, restarts=1, options=OptimizerOptions(iterations=1))
-
-
-def test_parts_of_the_wrong_kind_are_named(train):
-    with pytest.raises(InvalidInput, match="model is a Robot; give a Model"):
-        fit(train.model.robot, train)
-    with pytest.raises(InvalidInput, match="Noise acceleration is 'loud'"):
-        train.model.with_forces(JointForces(), noise="loud")
-    assert train.model.with_forces(JointForces(), noise=0.2).noise == Noise(0.2)
-    assert Noise(np.array([0.1, 0.2])).acceleration == (0.1, 0.2)
 
 
 def test_a_fit_that_cannot_start_names_the_cause(train):

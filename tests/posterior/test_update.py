@@ -10,13 +10,12 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.errors import ContactError, DataWarning, InvalidInput, NotEnoughMemory
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies
+from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions, likelihood
 from forcegp.inference import memory as memory_module
 from forcegp.mechanics import Contact, Plane
 from forcegp.noise import Noise
 from forcegp.posterior import load_posterior, save_posterior
-from forcegp.robots import Robot
 
 QUICK = OptimizerOptions(iterations=8)
 
@@ -126,23 +125,6 @@ def test_what_is_kept_of_the_fit_are_its_numbers_by_the_parameters_own_meaning()
     assert grown.negative_log_likelihood == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
-def test_bodies_that_were_estimated():
-    data = arm_data(26, seed=4)
-    posterior = learned(data, 20, data.model.with_forces(RigidBodies(learn=("hand",)), JointForces()))
-    grown = posterior.update(data.rows(slice(20, 26)))
-    assert_same(grown, at_once(posterior, data), data)
-    assert grown.estimates is posterior.estimates
-
-
-def test_two_contacts():
-    data = on_two_planes(16, seed=5)
-    posterior = learned(data)
-    grown = posterior.update(data.rows(slice(12, 16)))
-    assert grown.latent.system.deflation.rank == 1
-    assert_same(grown, at_once(posterior, data), data)
-
-
 def test_the_order_of_updates_does_not_matter_and_variances_never_grow():
     data, test = arm_data(24, seed=6), arm_data(30, seed=7)
     posterior = learned(data)
@@ -154,19 +136,6 @@ def test_the_order_of_updates_does_not_matter_and_variances_never_grow():
     )
     assert torch.linalg.eigvalsh(before - between).min() > -1e-10
     assert torch.linalg.eigvalsh(between - after).min() > -1e-10
-
-
-def test_the_old_posterior_predicts_as_before():
-    data, test = arm_data(20, seed=8), arm_data(5, seed=9)
-    posterior = learned(data)
-    before = posterior.predict(test.q, test.v, test.u)
-    posterior.update(data.rows(slice(12, 20)))
-    posterior.update(data.rows(slice(12, 20)), budget=6)
-    after = posterior.predict(test.q, test.v, test.u)
-    assert torch.equal(before.mean, after.mean)
-    assert torch.equal(before.covariance, after.covariance)
-    assert len(posterior.training.q) == 12
-    assert posterior.training.reference is None
 
 
 @pytest.mark.parametrize("budget", [8, 12, 15])
@@ -227,13 +196,6 @@ def posterior():
 def test_budgets_that_mean_nothing_are_refused(posterior, budget):
     with pytest.raises(InvalidInput, match="must be an integer of at least 2"):
         posterior.update(arm_data(2, seed=17), budget)
-
-
-def test_other_joints_are_refused(posterior):
-    text = posterior.model.robot.urdf_text.replace('"pan"', '"swing"')
-    other = arm_data(3, seed=17, model=posterior.model.with_robot(Robot.from_urdf_text(text)))
-    with pytest.raises(InvalidInput, match="the joints of rows are swing, lift, bend"):
-        posterior.update(other)
 
 
 def test_rows_away_from_the_surface_are_refused(posterior):

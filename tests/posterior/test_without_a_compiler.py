@@ -79,16 +79,6 @@ def test_what_was_compiled_stays_and_what_cannot_be_is_done_by_torch(posterior, 
     torch.testing.assert_close(linear, posterior.predictor(covariance="none", compile=False).linearize(*states))
 
 
-def test_a_cache_that_others_may_write_to_is_not_used(posterior, states, tmp_path):
-    folder = tmp_path / "cache" / "forcegp" / "compiled"
-    folder.mkdir(parents=True)
-    folder.chmod(0o777)
-    with pytest.warns(NumericalWarning, match=SLOWER + ".*compiled can be written to by others.*chmod go-w"):
-        predictor = posterior.predictor(covariance="none")
-    assert list(folder.iterdir()) == []
-    torch.testing.assert_close(predictor.mean(*states), posterior.predict(*states).mean)
-
-
 def test_a_predictor_sent_to_a_process_without_compiler_works_there(posterior, states, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     predictor = posterior.predictor(covariance="none", compile=False)

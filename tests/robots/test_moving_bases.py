@@ -176,14 +176,6 @@ def test_integrate_and_difference(pair):
         close(back[k], pin.difference(pair.model, q, flipped[k])[pair.to_v], 10.0)
 
 
-def test_small_and_no_steps_come_back(pair):
-    for size in (0.0, 1e-9, 1e-4, 0.1, 0.5):  # turns below half a turn come back
-        step = size * pair.v
-        end = pair.robot.integrate(pair.q, step)
-        torch.testing.assert_close(pair.robot.difference(pair.q, end), step, rtol=1e-9, atol=1e-13)
-        torch.testing.assert_close(pair.robot.normalized(end), end, rtol=0, atol=1e-14)
-
-
 def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
     def moved(step, k):
         return pair.robot.forward_dynamics(pair.robot.integrate(pair.q[k], step), pair.v[k], pair.tau[k])
@@ -193,15 +185,6 @@ def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
         pin.computeABADerivatives(pair.model, pair.data, q, v, tau)
         found = torch.func.jacrev(moved)(torch.zeros(pair.robot.nv, dtype=torch.float64), k)
         close(found, pair.data.ddq_dq[order], 100.0)
-
-
-def test_a_compiled_robot_refuses_turns_of_other_length(pair, compiled):
-    if pair.robot.space.is_vector_space:
-        return
-    q = 1.01 * pair.q
-    for given in (q, q[0].contiguous(), q[0].float()):
-        with pytest.raises(InvalidInput, match="of length 1"):
-            compiled.mass_matrix(given)
 
 
 def test_the_chart_is_that_of_the_exponential(pair):

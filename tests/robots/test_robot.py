@@ -34,18 +34,6 @@ def test_joints_come_depth_first_and_branches_in_file_order(tree):
     assert tree.name == "tree"
 
 
-def test_joint_order_does_not_change_the_physics(tree):
-    # the same joints, with the branches in the other order
-    wrist = TREE.index('<joint name="right_shoulder"'), TREE.index('<joint name="left_shoulder"')
-    end = TREE.index('<joint name="left_gripper"')
-    swapped = Robot.from_urdf_text(TREE[: wrist[0]] + TREE[wrist[1] : end] + TREE[wrist[0] : wrist[1]] + TREE[end:])
-    assert swapped.joint_names[1] == "left_shoulder"
-    columns = [tree.joint_names.index(name) for name in swapped.joint_names]
-    q = torch.linspace(-1, 1, 6, dtype=torch.float64)
-    expected = tree.mass_matrix(q)[columns][:, columns]
-    torch.testing.assert_close(swapped.mass_matrix(q[columns]), expected, rtol=1e-13, atol=1e-13)
-
-
 def test_limits_damping_and_friction_are_visible(tree):
     torso = tree.joint("torso")
     assert (torso.type, torso.parent, torso.child) == ("revolute", "base", "body")
@@ -122,31 +110,6 @@ def test_robot_is_immutable_and_survives_pickling(chain):
 
 
 # ---------------------------------------------------------------------- batches
-
-
-@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (1, 1, 2), (0,), (3, 0)])
-def test_any_batch_shape(tree, batch):
-    q, v, a = torch.randn(3, *batch, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    n = tree.nv
-    shapes = {
-        (*batch, n, n): [tree.mass_matrix(q)],
-        (*batch, n): [
-            tree.bias_forces(q, v),
-            tree.gravity_forces(q),
-            tree.inverse_dynamics(q, v, a),
-            tree.forward_dynamics(q, v, a),
-        ],
-        (*batch, 4, 4): [tree.frame_pose(q, "lens"), tree.frame_pose(q, "base")],
-        (*batch, 6, n): [tree.frame_jacobian(q, "lens", (1.0, 0.0, 0.0)), tree.frame_jacobian(q, "base")],
-        (*batch, 6): [tree.frame_bias_acceleration(q, v, "lens"), tree.frame_bias_acceleration(q, v, "base")],
-    }
-    for shape, values in shapes.items():
-        for value in values:
-            assert value.shape == shape
-    # each state on its own gives the same
-    flat = tree.forward_dynamics(q, v, a).reshape(-1, n)
-    for i, state in enumerate(zip(*(x.reshape(-1, n) for x in (q, v, a)), strict=True)):
-        torch.testing.assert_close(flat[i], tree.forward_dynamics(*state), rtol=1e-11, atol=1e-11)
 
 
 def test_batches_broadcast(chain):
@@ -236,18 +199,6 @@ def test_wrong_inputs(chain, value, message):
             function(*arguments)
 
 
-def test_wrong_batches_points_and_parameters(chain):
-    two, three = torch.zeros(2, 4, dtype=torch.float64), torch.zeros(3, 4, dtype=torch.float64)
-    with pytest.raises(InvalidInput, match=r"do not broadcast: q \(2,\), v \(3,\)"):
-        chain.bias_forces(two, three)
-    with pytest.raises(InvalidInput, match=r"do not broadcast: the states \(2,\), tau \(3,\)"):
-        chain.forward_dynamics(two, two, three)
-    with pytest.raises(InvalidInput, match=r"point is .* give 3 finite numbers"):
-        chain.frame_jacobian(two, "tool", (1.0, 2.0))
-    with pytest.raises(InvalidInput, match=r"point has shape \(2,\)"):
-        chain.frame_jacobian(two, "tool", torch.zeros(2, dtype=torch.float64))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -272,15 +223,3 @@ def test_singular_mass_matrix_is_an_error():
     nowhere = nowhere * torch.nan
     with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
         Robot.from_urdf_text(body).forward_dynamics(nowhere, one, one)
-
-
-def test_constants_move_to_another_device(chain):
-    # the meta device computes shapes only; it is there on every machine
-    moved = chain.to("meta")
-    q = torch.zeros(5, 4, dtype=torch.float64, device="meta")
-    assert moved.device.type == "meta"
-    assert moved.mass_matrix(q).device.type == "meta"
-    assert moved.frame_jacobian(q, "tool", (0.0, 0.0, 0.1)).shape == (5, 6, 4)
-    assert chain.device.type == "cpu"
-    with pytest.raises(InvalidInput, match="q is on cpu but the robot on meta"):
-        moved.mass_matrix(torch.zeros(4, dtype=torch.float64))

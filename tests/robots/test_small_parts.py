@@ -6,25 +6,15 @@ import torch
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import MODELS
 
-from forcegp.errors import InvalidInput
 from forcegp.robots import Robot
-from forcegp.robots.arguments import locked_positions
 from forcegp.robots.inertia import (
-    inverse,
     pseudo_inertia_of_standard,
-    rotation_about,
     rotation_from_rpy,
     rpy_from_rotation,
     standard_of_pseudo_inertia,
-    transform,
 )
 
 LINK = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-
-
-def test_a_transform_times_its_inverse_is_the_identity():
-    pose = transform(rotation_about([0.6, 0.0, 0.8], 1.1), [1.0, -2.0, 3.0])
-    np.testing.assert_allclose(inverse(pose) @ pose, np.eye(4), atol=1e-14)
 
 
 def test_pseudo_inertia_of_standard_parameters():
@@ -70,12 +60,6 @@ def test_the_regressor_times_any_parameters_is_the_joint_force(model):
     expected = (mass @ a[..., None])[..., 0] + bias
     found = torch.einsum("...ikp,kp->...i", kinematics.torque_regressor(a), parameters)
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize("position", ["far", None, float("inf")])
-def test_a_locked_position_that_is_no_number_is_named(position):
-    with pytest.raises(InvalidInput, match=r"locked\['slide'\] is .*finite position"):
-        locked_positions({"slide": position})
 
 
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 2.5])

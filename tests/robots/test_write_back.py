@@ -8,7 +8,7 @@ import torch
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS, TREE, loaded
 
-from forcegp.errors import InvalidInput, UnknownJoint
+from forcegp.errors import UnknownJoint
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_dynamics
 
@@ -98,22 +98,3 @@ def test_dynamics_of_a_joint_are_replaced_or_added_and_nothing_else_changes(befo
     assert replace_dynamics(text, "one", {"damping": 0.1, "friction": 0.25}, source="a test") == expected
     with pytest.raises(UnknownJoint, match="a test: no joint 'two'"):
         replace_dynamics(text, "two", {"damping": 0.1}, source="a test")
-
-
-def test_the_original_robot_stays_as_it_is():
-    robot = Robot.from_urdf_text(CHAIN)
-    assert loaded(robot, "wrist").link("wrist").mass == pytest.approx(0.5 + 0.9, rel=1e-14)
-    assert robot.urdf_text == CHAIN
-    assert robot.to_urdf() == CHAIN
-
-
-def test_writing_where_no_folder_is(tmp_path):
-    with pytest.raises(InvalidInput, match=r"the folder .*nowhere does not exist; create it first"):
-        Robot.from_urdf_text(CHAIN).to_urdf(tmp_path / "nowhere" / "arm.urdf")
-
-
-def test_existing_file_is_replaced_whole(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text("x" * 100_000)
-    Robot.from_urdf_text(CHAIN).to_urdf(str(path))
-    assert path.read_text() == CHAIN

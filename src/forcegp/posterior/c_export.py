@@ -1,7 +1,7 @@
 """A fitted model as C99 that needs nothing but <math.h>: `export_c`.
 
 The program is that of a compiled predictor (`programs`) for one state, with its tables inside as constants; what
-is written (`c_files`) is compiled and compared with `posterior.predict` before the folder appears.
+is written is compiled and compared with `posterior.predict` before the folder appears.
 """
 
 import ctypes
@@ -215,7 +215,7 @@ def _plain(line: str) -> str:
 STATES = 300
 """States at which the program is compared."""
 MEAN_TOLERANCE, TABLE_TOLERANCE = 5e-12, 1e-7
-"""Largest difference relative to the largest value: of sums, unless `Predictor.rounding` is larger, and of tables."""
+"""Largest difference relative to the largest value: of sums, unless `rounding` is larger, and of tables."""
 LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3}
 """How many times as much as the mean these may differ: more cancels in them."""
 BETWEEN = ("linearize", "step", "step_jacobian")

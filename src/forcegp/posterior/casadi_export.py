@@ -19,7 +19,7 @@ from torch import Tensor
 from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.codegen.tracing import trace
-from forcegp.errors import MissingExtra, NumericalError, require_type
+from forcegp.errors import NumericalError, require_type, required_extra
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.integration import integrator_named
@@ -50,12 +50,7 @@ def casadi_function(
     Raises MissingExtra without CasADi, InvalidInput for other models than structured ones, for operations that no
     graph holds, steps that are no positive number, and other integrators.
     """
-    try:
-        import casadi
-    except ImportError:
-        raise MissingExtra(
-            "casadi_function needs CasADi, which is not installed; pip install 'forcegp[casadi]'."
-        ) from None
+    casadi: Any = required_extra("casadi", "casadi", "casadi_function")
     require_type("posterior", posterior, Posterior)
     code = posterior.programs()
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
@@ -90,8 +85,7 @@ def export_casadi(
     """
     called = identifier(name or posterior.model.robot.name)
     functions = {called: casadi_function(posterior, name=called)}
-    import casadi  # it is there, or the line above has raised
-
+    casadi: Any = required_extra("casadi", "casadi", "export_casadi")
     rows = rows_for(posterior.training, posterior.trained, posterior.model)
     q, v, u = sample_states(rows, posterior.model.robot.space, STATES, 2, STATES // 3)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}

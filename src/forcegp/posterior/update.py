@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -34,8 +34,13 @@ OTHER_NOISE = 0.1
 """Part of the fit's level of noise by which rows may state another one without a warning."""
 
 
-def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None) -> Structured:
-    """What `Posterior.update` documents without a horizon."""
+def learn_more_rows(
+    posterior: Structured,
+    rows: Dataset,
+    budget: int | None,
+    keep: Callable[[ExactPosterior, int], Tensor] = rows_to_keep,
+) -> Structured:
+    """What `Posterior.update` documents without a horizon; `keep` gives the numbers of the rows that stay."""
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
     budget = None if budget is None else whole_number("budget", budget, 2)
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)
@@ -50,7 +55,7 @@ def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None) ->
             latent = with_rows(latent, Terms([z[part] for z in features], W[part], residual[part], variance[part]))
             training = _joined(training, _selected(added, part))
             if budget is not None and len(training.q) > budget:
-                kept = rows_to_keep(latent, budget)
+                kept = keep(latent, budget)
                 latent, training = with_only(latent, kept), _selected(training, kept)
     likelihood = replace(more, training=replace(training, reference=reference))
     changes = {"points": len(latent.system.alpha), "budget": budget}
