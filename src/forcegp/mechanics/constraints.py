@@ -66,6 +66,11 @@ class LoopClosure(Contact):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not isinstance(self.second_frame, str) or not isinstance(self.surface, Held):
+            raise InvalidInput(
+                f"LoopClosure of {self.frame!r} has the second frame {self.second_frame!r} and the surface "
+                f"{self.surface!r}; give the name of a link, and Held(axis), or use loop_point."
+            )
         meaning = f" x, y, z in m, in frame {self.second_frame!r}"
         point = finite_vector("LoopClosure second_point", self.second_point, 3, meaning)
         object.__setattr__(self, "second_point", tuple(point.tolist()))
@@ -164,6 +169,9 @@ class RollingContact(Contact):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not isinstance(self.surface, Held | Plane):
+            kind = type(self.surface).__name__
+            raise InvalidInput(f"RollingContact surface is a {kind}; give a Plane or Held, or use rolling(...).")
         object.__setattr__(self, "radius", positive("RollingContact radius", self.radius))
         object.__setattr__(self, "normal", direction("RollingContact normal", self.normal)[0])
         if self.axis is not None:
