@@ -45,7 +45,7 @@ from forcegp.errors import (
 from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.manifold import MOTIONS, Group
 from forcegp.robots.problems import Problems
-from forcegp.robots.urdf import FREE, MOVABLE, JointDescription, RobotDescription, free_joint
+from forcegp.robots.urdf import FREE, MOVABLE, Joint, RobotDescription, free_joint
 
 BaseChoice = Literal["fixed", "floating", "planar", "spherical"]
 """How the root link is held: "fixed" in the world, free, free in the plane z = 0, or free to turn about its origin."""
@@ -134,7 +134,7 @@ def followed(
     return held, drives
 
 
-def _objection(source: str, joint: JointDescription, at: JointDescription, found: bool) -> UnsupportedJoint:
+def _objection(source: str, joint: Joint, at: Joint, found: bool) -> UnsupportedJoint:
     """Why a joint cannot be followed to one with a coordinate: at the last one passed."""
     last = (joint if found else at).mimics
     seen = f"{source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
@@ -143,10 +143,10 @@ def _objection(source: str, joint: JointDescription, at: JointDescription, found
 
 
 def with_followers(
-    joints: Mapping[str, JointDescription],
-    bodies: Sequence[JointDescription],
+    joints: Mapping[str, Joint],
+    bodies: Sequence[Joint],
     drives: Mapping[str, tuple[str, float, float]],
-) -> tuple[JointDescription, ...]:
+) -> tuple[Joint, ...]:
     """The joints with damping and dry friction of those that follow them: factors of multiplier^2 and |multiplier|."""
     whole = dict(joints)
     for body in bodies:
@@ -182,9 +182,9 @@ class Placement:
 class Layout:
     """The tree as plain Python: movable joints in order, the parent body of each, and the placement of every link."""
 
-    bodies: tuple[JointDescription, ...]  # the joint that moves each body
+    bodies: tuple[Joint, ...]  # the joint that moves each body
     drives: tuple[Drive, ...]  # the row of G and the entry of g of each body
-    joints: tuple[JointDescription, ...]  # those with a coordinate of their own
+    joints: tuple[Joint, ...]  # those with a coordinate of their own
     parents: tuple[int, ...]
     origins: tuple[np.ndarray, ...]  # body frame at q = 0 in the parent body's frame
     links: dict[str, Placement]
@@ -247,7 +247,7 @@ def lay_out(
     _check_locked(description, locked)
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)
-    bodies: list[JointDescription] = []
+    bodies: list[Joint] = []
     parents: list[int] = []
     origins: list[np.ndarray] = []
     groups: list[Group] = []
@@ -317,7 +317,7 @@ def lay_out(
     )
 
 
-def _rows_of(joint: JointDescription) -> list[JointDescription]:
+def _rows_of(joint: Joint) -> list[Joint]:
     """A joint of several degrees of freedom as one for each, called "base.x", "base.rz" and so on."""
     kinds = {each: "continuous" if each.startswith("r") else "prismatic" for each in MOTIONS[joint.type].velocities}
     return [replace(joint, name=f"{joint.name}.{each}", type=kind) for each, kind in kinds.items()]
@@ -335,11 +335,11 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
             )
 
 
-def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[JointDescription]]]:
+def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:
     """Root link and the joints below each link; :class:`KinematicLoop` where the joints form no single tree."""
     source = description.source
-    above: dict[str, JointDescription] = {}
-    children: dict[str, list[JointDescription]] = {link: [] for link in description.links}
+    above: dict[str, Joint] = {}
+    children: dict[str, list[Joint]] = {link: [] for link in description.links}
     for joint in description.joints:
         if joint.child in above:
             raise KinematicLoop(
@@ -374,7 +374,7 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[JointDe
     return roots[0], children
 
 
-def joint_motion(joint: JointDescription, position: float) -> np.ndarray:
+def joint_motion(joint: Joint, position: float) -> np.ndarray:
     """How a joint that stands still is displaced, (4, 4)."""
     if not position:
         return np.eye(4)

@@ -1,7 +1,7 @@
 """What a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from forcegp.robots.arguments import JointValues, Positions, checked_tensor
 from forcegp.robots.layout import WORLD, BaseChoice, Layout
 from forcegp.robots.manifold import ConfigurationSpace, pose
 from forcegp.robots.tree import Tree
-from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
+from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
 
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
@@ -116,11 +116,10 @@ class RobotStructure(Summary):
     @property
     def joints(self) -> tuple[Joint, ...]:
         """Movable joints in the order of v, without those that mimic one; one for each degree of freedom."""
-        names = [field.name for field in fields(Joint)]
-        return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
+        return self.layout.joints
 
     @property
-    def all_joints(self) -> tuple[JointDescription, ...]:
+    def all_joints(self) -> tuple[Joint, ...]:
         """Every joint of the file, fixed ones included, parents before children."""
         places = {name: place for place, name in enumerate(self.layout.links)}
         return tuple(sorted(self.description.joints, key=lambda joint: places[joint.child]))

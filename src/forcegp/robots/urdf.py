@@ -9,7 +9,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
@@ -136,11 +136,20 @@ class InertialDescription:
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """A joint moves with another: ``q = multiplier q_other + offset``, in rad or m."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
 class Joint:
-    """A movable joint. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
+    """One ``<joint>``. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
 
     name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic'
+    type: str  # 'revolute' | 'continuous' | 'prismatic', of a file also 'fixed' and those of `FREE`
     parent: str
     child: str
     axis: tuple[float, float, float]  # unit vector in the joint frame
@@ -150,29 +159,14 @@ class Joint:
     effort_limit: float
     damping: float  # Nms/rad or Ns/m
     friction: float  # Nm or N
-
-
-@dataclass(frozen=True)
-class Mimic:
-    """A joint moves with another: ``q = multiplier q_other + offset``, in rad or m."""
-
-    joint: str
-    multiplier: float
-    offset: float
-
-
-@dataclass(frozen=True, eq=False)
-class JointDescription(Joint):
-    """One ``<joint>``, which may also be fixed or free; ``origin`` (4, 4) places it in its parent link."""
-
-    origin: np.ndarray
+    origin: np.ndarray = field(compare=False)  # (4, 4), places it in its parent link
     mimics: Mimic | None
 
 
-def free_joint(name: str, kind: str, parent: str, child: str) -> JointDescription:
+def free_joint(name: str, kind: str, parent: str, child: str) -> Joint:
     """A joint without limits and friction, at the origin of its parent; one that is planar moves along x and y."""
     limits = (-math.inf, math.inf, math.inf, math.inf)
-    return JointDescription(name, kind, parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
+    return Joint(name, kind, parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
 
 
 @dataclass(frozen=True)
@@ -182,7 +176,7 @@ class RobotDescription:
     name: str
     source: str
     links: dict[str, InertialDescription | None]
-    joints: tuple[JointDescription, ...]
+    joints: tuple[Joint, ...]
     complete: bool = True
     """Whether every joint of the file could be read."""
 
@@ -359,9 +353,7 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
     return InertialDescription(mass, origin[:3, 3], 0.5 * (about_center + about_center.T))
 
 
-def _joint(
-    element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place
-) -> JointDescription:
+def _joint(element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place) -> Joint:
     kind = _attribute(element, "type", place)
     kinds = (*MOVABLE, "fixed", *FREE)
     if kind not in kinds:
@@ -404,7 +396,7 @@ def _joint(
     mimic = _optional_child(element, "mimic", place)
     if mimic is not None and kind == "fixed":
         place.problems.note("the <mimic> of a fixed joint is ignored", place.owner)
-    return JointDescription(
+    return Joint(
         name=name,
         type=kind,
         parent=ends["parent"],
