@@ -342,7 +342,7 @@ class Predictor(Summary):
             latents = Gaussian(latents.mean, spread)
         affine = posterior.acceleration_map(dynamics)[0]
         found = latents.through(affine.matrix @ prior.direction(dynamics), affine.offset)
-        return found.mean, found.covariance
+        return found.mean, found.covariance  # type: ignore[return-value]  # it was asked for
 
     def _at_one(self, kind: str, program: RowFunction, state: Sequence[Tensor]) -> list[Tensor]:
         """The same at what `_one_state` gave, whose numbers are checked on the way."""

@@ -220,6 +220,7 @@ def roll_out(
     q, v, forces, batch = checked_start(model.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
+    counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
 
     def run(copies: int, what: str, before: int) -> Rollout:
         shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
@@ -230,7 +231,7 @@ def roll_out(
             loops = _loops(posterior, model, integrator, steps, copies, seed)
         if loops is None:
             control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
-            report = None if progress is None else lambda done, _: progress(before + done, total)
+            report = None if counted is None else counted(before)
             motion = integrate(*given, feedback=control, what=what, progress=report)
         else:
             motion = fused(loops, *given, what=what)

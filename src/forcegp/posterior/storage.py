@@ -139,7 +139,8 @@ def _model(urdf: Path, stored: Mapping[str, Any]) -> Model:
 
 
 def _rows(prefix: str, tensors: Mapping[str, torch.Tensor]) -> TrainingData:
-    return TrainingData(**{name: tensors[prefix + name] for name in ROWS if prefix + name in tensors})
+    given: dict[str, Any] = {name: tensors[prefix + name] for name in ROWS if prefix + name in tensors}
+    return TrainingData(**given)
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -398,8 +398,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return self.space.normalized(q).to(self.device)
 
     @override
-    def _dynamics(self, function: str, q: Tensor, v: Tensor | None = None, *more: Tensor) -> Any:
-        return getattr(self.kinematics(q, v), function)(*more)
+    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+        return getattr(self.kinematics(*arguments[:2]), function)(*arguments[2:])
 
     def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
