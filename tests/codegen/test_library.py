@@ -13,15 +13,6 @@ from forcegp.errors import CompilerError, InvalidInput
 SOURCE = "double twice(double x) { return x + x; }"
 
 
-@pytest.fixture
-def broken_linker(tmp_path) -> str:
-    """A command that takes everything, ends well, and writes what no system can load."""
-    path = tmp_path / "broken"
-    path.write_text('#!/bin/sh\nwhile [ "$1" != -o ]; do shift; done\necho "no library" > "$2"\n')
-    path.chmod(0o700)
-    return str(path)
-
-
 def test_a_text_becomes_a_library(tmp_path):
     path = tmp_path / "code.so"
     options = ("-fPIC", "-shared")

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from tests.mechanics.systems import assert_close, model_with, normal, robot, states, surfaces
+from tests.mechanics.systems import model_with, normal, robot, states, surfaces
 from tests.robots.robot_models import FRAMES, TREE, loaded
 
 from forcegp.errors import ContactError, InvalidInput, NumericalError, UnknownFrame
@@ -49,20 +49,6 @@ def assert_same_dynamics(one: Model, other: Model) -> None:
 # ---------------------------------------------------------------- what it holds
 
 
-def test_other_contacts_and_other_robots():
-    built = complete()
-    free = built.with_contacts([])
-    assert free.contacts == ()
-    assert free.baumgarte == built.baumgarte
-    assert len(built.contacts) == 3
-    heavier = built.with_robot(built.robot.with_armature([1.0] * built.robot.nv))
-    arguments = states(built.robot.nv, 3)
-    expected = built.dynamics(*arguments).M - torch.diag(built.robot.armature) + torch.eye(built.robot.nv).double()
-    assert_close(heavier.dynamics(*arguments).M, expected, 1e-12)
-    with pytest.raises(InvalidInput, match="chain has 4 joints"):
-        built.with_robot(robot("chain"))
-
-
 # ---------------------------------------------------------------- parts that do not fit
 
 
@@ -76,23 +62,6 @@ def test_other_contacts_and_other_robots():
 def test_contacts_that_do_not_fit_the_robot(contact, error, message):
     with pytest.raises(error, match=message):
         Model(robot("chain"), (contact,))
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ({"contacts": (FLOOR,)}, "contacts is .*; give a sequence of Contact objects"),
-        ({"contacts": Contact("tool", (0.0, 0.0, 0.0), FLOOR)}, "give a sequence of Contact objects"),
-        ({"contacts": None}, "contacts is None"),
-        ({"forces": (Actuation,)}, "forces is .*; give a sequence of Force objects"),
-        ({"forces": Actuation()}, "give a sequence of Force objects"),
-        ({"forces": ("actuation",)}, "give a sequence of Force objects"),
-    ],
-    ids=str,
-)
-def test_parts_of_the_wrong_kind(parts, message):
-    with pytest.raises(InvalidInput, match=message):
-        Model(robot("chain"), **parts)
 
 
 @pytest.mark.parametrize(
@@ -110,16 +79,6 @@ def test_parts_of_the_wrong_kind(parts, message):
 def test_states_of_wrong_shape_are_never_stretched(shapes, message):
     with pytest.raises(InvalidInput, match=message):
         Model(robot("chain")).dynamics(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
-
-
-def test_states_of_wrong_type():
-    good = torch.zeros(4, dtype=torch.float64)
-    for bad in (good.bool(), good.numpy(), [0.0] * 4):
-        for position in range(3):
-            arguments = [good] * 3
-            arguments[position] = bad
-            with pytest.raises(InvalidInput, match=f"^{'qvu'[position]} (is|must be)"):
-                Model(robot("chain")).dynamics(*arguments)
 
 
 # ---------------------------------------------------------------- states that contacts cannot hold

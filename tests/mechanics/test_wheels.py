@@ -159,22 +159,6 @@ def test_a_differential_drive_is_the_unicycle(base):
             assert float(force[0] + force[3] + force[6]) == pytest.approx(weight, rel=1e-9)
 
 
-def test_a_ball_rolls_down_a_slope_with_five_sevenths():
-    r, m = 0.1, 3.0
-    sphere = (
-        f'<robot name="ball"><link name="ball">{INERTIAL.format("0 0 0", m, *3 * [0.4 * m * r * r])}</link></robot>'
-    )
-    robot = Robot.from_urdf_text(sphere, base="floating")
-    slope = Plane((math.sin(0.3), 0.0, math.cos(0.3)), 0.0)
-    model = Model(robot, rolling("ball", r, None, ground=slope))
-    q = robot.neutral()
-    q[:3] = r * torch.tensor(slope.normal)
-    a = model.dynamics(q, torch.zeros(6).double(), torch.zeros(0).double())
-    down = torch.tensor([math.cos(0.3), 0.0, -math.sin(0.3)]).double()
-    torch.testing.assert_close(a.acceleration_map().offset[:3], 5.0 / 7.0 * 9.81 * math.sin(0.3) * down)
-    assert float(a.multiplier_map().offset[0]) == pytest.approx(m * 9.81 * math.cos(0.3))
-
-
 def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     """A coin that wobbles: the fourth-order method on the manifold, kinetic and potential energy."""
     robot = Robot.from_urdf_text(DISC, base="floating")

@@ -163,30 +163,6 @@ def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete,
     assert "differs by" in broken.stdout
 
 
-@pytest.mark.skipif(not shutil.which("cmake"), reason="needs CMake")
-def test_cmake_builds_and_tests(complete, tmp_path):
-    for command in (["-S", str(complete), "-B", "."], ["--build", "."]):
-        done = subprocess.run(["cmake", *command], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-    assert subprocess.run(["ctest"], cwd=tmp_path, capture_output=True, check=False).returncode == 0
-    assert (tmp_path / "libarm.a").exists()
-
-
-def test_the_program_allocates_nothing_and_keeps_nothing(complete):
-    text = (complete / "arm.c").read_text()
-    assert set(line for line in text.splitlines() if line.startswith("#include")) == {
-        '#include "arm.h"',
-        "#include <math.h>",
-        "#include <string.h>",
-    }
-    subprocess.run(["cc", *STRICT, "-c", "arm.c", "-o", "arm.o"], cwd=complete, check=True)
-    symbols = subprocess.run(["nm", "arm.o"], cwd=complete, capture_output=True, text=True, check=True).stdout
-    kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
-    assert not [name for name, kind in kinds.items() if kind in "bBDC"]  # nothing that could be written to
-    outside = {name for name, kind in kinds.items() if kind == "U"}
-    assert not outside & {"malloc", "calloc", "realloc", "free"}
-
-
 def test_what_is_not_finite_is_reported(library, states):
     q, v, u = (x[0].copy() for x in states)
     v[1] = np.nan
@@ -210,24 +186,6 @@ def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states
     assert np.isnan(v).any()
     assert "arm_STEP_NOT_FOUND = 8" in (tmp_path / "arm" / "arm.h").read_text()
     assert call(step, [3, 3], states[0][0], [1e200, 0.0, 0.0], states[2][0])[0] == 4
-
-
-def test_casadi_loads_it_with_derivatives(complete, library, posterior, states):
-    casadi = pytest.importorskip("casadi")
-    reference = posterior.predictor(covariance="none", compile=False)
-    q, v, u = (x[2] for x in states)
-    path = str(complete / "lib.so")
-    a = casadi.external("arm_acceleration", path)
-    np.testing.assert_allclose(a(q, v, u).full()[:, 0], reference.mean(q, v, u), rtol=1e-11)
-    following = casadi.external("arm_next", path)
-    x, w = casadi.MX.sym("x", 6), casadi.MX.sym("u", 3)
-    jacobian = casadi.Function("J", [x, w], [casadi.jacobian(following(x, w), casadi.vertcat(x, w))])
-    linear = reference.linearize_step(q, v, u, DT, "rk4")
-    found = jacobian(np.concatenate([q, v]), u).full()
-    np.testing.assert_allclose(found, torch.cat([linear.A, linear.B], -1), rtol=1e-9, atol=1e-9)
-    by_v = casadi.Function("D", [x, w], [casadi.jacobian(a(x[:3], x[3:], w), x)])
-    slopes = reference.linearize(q, v, u).da_dv
-    np.testing.assert_allclose(by_v(np.concatenate([q, v]), u).full()[:, 3:], slopes, rtol=1e-9, atol=1e-9)
 
 
 ACADOS = """#pragma once
@@ -357,24 +315,6 @@ def test_a_branch_on_values_is_an_error_everywhere(how, tmp_path, states):
     torch.testing.assert_close(found, model.predict(*states).mean)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"steps": float("nan")}, "dt is nan; give the time step as a positive number"),
-        ({"steps": -0.1}, "dt is -0.1; give the time step as a positive number"),
-        ({"steps": 0.0}, "dt is 0.0; give the time step as a positive number"),
-        ({"steps": DT, "integrator": "rk5"}, "integrator 'rk5'"),
-        (
-            {"steps": DT, "integrator": "projected"},
-            "an exported step is not 'projected'; give one of 'symplectic-euler'",
-        ),
-    ],
-)
-def test_steps_that_cannot_be_exported(posterior, tmp_path, options, message):
-    with pytest.raises(InvalidInput, match=message):
-        export_c(posterior, tmp_path / "arm", **options)
-
-
 def test_measured_torques_are_refused(tmp_path):
     measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
     with pytest.raises(InvalidInput, match="a program is for commanded torques"):
@@ -410,3 +350,13 @@ def test_a_state_outside_of_a_table_is_reported(tmp_path):
     bits, (a,) = call(mean, [3], [0.3] * 3, [1e3] * 3, [0.0] * 3)
     assert bits == 4
     assert np.isnan(a).all()
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(not shutil.which("cmake"), reason="needs CMake")
+def test_cmake_builds_and_tests(complete, tmp_path):
+    for command in (["-S", str(complete), "-B", "."], ["--build", "."]):
+        done = subprocess.run(["cmake", *command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert subprocess.run(["ctest"], cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert (tmp_path / "libarm.a").exists()

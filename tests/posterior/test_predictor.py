@@ -3,10 +3,9 @@
 import pickle
 import warnings
 
-import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import Weight, arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model
 from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
@@ -102,25 +101,6 @@ def test_it_is_predict_with_any_prior(states, model):
     check(fitted(model), states)
 
 
-def test_constant_kernels_have_no_slopes_of_their_own(states):
-    posterior = fitted(arm_model().with_forces(Weight()))
-    predictor = posterior.predictor(covariance="exact")
-    # the mean of a constant is k sum_i beta_i, whose terms of 1e8 cancel to 1e-2: each rounds to eps of itself, and the
-    # factor 10 stands for the operations on the way
-    variances = torch.stack(
-        [K[0, 0] for K in posterior.kernels.matrices(posterior.hyperparameters, posterior.latent.features)]
-    )
-    dynamics = posterior.model.dynamics(*states)
-    response = (dynamics.H @ posterior.model.unknown.direction(dynamics)).abs()
-    terms = response @ (variances * posterior.latent.system.beta.abs().sum(0))
-    error = (predictor.mean(*states) - posterior.predict(*states).mean).abs()
-    assert bool((error <= 10.0 * torch.finfo(torch.float64).eps * terms).all())
-    x = tuple(part.clone().requires_grad_() for part in states)
-    slopes = torch.autograd.grad(predictor.mean(*x)[:, 1].sum(), x)
-    for found, slope in zip(predictor.linearize(*states)[1:], slopes, strict=True):
-        assert_close(found[:, 1], slope, 1e-6)
-
-
 def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states):
     compiled = posterior.predictor(tolerance=100.0)
     eager = posterior.predictor(tolerance=100.0, compile=False)
@@ -168,19 +148,6 @@ def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch)
     rows = posterior.training
     ratio = predictor(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
     assert float((ratio / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt().max()) < 1.05
-
-
-def test_many_states_are_one_by_one(compressed):
-    predictor = compressed
-    data = arm_data(3000, 3)  # more than one block
-    mean, covariance = predictor(data.q, data.v, data.u)
-    assert mean.shape == (3000, 3)
-    assert covariance.shape == (3000, 3, 3)
-    for row in (0, 1499, 2999):
-        alone = predictor(*(np.array(x[row]) for x in (data.q, data.v, data.u)))
-        assert_close(alone[0], mean[row])
-        assert_close(alone[1], covariance[row], 1e-9)
-    assert predictor.mean(data.q[:0], data.v[:0], data.u[:0]).shape == (0, 3)
 
 
 def test_a_copy_in_another_process_is_the_same(compressed, states):

@@ -91,15 +91,6 @@ def test_means_and_covariances_are_those_of_predict(floating, covariance):
         close(found, expected.covariance, 1e-5)
 
 
-def test_forces_and_what_they_act_on(floating):
-    posterior, *states = floating
-    ours, theirs = (posterior.predictor(covariance="none", compile=how).joint_forces(*states) for how in (True, False))
-    for found, expected in zip(ours, theirs, strict=True):
-        close(found, expected)
-    one = posterior.predictor(covariance="none").joint_forces(*(x[5] for x in states))
-    close(one[0], theirs[0][5])
-
-
 def test_derivatives_are_those_in_a_step_from_q(case):
     posterior, q, v, u = case
     space, size = posterior.model.robot.space, 1e-5

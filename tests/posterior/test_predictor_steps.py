@@ -132,15 +132,6 @@ def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     assert alone.covariance.shape == (3, 3)
 
 
-def test_the_covariance_of_u_is_that_of_the_unknown_force_where_it_does_not_depend_on_u(states):
-    posterior = fitted(JointFriction())
-    u = posterior.predictor(covariance="exact", compile=False).inverse_dynamics(*states, [5.0])  # any acceleration
-    expected = posterior.predict(*states[:2], u.mean).unknown_force.covariance
-    torch.testing.assert_close(u.covariance, expected, rtol=1e-9, atol=1e-12)
-    means = posterior.predictor(covariance="none", compile=False)
-    assert means.inverse_dynamics(*states).covariance is None
-
-
 def test_inverse_dynamics_refuses_what_it_cannot_solve(smooth, states):
     predictor = smooth.predictor(covariance="none", compile=False)
     with pytest.raises(InvalidInput, match=r"normal_force has shape \(2,\); give \(1,\) or \(4, 1\)"):

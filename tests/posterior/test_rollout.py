@@ -66,18 +66,6 @@ def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posteri
         assert rollout.baumgarte == baumgarte
 
 
-def test_batches_lead_and_broadcast(posterior, start):
-    q, v, u = start
-    many = posterior.rollout(q[:, None], v[:, None], u[0].expand(3, -1, -1), DT)
-    assert many.q.shape == many.v.shape == (2, 3, STEPS + 1, 3)
-    assert many.a.shape == (2, 3, STEPS, 3)
-    assert many.constraint.shape == many.velocity_constraint.shape == (2, 3, STEPS + 1, 1)
-    assert many.diverged_at.shape == (2, 3)
-    alone = posterior.rollout(q[1].tolist(), v[1].numpy(), u[0], DT)
-    assert alone.q.shape == (STEPS + 1, 3)
-    torch.testing.assert_close(many.q[1, 2], alone.q, rtol=0, atol=1e-12)
-
-
 def test_the_constraint_is_that_of_the_contacts_and_projection_keeps_it(posterior, start):
     q, v, u = start
     contact, robot = posterior.model.contacts[0], posterior.model.robot
@@ -165,20 +153,6 @@ def test_wrong_arguments_are_named(posterior, start, changed, message):
     arguments = {"q0": q, "v0": v, "u": u, "dt": DT} | changed
     with pytest.raises(InvalidInput, match=message):
         posterior.rollout(**arguments)
-
-
-def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, start):
-    q, v, u = start
-    rollout = posterior.rollout(q, v, u[:, :1], DT)
-    for ask in (rollout.std, rollout.quantiles):
-        with pytest.raises(InvalidInput, match="this rollout has 0 samples"):
-            ask()
-    with pytest.raises(InvalidInput, match="quantile levels"):
-        rollout.quantiles((1.5,))
-    free = fit(arm_model(0).with_forces(JointForces()), arm_data(20, 1, arm_model(0)), points=10, **QUICK)
-    with pytest.raises(InvalidInput, match="has no contacts; give baumgarte=None"):
-        free.rollout(q, v, u, DT, baumgarte=Baumgarte(1.0))
-    assert free.rollout(q, v, u, DT, integrator="projected").constraint.shape == (2, STEPS + 1, 0)
 
 
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "projected"])

@@ -6,7 +6,7 @@ import torch
 from tests.posterior.arm import NOISE, URDF, arm_data, arm_model
 
 from forcegp.data import Dataset
-from forcegp.errors import ContactError, DataWarning, FitError, InvalidInput
+from forcegp.errors import ContactError, DataWarning, InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
@@ -103,28 +103,6 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
     assert torch.allclose(prediction.covariance, posterior.widening**2 * covariance, atol=1e-8)
 
 
-def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
-    states = [torch.tensor(x[:6]) for x in (test.q, test.v, test.u)]
-    flat = posterior.predict(*states)
-    batched = posterior.predict(*(x.reshape(2, 3, 3) for x in states))
-    torch.testing.assert_close(batched.mean.reshape(6, 3), flat.mean, rtol=1e-10, atol=1e-10)
-    assert batched.covariance.shape == (2, 3, 3, 3)
-    assert batched.multiplier.mean.shape == (2, 3, 1)
-    single = posterior.predict(*(x[0] for x in states))
-    assert single.mean.shape == (3,)
-    assert torch.allclose(single.mean, flat.mean[0], atol=1e-12)
-    assert posterior.predict(*(x[:0] for x in states)).mean.shape == (0, 3)
-    monkeypatch.setattr("forcegp.posterior.posterior.ROWS_PER_BLOCK", 4)
-    assert torch.allclose(posterior.predict(*states).covariance, flat.covariance, atol=1e-12)
-    assert posterior.predict(*states, covariance=False).covariance is None
-
-    def mean_of(q, v, u):
-        return posterior.predict(q, v, u, covariance=False).mean
-
-    point = tuple(x[0].requires_grad_() for x in states)
-    assert torch.autograd.gradcheck(mean_of, point, atol=1e-6)
-
-
 def test_zero_mean_carries_the_known_forces_in_the_processes(train, test):
     zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=QUICK)
     states = tuple(map(torch.tensor, (test.q, test.v, test.u)))
@@ -190,19 +168,6 @@ def test_nothing_of_the_caller_changes(train):
     assert state == (torch.get_default_dtype(), torch.get_num_threads())
 
 
-def test_redundant_contacts_change_nothing(train, test):
-    doubled = train.model.with_contacts(train.model.contacts * 2)
-    options = OptimizerOptions(iterations=5)
-    one = fit(train.model.with_forces(JointForces()), train, points=20, restarts=1, options=options).predict(
-        test.q, test.v, test.u
-    )
-    two = fit(doubled.with_forces(JointForces()), train, points=20, restarts=1, options=options).predict(
-        test.q, test.v, test.u
-    )
-    assert torch.allclose(one.mean, two.mean, atol=1e-6)
-    assert torch.allclose(two.multiplier.mean.sum(-1), one.multiplier.mean[:, 0], atol=1e-6)
-
-
 def test_a_dataset_of_another_robot_is_refused(train):
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
     with pytest.raises(InvalidInput, match="dataset are pan, lift, bend, those of the robot yaw, lift, bend"):
@@ -229,19 +194,6 @@ def test_a_surface_that_most_rows_miss_is_pointed_out(train):
     data = Dataset(**mixed, time=np.arange(60.0), model=train.model, noise_std=train.noise_std)
     with pytest.warns(DataWarning, match=r"half of the training points .* rows in contact only"):
         fit(train.model.with_forces(JointForces()), data, restarts=1, options=OptimizerOptions(iterations=1))
-
-
-def test_a_fit_that_cannot_start_names_the_cause(train):
-    broken = train.rows(slice(0, 10))
-    huge = Dataset(
-        **{
-            name: getattr(broken, name)
-            for name in ("q", "v", "u", "time", "joint_names", "units", "model", "noise_std")
-        },
-        a=np.full((10, 3), 1e200),
-    )
-    with pytest.raises(FitError, match="none of 2 restarts"):
-        fit(train.model.with_forces(JointForces()), huge, restarts=2)
 
 
 def test_states_that_make_no_sense_are_refused(posterior, test):

@@ -1,19 +1,17 @@
 """`posterior.update`: against conditioning on all rows at once, with the standardization of the fit."""
 
 import dataclasses
-import warnings
 
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data
 
 from forcegp.errors import ContactError, DataWarning, InvalidInput, NotEnoughMemory
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions, likelihood
 from forcegp.inference import memory as memory_module
-from forcegp.mechanics import Contact, Plane
 from forcegp.noise import Noise
 from forcegp.posterior import load_posterior, save_posterior
 
@@ -59,21 +57,6 @@ def assert_same(one, other, data, tolerance=1e-8):
 
 def uneven_noise(data):
     return dataclasses.replace(data, noise_std=0.05 * np.linspace(0.5, 2.0, data.q.size).reshape(data.q.shape))
-
-
-def on_two_planes(rows, seed):
-    """The arm with its tool in the edge between two planes."""
-    model = arm_model()
-    model = model.with_contacts([*model.contacts, Contact("hand", (0.0, 0.0, 0.2), Plane((1.0, 0.2, 0.0), 0.25))])
-    data = arm_data(rows, seed)
-    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
-    for _ in range(20):
-        dynamics, kinematics = model.dynamics(q, 0.0 * v, u), model.robot.kinematics(q)
-        distance = torch.stack([contact.distance(kinematics) for contact in model.contacts], dim=-1)
-        q = q - (torch.linalg.pinv(dynamics.A) @ distance[..., None])[..., 0]
-    a = model.dynamics(q, v, u).acceleration(-0.8 * torch.tanh(v / 0.4)).numpy()
-    noise = np.random.default_rng(seed).normal(0.0, 0.05, a.shape)
-    return dataclasses.replace(data, q=q.numpy(), a=a + noise, model=model, truth={})
 
 
 MODELS = {
@@ -123,19 +106,6 @@ def test_what_is_kept_of_the_fit_are_its_numbers_by_the_parameters_own_meaning()
     with torch.no_grad():
         expected = float(likelihood.negative_log_likelihood(W, residual, noise, matrices))
     assert grown.negative_log_likelihood == pytest.approx(expected, rel=1e-9)
-
-
-def test_the_order_of_updates_does_not_matter_and_variances_never_grow():
-    data, test = arm_data(24, seed=6), arm_data(30, seed=7)
-    posterior = learned(data)
-    parts = [data.rows(slice(12, 17)), data.rows(slice(17, 24))]
-    forth, back = posterior.update(parts[0]).update(parts[1]), posterior.update(parts[1]).update(parts[0])
-    assert_same(forth, back, test)
-    before, between, after = (
-        p.predict(test.q, test.v, test.u).covariance for p in (posterior, posterior.update(parts[0]), forth)
-    )
-    assert torch.linalg.eigvalsh(before - between).min() > -1e-10
-    assert torch.linalg.eigvalsh(between - after).min() > -1e-10
 
 
 @pytest.mark.parametrize("budget", [8, 12, 15])
@@ -233,17 +203,6 @@ def test_rows_that_state_another_noise_than_the_fit_are_warned_of(posterior, tmp
     save_posterior(posterior, tmp_path / "run")
     with pytest.warns(DataWarning, match="another noise"):
         load_posterior(tmp_path / "run").update(other)
-
-
-@pytest.mark.parametrize("noise", [Noise(0.05), Noise(0.05, learn=True), Noise(None, learn=True)], ids=repr)
-def test_a_level_that_was_given_or_learned_is_meant(noise):
-    data = arm_data(15, seed=16)
-    posterior = learned(data, model=data.model.with_forces(JointForces(), noise=noise))
-    rows = data.rows(slice(12, 15))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        grown = posterior.update(stating(rows, rows.noise_std * 10.0))
-    assert_same(grown, posterior.update(stating(rows, None)), data)
 
 
 def test_rows_that_state_their_own_noise_are_as_noisy_as_they_say():

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.robots.robot_models import loaded
 
 from forcegp.codegen.c_writer import write_program
 from forcegp.codegen.library import RowFunction, compile_library
@@ -137,22 +136,6 @@ print(compiled.forward_dynamics(q, v, tau).tolist())
     assert all(path.suffix == ".so" for path in before)  # nothing unfinished lies about
 
 
-def test_other_robots_have_code_of_their_own(robot, compiled, folder):
-    compiled.gravity_forces(random(3))
-    before = len(list(folder.iterdir()))
-    heavier = loaded(robot, "tool")
-    q = random(2, 3)
-    torch.testing.assert_close(heavier.compile(folder).gravity_forces(q), heavier.gravity_forces(q))
-    assert len(list(folder.iterdir())) == before + 1
-
-
-def test_prepare_compiles_ahead(robot, tmp_path):
-    compiled = robot.compile(tmp_path / "new").prepare("gravity_forces")
-    assert len(list((tmp_path / "new").iterdir())) == 1
-    with pytest.raises(InvalidInput, match=r"no function 'gravity' .*gravity_forces"):
-        compiled.prepare("gravity")
-
-
 def test_default_folder(robot, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert robot.compile().folder == tmp_path / "forcegp" / "compiled"
@@ -170,13 +153,6 @@ def test_the_page_on_compiled_dynamics_runs(repository, tmp_path, monkeypatch, c
 
 
 # ---------------------------------------------------------------------- what cannot be
-
-
-def test_inputs_are_checked_as_those_of_the_robot(compiled):
-    with pytest.raises(InvalidInput, match=r"tau must be a tensor of real numbers; given: torch\.bool"):
-        compiled.forward_dynamics(random(3), random(3), random(3) > 0)
-    with pytest.raises(InvalidInput, match=r"batch shapes do not broadcast: q \(2,\), v \(3,\)"):
-        compiled.bias_forces(random(2, 3), random(3, 3))
 
 
 def test_what_is_not_supported_says_so(robot, compiled):

@@ -1,7 +1,6 @@
 """Floating, planar and spherical joints against Pinocchio, and the manifold of their positions."""
 
 from contextlib import nullcontext
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -204,31 +203,6 @@ def test_turns_of_other_length_are_refused():
     with pytest.raises(InvalidInput, match=r"base\.qx, base\.qy.*length 0\.7.*normalized"):
         robot.mass_matrix(q)
     robot.mass_matrix(robot.normalized(q))
-
-
-def test_energy_is_invariant_to_where_the_base_is():
-    """Gravity forces turn with the base; the mass matrix in body axes does not change at all."""
-    robot = Robot.from_urdf_text(LIMBS, base="floating")
-    generator = torch.Generator().manual_seed(0)
-    q = robot.random(generator, 2)
-    q[1, 7:] = q[0, 7:]
-    M = robot.mass_matrix(q)
-    torch.testing.assert_close(M[0], M[1], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["floating", "spherical"])
-def test_a_joint_of_several_degrees_on_a_post_is_stored_as_it_is(kind):
-    """Neither welded nor given a base of its own."""
-    post = '<link name="floor"/><joint name="post" type="fixed"><parent link="floor"/><child link="stand"/></joint>'
-    mount = f'<link name="stand"/><joint name="mount" type="{kind}"><parent link="stand"/><child link="trunk"/></joint>'
-    text = LIMBS.replace("<link", f"{post}{mount}<link", 1)
-    root = ElementTree.fromstring(LIMBS)
-    children = {joint.find("child").get("link") for joint in root.findall("joint")}
-    (base,) = {link.get("name") for link in root.findall("link")} - children
-    robot = Robot.from_urdf_text(text.replace('child link="trunk"', f'child link="{base}"'))
-    again = Robot.from_stored(robot.to_stored())
-    assert (again.nv, again.joint_names) == (robot.nv, robot.joint_names)
-    assert robot.joint_names[0].startswith("mount.")
 
 
 @pytest.mark.parametrize("axis", ["0 0 1", "1 0 0", "0.6 0 -0.8", None])

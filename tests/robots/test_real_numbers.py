@@ -5,7 +5,7 @@ import datetime
 import numpy as np
 import pytest
 import torch
-from tests.data.samples import LINK, TWO_JOINTS, columns, dataset
+from tests.data.samples import LINK, TWO_JOINTS, dataset
 from tests.posterior.arm import arm_data
 
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
@@ -72,25 +72,6 @@ def test_a_prediction_that_is_not_finite_is_an_error(posterior, state):
         posterior.predict(np.stack([q, q]), np.stack([v, 1e308 * np.ones(3)]), np.stack([u, u]))
     with pytest.raises(ForceGPError):
         posterior.predict(q + 1e308, v, u)
-
-
-@pytest.mark.usefixtures("unchecked")  # integers are promised nowhere
-@pytest.mark.parametrize("kind", [np.float32, np.float16, np.int64])
-def test_numbers_of_any_precision_are_converted_exactly_everywhere(posterior, data, state, kind):
-    given = tuple(x.astype(kind) for x in state)
-    exact = tuple(torch.tensor(x.astype(np.float64)) for x in given)
-    tensors = tuple(torch.tensor(x) for x in given)
-    robot, predictor = data.model.robot, posterior.predictor(compile=False)
-    expected = posterior.predict(*exact, covariance=False).mean
-    for same in (given, tensors):
-        assert torch.equal(posterior.predict(*same, covariance=False).mean, expected)
-        assert torch.equal(predictor.mean(*same), predictor.mean(*exact))
-    assert torch.equal(data.model.dynamics(*tensors).H, data.model.dynamics(*exact).H)
-    assert torch.equal(robot.inverse_dynamics(*tensors), robot.inverse_dynamics(*exact))
-    assert torch.equal(robot.forward_dynamics(*tensors), robot.forward_dynamics(*exact))
-    held = dataset(q=columns()["q"].astype(kind)).q
-    assert held.dtype == np.float64
-    np.testing.assert_array_equal(held, columns()["q"].astype(kind))
 
 
 @pytest.mark.parametrize(

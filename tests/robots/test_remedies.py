@@ -107,20 +107,6 @@ def test_an_undefined_parent_is_offered_as_the_root():
         Robot.from_urdf_text(SMALL, root="base")
 
 
-@pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_a_world_that_drake_knows_and_the_file_does_not_define_is_offered_as_the_root(kind):
-    weld = f'<joint name="weld" type="{kind}"><parent link="world"/><child link="trunk"/></joint></robot>'
-    text = LOOSE["legs"].replace("</robot>", weld)
-    with pytest.raises(
-        RobotModelError, match="the link 'world' is a parent, and the file does not define it"
-    ) as caught:
-        Robot.from_urdf_text(text)
-    assert caught.value.remedy == {"root": "world"}  # whether it is bolted is not asked: the joint answers
-    robot = Robot.from_urdf_text(text, **caught.value.remedy)
-    assert robot.base == kind
-    assert robot.nv == (2 if kind == "fixed" else 8)
-
-
 def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
     text = re.sub("<inertia .*/>", "", SMALL)
     with pytest.raises(NonPhysicalInertia, match="add it, or take the mass as a point") as caught:

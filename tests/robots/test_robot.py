@@ -34,46 +34,6 @@ def test_joints_come_depth_first_and_branches_in_file_order(tree):
     assert tree.name == "tree"
 
 
-def test_limits_damping_and_friction_are_visible(tree):
-    torso = tree.joint("torso")
-    assert (torso.type, torso.parent, torso.child) == ("revolute", "base", "body")
-    assert (torso.lower, torso.upper) == (-np.inf, np.inf)
-    assert (torso.velocity_limit, torso.effort_limit, torso.damping, torso.friction) == (2.0, 100.0, 0.7, 0.2)
-    wrist = tree.joint("right_wrist")
-    assert (wrist.lower, wrist.upper, wrist.axis) == (-1.0, 2.0, (0.0, 0.0, -1.0))
-    shoulder = tree.joint("right_shoulder")
-    assert shoulder.type == "continuous"
-    assert (shoulder.effort_limit, shoulder.damping) == (np.inf, 0.0)
-    np.testing.assert_allclose(shoulder.axis, np.array([1, 2, -0.5]) / np.sqrt(5.25))
-    assert tree.joint("left_shoulder").axis == (1.0, 0.0, 0.0)  # the format's default
-    assert tree.joint("second_finger").upper == 0.0  # the format's default where only one is given
-
-
-def test_links_show_who_moves_them_and_their_inertia(tree):
-    camera = tree.link("camera")
-    assert camera.joint == "torso"
-    assert camera.mass == 0.4
-    assert camera.center_of_mass == (0.01, 0.0, 0.0)
-    c, s = np.cos(0.5), np.sin(0.5)
-    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-    inertia = np.array([[0.0004, 0, 0], [0, 0.0003, 0.00005], [0, 0.00005, 0.0002]])
-    np.testing.assert_allclose(camera.inertia, turn @ inertia @ turn.T, atol=1e-18)
-    assert tree.link("base").joint is None
-    assert tree.link("lens").mass == 0.0
-
-
-def test_massless_frame_can_be_given_inertia_and_frames_stay(chain):
-    given = loaded(chain, "tool")
-    assert given.link("tool").mass == pytest.approx(0.9, rel=1e-14)
-    q = torch.linspace(-1, 1, 4, dtype=torch.float64)
-    more = given.gravity_forces(q) - chain.gravity_forces(q)
-    places = torch.tensor([given.link("tool").center_of_mass], dtype=torch.float64)
-    lift = chain.frame_jacobian(q, "tool", places[0])[2]
-    torch.testing.assert_close(more, 9.81 * 0.9 * lift, rtol=1e-12, atol=1e-12)
-    for frame in chain.link_names:
-        assert torch.equal(given.frame_pose(q, frame), chain.frame_pose(q, frame))
-
-
 def test_locked_joint_is_fixed_where_it_is_locked(tree):
     locked = Robot.from_urdf_text(TREE, locked={"torso": 0.4, "right_wrist": -0.3})
     assert locked.joint_names == ("right_shoulder", "left_shoulder", "left_gripper", "second_finger")

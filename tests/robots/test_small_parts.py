@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import MODELS
 
 from forcegp.robots import Robot
@@ -29,24 +28,6 @@ def test_pseudo_inertia_of_standard_parameters():
     expected[3, 3] = m
     torch.testing.assert_close(pseudo_inertia_of_standard(parameters), expected, rtol=0.0, atol=1e-15)
     torch.testing.assert_close(standard_of_pseudo_inertia(expected), parameters, rtol=0.0, atol=1e-14)
-
-
-def test_arms_that_end_at_different_depths():
-    """Three joints below the base, and one more below each of the first two."""
-    links = "".join(f'<link name="{name}">{LINK}</link>' for name in "abcde")
-    joints = "".join(
-        f'<joint name="{parent}{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="0.{k} 0.2 -0.1"/><axis xyz="0 {k} 1"/>'
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
-        for k, (parent, child) in enumerate([("base", "a"), ("base", "b"), ("base", "c"), ("a", "d"), ("b", "e")], 1)
-    )
-    text = f'<robot name="arms"><link name="base"/>{links}{joints}</robot>'
-    robot = Robot.from_urdf_text(text)
-    oracle = Oracle(text, robot)
-    q, v = torch.tensor(np.random.default_rng(0).normal(size=(2, 5)))
-    np.testing.assert_allclose(robot.mass_matrix(q), oracle.mass_matrix(q.numpy()), rtol=1e-10, atol=1e-12)
-    bias = robot.mass_matrix_and_bias(q, v)[1]
-    np.testing.assert_allclose(bias, oracle.bias_forces(q.numpy(), v.numpy()), rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tests.robots.pinocchio_oracle import Oracle
-from tests.robots.robot_models import CHAIN, MODELS, TREE, loaded
+from tests.robots.robot_models import MODELS, TREE, loaded
 
 from forcegp.errors import UnknownJoint
 from forcegp.robots import Robot
@@ -50,29 +50,6 @@ def test_everything_else_stays_byte_for_byte():
     start = text.index("<inertial>", text.index("link  name"))
     assert written[:start] == text[:start]
     assert written.endswith(text[text.index("</inertial>", start) :])
-
-
-@pytest.mark.parametrize(
-    "element",
-    [
-        '<link name="tool"/>',
-        '<link name="tool" />',
-        '<link a=">" name="tool"></link>',
-        '<link name="tool"><visual/></link>',
-    ],
-)
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-def test_link_without_inertial_gains_one(element, newline):
-    robot = Robot.from_urdf_text(CHAIN.replace('<link name="tool"/>', element).replace("\n", newline))
-    payload = 0.7, (0.1, -0.2, 0.3), np.diag([0.02, 0.03, 0.04])
-    heavier = robot.with_link("tool", *payload)
-    assert heavier.link("tool").center_of_mass == payload[1]
-    assert heavier.urdf_text.count("<inertial>") == robot.urdf_text.count("<inertial>") + 1
-    assert heavier.urdf_text.replace("\r\n", "").count("\n") == (
-        0 if newline == "\r\n" else heavier.urdf_text.count("\n")
-    )
-    twice = heavier.with_link("tool", *payload)
-    assert twice.urdf_text == heavier.urdf_text
 
 
 JOINT = """<robot name="r"><link name="a"/><link name="b"/>
