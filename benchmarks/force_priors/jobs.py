@@ -19,7 +19,7 @@ from forcegp.forces import ContactFriction, Coulomb, JointFriction, Viscous, par
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.posterior import save_posterior
-from forcegp.posterior.components import Curve
+from forcegp.posterior.prediction import Curve
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction

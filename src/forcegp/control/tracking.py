@@ -15,8 +15,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, NumericalError, require_known, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
-from forcegp.posterior.components import require_actuated
-from forcegp.posterior.prediction import JointForces
+from forcegp.posterior.prediction import JointForces, require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_tensor

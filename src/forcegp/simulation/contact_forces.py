@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.errors import InvalidInput, SimulationError
-from forcegp.robots.xml_text import numbers
+from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.trajectory import FlatTable, Table
 

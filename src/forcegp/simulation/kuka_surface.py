@@ -16,7 +16,7 @@ from forcegp.forces.registry import force_class
 from forcegp.mechanics import Baumgarte, Contact
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.robots.xml_text import numbers
+from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import (
     BulletContact,
