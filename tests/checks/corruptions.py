@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from tests.checks.logs import column, exchanged
 
 from forcegp.checks import check, quick_check
-from forcegp.cli.fit import findings_in_one_line
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.mechanics import Contact, Plane
@@ -299,8 +297,8 @@ def named(said: str, words: str) -> bool:
 
 
 def said_by_check(data: Dataset) -> str:
-    found = check(data).findings
-    return "\n".join(f"[{each.severity}] {each.subject}: {each.seen}" for each in found if each.severity != "ok")
+    found = check(data).doubts
+    return "\n".join(f"[{each.level}] {each.about}: {each.what}" for each in found if each.level != "ok")
 
 
 def said_by_fit(data: Dataset) -> str:
@@ -311,4 +309,4 @@ def said_by_fit(data: Dataset) -> str:
         data.model.check_states(q, v, u)
     except ForceGPError as error:
         return str(error)
-    return findings_in_one_line(quick_check(data), Path("log.h5")) or ""
+    return quick_check(data).in_one_line()

@@ -43,8 +43,8 @@ def test_defects_are_told_and_drawn_but_are_no_error(forcegp, folder):
     done = forcegp("check", "defects.h5", "--plots", "look", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
-    assert told["severity"] == "wrong"
-    subjects = {item["subject"]: item for item in told["findings"] if item["severity"] != "ok"}
+    assert told["level"] == "wrong"
+    subjects = {item["about"]: item for item in told["doubts"] if item["level"] != "ok"}
     assert subjects["torque sign"]["joints"] == ["lift"]
     assert subjects["delay"]["numbers"]["delay"] == pytest.approx(0.02, abs=0.005)
     assert json.loads((folder / "look" / "check.json").read_text()) == told

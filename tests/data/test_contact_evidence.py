@@ -44,7 +44,7 @@ def test_a_point_two_centimetres_sideways_is_measured(sliding):
 def test_a_missing_contact_is_found_with_its_normal(sliding):
     (doubt,) = contact_doubts(without_contacts(sliding))
     assert doubt.numbers["kind"] == "missing"
-    assert "1.00)" in doubt.seen
+    assert "1.00)" in doubt.what
     assert doubt.numbers["frame"] == "lbr_iiwa_link_7"
 
 

@@ -24,7 +24,7 @@ from forcegp.checks.torques import (
 )
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.findings import Finding, import_flags, listed, wrong
+from forcegp.doubts import Doubt, listed, wrong
 from forcegp.robots import Robot
 
 SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
@@ -69,7 +69,7 @@ class Hypothesis:
     rows: Dataset
     tau: Float[np.ndarray, "rows nv"]
     fit: TorqueFit
-    finding: Finding | None = None
+    doubt: Doubt | None = None
     cost: float = 0.0
     concerns: tuple[int, ...] = ()
 
@@ -83,8 +83,8 @@ class Hypothesis:
     def tried(
         self, change: Change, robot: Robot | None = None, cost: float = 0.0, concerns: tuple[int, ...] = (), **said: Any
     ) -> "Hypothesis":
-        """With one more change, or under another robot, and the finding that says so."""
-        more = {"cost": cost, "concerns": concerns, "finding": wrong(**said)}
+        """With one more change, or under another robot, and the doubt that says so."""
+        more = {"cost": cost, "concerns": concerns, "doubt": wrong(**said)}
         return Hypothesis.of(robot or self.robot, self.rows, (*self.changes, change), **more)
 
     def applied(self, dataset: Dataset) -> Dataset:
@@ -100,11 +100,11 @@ class Hypothesis:
         return float(np.log(np.maximum(known, SMALLEST)).sum())
 
 
-def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Finding]]:
-    """The corrected log and one finding for each correction, chosen greedily. Needs a robot, without contacts."""
+def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Doubt]]:
+    """The corrected log and one doubt for each correction, chosen greedily. Needs a robot, without contacts."""
     assert inputs.robot is not None
     now = Hypothesis.of(inputs.robot, inputs.rows(), (changed(),))
-    found: list[Finding] = []
+    found: list[Doubt] = []
     for _ in range(MAX_CORRECTIONS):
         if not np.nanmax(now.fit.unexplained, initial=0.0) > EXPLAINED:
             break
@@ -113,9 +113,9 @@ def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Finding]]:
         best = max(candidates, key=lambda other: now.score - other.score - other.cost, default=None)
         if best is None or now.score - best.score - best.cost < GAIN or not _explains(now, best):
             break
-        assert best.finding is not None
-        found.append(best.finding)
-        now = replace(best, finding=None, cost=0.0, concerns=())
+        assert best.doubt is not None
+        found.append(best.doubt)
+        now = replace(best, doubt=None, cost=0.0, concerns=())
     return now, found
 
 
@@ -141,11 +141,10 @@ def _torque_signs(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
     yield now.tried(
         changed("u", factor=factor),
         concerns=_places(turned),
-        subject="torque sign",
-        seen=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
+        about="torque sign",
+        what=f"the torque of {'all joints' if turned.all() else listed(joints)} has the opposite sign of what the "
         f"motion needs ({_remains(now.fit, other, turned)}).",
-        remedy=f"forcegp import {import_flags(signs)}; or turn the joint's whole motion if its axis in the URDF points "
-        "the other way.",
+        do="Turn the joint's whole motion if its axis in the URDF points the other way.",
         joints=joints,
         correction=signs,
     )
@@ -164,17 +163,17 @@ def _torque_places(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
         changed("u", order),
         cost=0.5,
         concerns=_places(moved),
-        subject="joints exchanged",
-        seen="torques stand under wrong joints: "
+        about="joints exchanged",
+        what="torques stand under wrong joints: "
         + ", ".join(f"that of {joint} stands under {owner}" for joint, owner in zip(joints, owners, strict=True)),
-        remedy="Correct the order of the torque columns.",
+        do="Correct the order of the torque columns.",
         joints=joints,
         numbers={"order": list(inputs.named(order))},
         correction={"order": {"u": tuple(int(place) for place in order)}},
     )
-    assert better.finding is not None
-    seen = f"{better.finding.seen} ({_remains(now.fit, better.fit, moved)})."
-    yield replace(better, finding=replace(better.finding, seen=seen))
+    assert better.doubt is not None
+    seen = f"{better.doubt.what} ({_remains(now.fit, better.fit, moved)})."
+    yield replace(better, doubt=replace(better.doubt, what=seen))
 
 
 def _motion_units(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
@@ -190,10 +189,10 @@ def _motion_units(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
             yield now.tried(
                 changed("qva", factor=np.where(turned, DEGREE, 1.0)),
                 cost=0.0 if turned.all() else 0.5,
-                subject="degrees",
-                seen=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
+                about="degrees",
+                what=f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
                 "for radians.",
-                remedy=f"forcegp import {import_flags(units)}, or np.deg2rad.",
+                do="Use np.deg2rad.",
                 joints=inputs.named(_places(turned)),
                 correction=units,
             )
@@ -205,10 +204,10 @@ def _motion_units(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
                 changed("qva", factor=np.where(places == joint, 1.0 / ratio, 1.0)),
                 cost=0.7,
                 concerns=(joint,),
-                subject="motion unit",
-                seen=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
+                about="motion unit",
+                what=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
                 "look like those of a motor before its gear.",
-                remedy=f"Divide the motion of this joint by its gear ratio (forcegp import --q '{name}/{ratio:g}').",
+                do=f"Divide the motion of this joint by its gear ratio (forcegp import --q '{name}/{ratio:g}').",
                 joints=(name,),
                 numbers={"factor": ratio},
             )
@@ -230,9 +229,9 @@ def _motion_signs(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
             yield now.tried(
                 changed(f"{signals}a", factor=turned),
                 cost=1.0,
-                subject="motion sign",
-                seen=f"{what} the opposite sign of the URDF's.",
-                remedy=f"forcegp import {import_flags(signs)}, or turn the joint's axis in the URDF.",
+                about="motion sign",
+                what=f"{what} the opposite sign of the URDF's.",
+                do="Turn the joint's axis in the URDF.",
                 joints=(name,),
                 correction=signs,
             )
@@ -248,9 +247,9 @@ def _motion_places(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
             yield now.tried(
                 changed(f"{signals}a", order),
                 cost=1.0,
-                subject="joints exchanged",
-                seen=f"{what} of {listed(inputs.named((one, other)))} stand in each other's place.",
-                remedy="Correct the order of the columns, or the joint names of the log.",
+                about="joints exchanged",
+                what=f"{what} of {listed(inputs.named((one, other)))} stand in each other's place.",
+                do="Correct the order of the columns, or the joint names of the log.",
                 joints=inputs.named((one, other)),
                 correction={"order": dict.fromkeys(signals, tuple(int(place) for place in order))},
             )
@@ -275,10 +274,10 @@ def _gravity(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
             changed(),
             with_gravity(now.robot, gravity),
             cost=cost,
-            subject="gravity",
-            seen=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
+            about="gravity",
+            what=f"the torques fit gravity along ({text}) m/s² of the base far better than the assumed one, "
             f"{np.rad2deg(angle):.0f} degrees away: the base is mounted another way.",
-            remedy=f"Give `gravity`={text.replace(' ', '')}.",
+            do=f"Give `gravity`={text.replace(' ', '')}.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
         )
 

@@ -10,8 +10,8 @@ from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.filtering import JITTER
-from forcegp.data.findings import Finding, Severity, import_flags, listed, look, ok
 from forcegp.data.row_selection import consecutive
+from forcegp.doubts import Doubt, Level, listed, look, ok
 
 LOST = 1.8  # median steps at which at least one sample is missing
 MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
@@ -19,7 +19,7 @@ LITTLE_LOST = 1e-4  # share that every logger loses
 OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
 
 
-def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:
+def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     """Rate and duration; jitter; lost samples and gaps; repeated rows."""
     log = inputs.log
     steps = np.diff(log.time)[consecutive(log)[:-1]]
@@ -30,8 +30,8 @@ def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:
     each = f"{count} episodes" if count > 1 else "one episode"
     seconds = float(steps.sum())
     yield ok(
-        subject="sampling",
-        seen=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
+        about="sampling",
+        what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
         numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
     )
     yield from _lost(inputs, steps, median)
@@ -39,17 +39,17 @@ def sampling_findings(inputs: CheckInput) -> Iterator[Finding]:
     spread = float(np.abs(regular - median).max()) / median
     if spread > JITTER:
         yield look(
-            subject="jitter",
-            seen=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
+            about="jitter",
+            what=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
             f"median {1e3 * median:.3g} ms.",
-            remedy="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
+            do="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
             "(forcegp import does).",
             numbers={"relative_deviation": spread},
         )
     yield from _repeated(inputs)
 
 
-def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Finding]:
+def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Doubt]:
     log = inputs.log
     long = steps > LOST * median
     if not long.any():
@@ -59,13 +59,13 @@ def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Find
     lost = float((steps[long] - median).sum())
     share = lost / float(steps.sum())
     gaps = int((steps > GAP * median).sum())
-    yield Finding(
-        severity="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
-        subject="lost samples",
-        seen=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
+    yield Doubt(
+        level="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
+        about="lost samples",
+        what=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
         f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
         + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
-        remedy=""
+        do=""
         if share <= LITTLE_LOST and not gaps
         else "A derivative across a gap is no acceleration: split the log there (forcegp import does), and look "
         "why the logger loses samples.",
@@ -73,7 +73,7 @@ def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Find
     )
 
 
-def _repeated(inputs: CheckInput) -> Iterator[Finding]:
+def _repeated(inputs: CheckInput) -> Iterator[Doubt]:
     """Rows in which every position is that of the row before although velocities show that the robot moves."""
     log = inputs.log
     follows = consecutive(log)[:-1]
@@ -85,10 +85,10 @@ def _repeated(inputs: CheckInput) -> Iterator[Finding]:
         return
     row = int(np.flatnonzero(same & moves)[0]) + 1
     yield look(
-        subject="repeated rows",
-        seen=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
+        about="repeated rows",
+        what=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
         f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",
-        remedy="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
+        do="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
         numbers={"share": share, "row": row},
     )
 
@@ -115,7 +115,7 @@ SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
 
 
-def motion_findings(inputs: CheckInput) -> list[Finding]:
+def motion_doubts(inputs: CheckInput) -> list[Doubt]:
     """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, joint by joint."""
     if inputs.prepared is None:
         return []
@@ -124,9 +124,9 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
     if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
     pieces = [even.select_episodes([number]) for number in even.episodes]
-    found: list[Finding] = []
+    found: list[Doubt] = []
     for name, source in (("v", "q"), ("a", "v")):
-        if name == "a" and any(finding.severity != "ok" for finding in found):
+        if name == "a" and any(doubt.level != "ok" for doubt in found):
             break  # of wrong velocities nothing better can come
         compared = ((joint, _compared(pieces, name, source, joint)) for joint in range(even.nv))
         fits = {joint: fit for joint, fit in compared if fit is not None}
@@ -134,7 +134,7 @@ def motion_findings(inputs: CheckInput) -> list[Finding]:
         if not found and fits and name == "v":
             error = max(unexplained for _, _, unexplained in fits.values())
             seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
-            found.append(ok(subject="velocity", seen=seen, numbers={"unexplained": error}))
+            found.append(ok(about="velocity", what=seen, numbers={"unexplained": error}))
     return found
 
 
@@ -163,8 +163,8 @@ def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tupl
 
 def _differences(
     inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]]
-) -> Iterator[Finding]:
-    """One finding for all joints in which v or a differs from the derivative in the same way."""
+) -> Iterator[Doubt]:
+    """One doubt for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
     groups: dict[tuple[str, float], list[int]] = {}
     for joint, (factor, shift, unexplained) in fits.items():
@@ -182,7 +182,7 @@ def _differences(
         factor, shift, unexplained = fits[joints[0]]
         named, every = inputs.named(joints), len(joints) == len(inputs.names) > 2
         one = f"the {what} of {'all joints' if every else listed(named)} is"
-        severity: Severity = "wrong"
+        severity: Level = "wrong"
         seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
         remedy = f"Check which column {name} was read from; or leave it out, so that it is computed from {source}."
         if kind == "other" and name == "a":
@@ -212,12 +212,10 @@ def _differences(
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
         elif name == "v" and severity == "wrong" and known in UNITS and named == inputs.names:
             correction = {"unit": {"v": (UNITS[known],)}}
-        if correction:
-            remedy = f"forcegp import {import_flags(correction)}; or {remedy[0].lower()}{remedy[1:]}"
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)
         ]
         numbers = each[0] if len(each) == 1 else {"each": each}
-        yield Finding(severity=severity, subject=what, seen=seen, remedy=remedy, joints=named, numbers=numbers,
+        yield Doubt(level=severity, about=what, what=seen, do=remedy, joints=named, numbers=numbers,
                       correction=correction)  # fmt: skip

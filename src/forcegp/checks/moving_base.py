@@ -16,9 +16,9 @@ from torch import Tensor
 
 from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
-from forcegp.data.findings import Finding, import_flags, look, ok, wrong
 from forcegp.data.row_selection import consecutive
 from forcegp.data.successive_rows import whole_windows
+from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.model import Model
 from forcegp.robots.manifold import Group, difference, pose
 
@@ -82,10 +82,10 @@ class _Windows:
         return torch.tensor(values[self.rows.ravel()])
 
 
-def base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """What is seen of the bases of a log."""
     if not dataset.time_ordered or consecutive(dataset).sum() < 10:
-        yield look(subject="base", seen="too few successive rows to compare positions and velocities of the base.")
+        yield look(about="base", what="too few successive rows to compare positions and velocities of the base.")
         return
     for group in model.robot.layout.groups:
         own = np.arange(dataset.nv)[group.rows]
@@ -100,25 +100,25 @@ def base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         specific = _rms(change - windows.mean(measured))
         if error > 2.0 * size and specific < CLEARLY * error:
             yield wrong(
-                subject="base acceleration",
-                seen=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
+                about="base acceleration",
+                what=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
                 f"velocity it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}.",
-                remedy=f"forcegp import {import_flags(IMU)}; or differentiate v.",
+                do="Differentiate v.",
                 correction=IMU,
                 numbers={"error": error, "specific": specific, "size": size},
             )
         elif error > 2.0 * size:  # noise of the velocities alone makes both large
             yield look(
-                subject="base acceleration",
-                seen=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
+                about="base acceleration",
+                what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
                 f"which itself is {size:.2g}.",
-                remedy="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
+                do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
                 "an accelerometer; differentiate v, or add gravity to what an IMU measures.",
                 numbers={"error": error, "size": size},
             )
 
 
-def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """A base that no foot, wheel, thruster or known force of the model moves, although it does not fall or drives."""
     robot, groups = model.robot, model.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
@@ -150,10 +150,10 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         needed = size(robot.mass * a[:, group.rows][:, :linear].cpu())
         if found > CARRIED * needed:
             yield look(
-                subject="base force",
-                seen=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
+                about="base force",
+                what=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
                 f"(its acceleration takes {needed:.3g} N); masses found from this log would be wrong.",
-                remedy="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
+                do="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
                 "For the arm alone, record it while the base stands, and leave out --base and the columns of the base.",
                 numbers={"force": found, "needed": needed},
             )
@@ -175,7 +175,7 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
             f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, no foot "
             f"that stands and no thruster {weighs}."
         )
-        yield wrong(subject="base force", seen=seen, remedy=remedy, numbers=numbers)
+        yield wrong(about="base force", what=seen, do=remedy, numbers=numbers)
         return
     seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
     still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
@@ -193,10 +193,10 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     for what, (rotation, speeds, stated) in readings.items():
         left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
         if left < CLEARLY * min(found, weight):
-            kind, correction, remedy = wrong, stated, f"forcegp import {import_flags(stated)}."
+            kind, correction, remedy = wrong, stated, ""
             numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
             break
-    yield kind(subject="base force", seen=f"{seen}.", remedy=remedy, correction=correction, numbers=numbers)
+    yield kind(about="base force", what=f"{seen}.", do=remedy, correction=correction, numbers=numbers)
 
 
 def _stated_axes(dataset: Dataset) -> tuple[str, str]:
@@ -217,7 +217,7 @@ def _stated_order(dataset: Dataset) -> str:
 
 def _of_velocity(
     windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: tuple[str, str], order: str
-) -> Iterator[Finding]:
+) -> Iterator[Doubt]:
     whole = list(range(v.shape[1]))
     angular = [free > 2 for free in group.motion.free]
     parts = {"linear ": [k for k in whole if not angular[k]], "angular ": [k for k in whole if angular[k]]}
@@ -260,29 +260,25 @@ def _of_velocity(
         axes = tuple(found.get(name, now) for name, now in zip(parts, stated, strict=True))
         correction["axes"] = {"v": axes[:1] if len(set(axes)) == 1 else axes}
     reading = " and ".join(meant)
-    remedy = (
-        f"forcegp import {import_flags(correction)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
-    )
     numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
     if reading:
         yield wrong(
-            subject="base",
-            seen=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
+            about="base",
+            what=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
             f"{recorded:.2g}, of a speed of {speed:.2g}.",
-            remedy=remedy,
             correction=correction,
             numbers=numbers,
         )
     elif recorded > CLEARLY * speed and speed > 0.0:
         yield look(
-            subject="base",
-            seen=f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of "
+            about="base",
+            what=f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of "
             f"{speed:.2g}.",
-            remedy="Check units and time stamps, and that v is linear, then angular velocity in the axes of the base.",
+            do="Check units and time stamps, and that v is linear, then angular velocity in the axes of the base.",
             numbers=numbers,
         )
     else:
-        yield ok(subject="base", seen=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
+        yield ok(about="base", what=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
 
 
 def _in_world(group: Group, q: Tensor, v: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from forcegp.checks.torques import SLOW, columns_of, inverse_dynamics, with_gravity
 from forcegp.data import Dataset
-from forcegp.data.findings import Finding, look
+from forcegp.doubts import Doubt, look
 from forcegp.robots import Robot
 
 GAIN = np.log(2.5)  # by which the product over the joints of what remains unexplained must fall
@@ -33,11 +33,11 @@ class Variation:
     """The torques tau(x) for every value x of one number: `weights` (values, k) times `taus` (k, rows, nv).
 
     `stated` is the value that the robot has and `least` the least change of it, on the scale of `values`, that is
-    reported; `seen` says what a value means and `cost` is subtracted from what it explains.
+    reported; `what` says what a value means and `cost` is subtracted from what it explains.
     """
 
-    subject: str
-    seen: Callable[[float], str]
+    about: str
+    what: Callable[[float], str]
     values: Float[np.ndarray, " values"]
     weights: Float[np.ndarray, "values k"]
     taus: Float[np.ndarray, "k rows nv"]
@@ -79,7 +79,7 @@ class Unexplained:
         return np.stack(shares, axis=1)
 
 
-def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> list[Finding]:
+def parameter_doubts(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> list[Doubt]:
     """The number of the robot that, if it were another, would explain the torques of `rows` far better; or none.
 
     `noise` (nv,) is the standard deviation of the noise of their accelerations.
@@ -106,18 +106,18 @@ def parameter_findings(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " n
     if gain < GAIN or abs(value - best.stated) < best.least:
         return []
     others = {
-        other.seen(1.0): other.seen(x)
+        other.what(1.0): other.what(x)
         for g, x, other in options[1:3]
         if g > gain - np.log(1.5) and abs(x - other.stated) >= other.least
     }
-    others.pop(best.seen(1.0), None)  # a mass with and without its inertia reads the same
+    others.pop(best.what(1.0), None)  # a mass with and without its inertia reads the same
     also = f" Nearly as well: {'; '.join(others.values())}." if others else ""
     return [
         look(
-            subject=best.subject,
-            seen=f"{best.seen(value)}; then {100.0 * np.exp(-gain / rows.nv):.2g} % of what was unexplained remains."
+            about=best.about,
+            what=f"{best.what(value)}; then {100.0 * np.exp(-gain / rows.nv):.2g} % of what was unexplained remains."
             f"{also}",
-            remedy=REMEDY,
+            do=REMEDY,
             joints=best.joints,
             numbers={"value": value, "gain": gain},
         )
@@ -132,9 +132,9 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
     def with_tree(**changes: torch.Tensor) -> np.ndarray:
         return inverse_dynamics(replace(robot, tree=replace(tree, **changes)), rows)
 
-    def factor(subject: str, what: Callable[[float], str], at_zero: np.ndarray, **more: object) -> Variation:
+    def factor(subject: str, meaning: Callable[[float], str], at_zero: np.ndarray, **more: object) -> Variation:
         taus = np.stack([at_zero, tau])
-        return Variation(subject=subject, seen=what, values=FACTORS, weights=linear, taus=taus, **more)  # type: ignore[arg-type]
+        return Variation(about=subject, what=meaning, values=FACTORS, weights=linear, taus=taus, **more)  # type: ignore[arg-type]
 
     # torque constants and masses
     for joint, name in enumerate(names):
@@ -171,8 +171,8 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
             rest[body, :3, 3] *= x
             taus.append(with_tree(rest=rest))
         yield Variation(
-            subject="lengths",
-            seen=lambda x, name=name, length=length: (
+            about="lengths",
+            what=lambda x, name=name, length=length: (
                 f"the torques fit {x:.3g} times the length from {name} to the joint before ({x * length:.3g} instead "
                 f"of {length:.3g} m)"
             ),
@@ -200,8 +200,8 @@ def _zeros(robot: Robot, rows: Dataset) -> Iterator[Variation]:
         one = np.eye(rows.nv)[joint]
         taus = [inverse_dynamics(robot, replace(rows, q=rows.q + x * one)) for x in samples]
         yield Variation(
-            subject="joint zero",
-            seen=lambda x, name=name: (
+            about="joint zero",
+            what=lambda x, name=name: (
                 f"the torques fit positions of {name} that are {x:+.3g} rad ({np.rad2deg(x):+.0f} "
                 "degrees) from the logged ones: its zero is elsewhere"
             ),
@@ -228,8 +228,8 @@ def _gravity(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation
         text = ",".join(f"{value + 0.0:.3g}" for value in along)
         stated = "" if size else f", but the robot states none (`gravity={text}`)"
         yield Variation(
-            subject="gravity",
-            seen=lambda x, text=text, stated=stated: (
+            about="gravity",
+            what=lambda x, text=text, stated=stated: (
                 "the torques show no gravity, although the robot states one (`gravity=0,0,0`)"
                 if abs(x) < NO_GRAVITY
                 else f"the torques fit {x:.3g} times gravity along ({text}) m/s²{stated}"

@@ -8,9 +8,9 @@ import numpy as np
 from forcegp.checks.check_input import CheckInput
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.findings import Finding, listed, look, wrong
 from forcegp.data.row_selection import consecutive
 from forcegp.data.successive_rows import runs
+from forcegp.doubts import Doubt, listed, look, wrong
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
@@ -26,10 +26,10 @@ COARSE = {
     "q": 1e-3,
     "v": 1e-2,
     "u": 1e-2,
-}  # of the range, below which steps are no finding; positions are differentiated twice
+}  # of the range, below which steps are no doubt; positions are differentiated twice
 
 
-def signal_findings(inputs: CheckInput) -> list[Finding]:
+def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
@@ -38,7 +38,7 @@ def signal_findings(inputs: CheckInput) -> list[Finding]:
     return [*found, *_limits(inputs), *_resolution(inputs)]
 
 
-def _leaps(inputs: CheckInput) -> Iterator[Finding]:
+def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
     for places, how, remedy in (
         (inputs.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
         (inputs.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
@@ -48,16 +48,16 @@ def _leaps(inputs: CheckInput) -> Iterator[Finding]:
             row, joint = (int(index) for index in np.argwhere(places)[0])
             name = inputs.names[joint]
             yield wrong(
-                subject="jumps",
-                seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
+                about="jumps",
+                what=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
                 f"({int(places.sum())} times in all).",
-                remedy=remedy,
+                do=remedy,
                 joints=inputs.named(np.flatnonzero(places.any(axis=0))),
                 numbers={"row": row, "count": int(places.sum())},
             )
 
 
-def _dropped(inputs: CheckInput) -> Iterator[Finding]:
+def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
     """Rows of a signal that were lost and read 0."""
     lost = {name: rows for name, rows in inputs.dropped.items() if rows.any()}
     if not lost:
@@ -66,17 +66,17 @@ def _dropped(inputs: CheckInput) -> Iterator[Finding]:
     first = int(np.flatnonzero(rows)[0])
     joints = np.logical_or.reduce([each.any(axis=0) for each in lost.values()])
     yield wrong(
-        subject="drop-outs",
-        seen=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
+        about="drop-outs",
+        what=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
         f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
         f"{inputs.log.time[first]:.3f} s.",
-        remedy="They were not measured: leave these rows out, and look at the logger.",
+        do="They were not measured: leave these rows out, and look at the logger.",
         joints=inputs.named(np.flatnonzero(joints)),
         numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
     )
 
 
-def _constant(inputs: CheckInput) -> Iterator[Finding]:
+def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
     rests = still(log, "v") & still(log, "q")
     for name, quantity in QUANTITY.items():
@@ -92,11 +92,11 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
             remedy = "Right for a passive mechanism; else the torque columns are missing."
         if passive and len(dead) == log.nv:
             seen = "no torque was logged at all (every u is 0)."
-        yield Finding(
-            severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
-            subject="constant channel",
-            seen=seen,
-            remedy=remedy,
+        yield Doubt(
+            level="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
+            about="constant channel",
+            what=seen,
+            do=remedy,
             joints=names,
             numbers={"quantity": name},
         )
@@ -108,7 +108,7 @@ def still(log: Dataset, name: str) -> np.ndarray:
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
-def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Finding]:
+def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
     values = getattr(log, name)[:, joint]
@@ -138,18 +138,18 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Finding]:
     start, length = longest
     if not length or values[start] in (values.min(), values.max()):
         return
-    yield Finding(
-        severity="look" if name == "u" and values[start] == 0.0 else "wrong",
-        subject="frozen channel",
-        seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
+    yield Doubt(
+        level="look" if name == "u" and values[start] == 0.0 else "wrong",
+        about="frozen channel",
+        what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-        remedy="Leave this stretch out, and look at the logger.",
+        do="Leave this stretch out, and look at the logger.",
         joints=(inputs.names[joint],),
         numbers={"quantity": name, "row": start, "seconds": length * step},
     )
 
 
-def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
+def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
     log = inputs.log
     speed = np.abs(log.v[:, joint])
@@ -167,18 +167,18 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
         length = stop - start
         if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
             yield wrong(
-                subject="saturation",
-                seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
+                about="saturation",
+                what=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
                 f"{at} rows of motion; the longest stretch, {length} rows, begins at row {start} at "
                 f"{log.time[start]:.3f} s.",
-                remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
+                do="The robot received another torque than the log states, or the sensor is at its end: leave "
                 "these stretches out, or move more gently.",
                 joints=(inputs.names[joint],),
                 numbers={"value": sign * extreme, "rows": at, "row": start},
             )
 
 
-def _limits(inputs: CheckInput) -> Iterator[Finding]:
+def _limits(inputs: CheckInput) -> Iterator[Doubt]:
     """Positions, velocities and torques beyond the limits of the URDF, the worst joint of each first."""
     if inputs.robot is None:
         return
@@ -201,18 +201,18 @@ def _limits(inputs: CheckInput) -> Iterator[Finding]:
         others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
         unit = unit_of_each(name, log.units[name], log.nv)[joint]
         yield look(
-            subject="limits",
-            seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
+            about="limits",
+            what=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
             f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
             f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
-            remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
+            do="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
             "is not that of your robot, which does no harm here.",
             joints=beyond,
             numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
         )
 
 
-def _resolution(inputs: CheckInput) -> Iterator[Finding]:
+def _resolution(inputs: CheckInput) -> Iterator[Doubt]:
     """Channels with few different values, and how coarse they are against their range."""
     for name, quantity in QUANTITY.items():
         quantized, quanta = [], {}
@@ -228,9 +228,9 @@ def _resolution(inputs: CheckInput) -> Iterator[Finding]:
             quanta[label] = quantum
         if quantized:
             yield look(
-                subject="resolution",
-                seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
-                remedy="Log more digits, or expect noise from this.",
+                about="resolution",
+                what=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
+                do="Log more digits, or expect noise from this.",
                 joints=tuple(quanta),
                 numbers={"quantity": name, "quantum": quanta},
             )

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset, estimate_stance
-from forcegp.data.findings import Finding, look, ok, wrong
 from forcegp.data.stance import TILTS, missing_gravity, tilting
+from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import ContactError
 from forcegp.model import Model
 
@@ -16,7 +16,7 @@ FEW, RARE, RESTING = 0.05, 0.002, 0.02
 """Shares of rows of stance that the motion contradicts and that are wrong, or worth a look; the same of swing."""
 
 
-def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """Contacts that contradict each other; flags that are no flags, or that `estimate_stance` contradicts."""
     if not model.contacts:
         return
@@ -26,11 +26,11 @@ def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         model.check_states(*(torch.tensor(x, device=model.robot.device) for x in (dataset.q, dataset.v, dataset.u)))
     except ContactError as error:
         counted = f" (rows are counted in every {every}. one)" if every > 1 else ""
-        yield wrong(subject="contacts", seen=f"{error}{counted}")
+        yield wrong(about="contacts", what=f"{error}{counted}")
     names = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
     if not names:
         return
-    if missing_gravity(dataset, model) is not None:  # another finding, without which forces show nothing
+    if missing_gravity(dataset, model) is not None:  # another doubt, without which forces show nothing
         return
     found = estimate_stance(dataset, model)
     leans = tilting(dataset, model, found.names, dataset.u[:, [model.inputs.index(name) for name in found.names]])
@@ -41,20 +41,20 @@ def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         leaning = float(leans[:, k].sum() / max(stands.sum(), 1))
         if leaning > FEW:
             yield wrong(
-                subject="contact flag",
-                seen=f"{frame!r}, which is held flat, leans by more than {TILTS:g} rad in {leaning:.0%} of the rows in "
+                about="contact flag",
+                what=f"{frame!r}, which is held flat, leans by more than {TILTS:g} rad in {leaning:.0%} of the rows in "
                 f"which {name!r} is 1, row {every * int(np.flatnonzero(leans[:, k])[0])} for example: its heel or "
                 "toe turns.",
-                remedy="forcegp import log.h5 --stance auto --out data.h5 leaves these rows out; for a foot that is "
+                do="forcegp import log.h5 --stance auto --out data.h5 leaves these rows out; for a foot that is "
                 "never flat give the point that it stands on, --feet FRAME@x,y,z.",
                 numbers={"leaning": leaning},
             )
         odd = int(((logged != 0.0) & (logged != 1.0)).sum())
         if odd:
             yield wrong(
-                subject="contact flag",
-                seen=f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1.",
-                remedy="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
+                about="contact flag",
+                what=f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1.",
+                do="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
                 numbers={"rows": odd},
             )
         lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), ~stands & (shown == 1.0)
@@ -78,17 +78,17 @@ def stance_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
             kind, remedy = look, "A foot at rest may stand: compare the flag with contact forces or heights."
             seen = f"{name!r} is 0 in rows of which {rests:.0%} show {frame!r} at rest, row {row} for example."
         if kind is not ok or not odd:
-            yield kind(subject="contact flag", seen=seen, remedy=remedy, numbers=numbers)
+            yield kind(about="contact flag", what=seen, do=remedy, numbers=numbers)
 
 
-def gravity_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def gravity_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """A robot in a vertical plane that was read without gravity in it."""
     found = missing_gravity(dataset, model)
     if found is not None:
-        yield wrong(subject="gravity", seen=f"{found[0]}.", remedy=found[1])
+        yield wrong(about="gravity", what=f"{found[0]}.", do=found[1])
 
 
-def unmeasured_base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def unmeasured_base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """A base whose columns hold one number while joints move: nobody measured it."""
     for group in model.robot.layout.groups:
         others = np.delete(np.arange(dataset.nv), np.arange(group.rows.start, group.rows.stop))
@@ -96,8 +96,8 @@ def unmeasured_base_findings(dataset: Dataset, model: Model) -> Iterator[Finding
         moves = not len(others) or np.ptp(dataset.v[:, others], axis=0).any()
         if still and moves and len(dataset) > 1:
             yield wrong(
-                subject="base",
-                seen=f"{group.name!r} stands still in all {len(dataset)} rows to the last digit: it was not measured.",
-                remedy="Record its pose by motion capture or a state estimator (position and quaternion), and its "
+                about="base",
+                what=f"{group.name!r} stands still in all {len(dataset)} rows to the last digit: it was not measured.",
+                do="Record its pose by motion capture or a state estimator (position and quaternion), and its "
                 "velocity. Without, learn joint friction on a stand: base='fixed'.",
             )

@@ -32,7 +32,8 @@ from forcegp.cli.fit import write_estimates
 from forcegp.cli.import_log import LogOptions
 from forcegp.cli.input_options import CandidateOptions, forces_of
 from forcegp.cli.payload import payload_dict, with_payload
-from forcegp.cli.terminal import Terminal, facts, findings_table
+from forcegp.cli.terminal import Terminal, doubts_table, facts
+from forcegp.doubts import Doubt, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 
 MOST_CORRECTIONS = 8
@@ -95,7 +96,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
         corrected = self._command(mapping)
         if mistakes and not self.correct:
-            terminal.show(findings_table(mistakes, terminal.worded), "Run:")
+            terminal.show(doubts_table(mistakes, terminal.worded), "Run:")
             terminal.command(corrected)
             raise DatasetError(
                 f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
@@ -103,12 +104,11 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
-        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
-        if wrong and not self.accept:
-            terminal.show(findings_table(wrong, terminal.worded))
+        bad = report.doubts.at("wrong")
+        if bad and not self.accept:
+            terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(
-                f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
-                "add --accept to continue."
+                f"something is wrong with the log ({bad.subjects}); correct it, or add --accept to continue."
             )
         self.out.mkdir(parents=True, exist_ok=True)
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
@@ -138,7 +138,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
             "out": str(self.out),
             "seconds": sum(each["seconds"] for each in done["recordings"]),
             "import": done,
-            "mistakes": [finding.to_dict() for finding in mistakes],
+            "mistakes": [doubt.to_dict() for doubt in mistakes],
             "check": report.to_dict(),
             "preparation": settings,
             "payload": None if payload is None else payload_dict(payload, False),
@@ -159,9 +159,9 @@ class Auto(CandidateOptions, Resuming, LogOptions):
 
     def _imported(
         self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping
-    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
+    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[Doubt]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
-        mistakes: list[forcegp.checks.Finding] = []
+        mistakes: list[Doubt] = []
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress:
@@ -169,15 +169,8 @@ class Auto(CandidateOptions, Resuming, LogOptions):
                     dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
-                mistakes.append(
-                    forcegp.checks.Finding(
-                        severity="wrong",
-                        subject=f"unit of {error.quantity}",
-                        seen=str(error).partition(" Is ")[0],
-                        remedy=f"forcegp import {forcegp.checks.import_flags(correction)}",
-                        correction=correction,
-                    )
-                )
+                what = str(error).partition(" Is ")[0]
+                mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction=correction))
                 mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
                 continue
             done = dict(dataset.metadata["import"])
@@ -186,7 +179,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
                     dataset = forcegp.data.estimate_stance(dataset).filled(dataset)
                 except DatasetError as error:  # of a mistake, perhaps
                     undecided = error
-            found = [finding for finding in forcegp.checks.quick_check(dataset) if finding.correction]
+            found = [doubt for doubt in forcegp.checks.quick_check(dataset) if doubt.correction]
             if not found and undecided is not None:
                 raise undecided
             if not found:
@@ -272,7 +265,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
                 recording,
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
-                findings=[forcegp.report.Finding(*line) for line in answer],
+                doubts=[forcegp.report.Finding(*line) for line in answer],
                 pictures=forcegp.report.scores_pictures(scores),
                 tables=[forcegp.report.scores_table(scores, names)],
                 next_steps=following if command.startswith("forcegp") else [],

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import forcegp
-import forcegp.checks
 import forcegp.data
 from forcegp.cli.import_log import stance_text
 from forcegp.cli.payload import DRY, LAWS
@@ -48,7 +47,7 @@ def answer_lines(
     seconds = content["seconds"]
     rate = (len(dataset) - len(dataset.episodes)) / seconds
     # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
-    flags = ((forcegp.checks.import_flags(each["correction"]), each["subject"]) for each in content["mistakes"])
+    flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late = prepared["delay"][0]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"

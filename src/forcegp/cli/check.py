@@ -14,7 +14,7 @@ import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Overwriting, unless_given
 from forcegp.cli.input_options import CutoffOptions, RobotOptions
-from forcegp.cli.terminal import Terminal, columns, findings_table, shown
+from forcegp.cli.terminal import Terminal, columns, doubts_table, shown
 from forcegp.errors import DatasetError
 
 
@@ -22,7 +22,7 @@ from forcegp.errors import DatasetError
 class Check(CutoffOptions, RobotOptions, Overwriting):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
-    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
+    Each doubt is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
 
     For example:
       forcegp check log.h5 --robot arm.urdf
@@ -34,7 +34,7 @@ class Check(CutoffOptions, RobotOptions, Overwriting):
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
     """Filter for the comparison of q, v, a and u. auto: near where the spectrum shows the end of the motion."""
     plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
-    """Also draw torques, spectra and time steps into this folder, with the findings as check.json."""
+    """Also draw torques, spectra and time steps into this folder, with the doubts as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
 
@@ -54,25 +54,24 @@ class Check(CutoffOptions, RobotOptions, Overwriting):
                 write_json(folder / "check.json", content)
             terminal.note(f"plots: {self.plots}")
         terminal.show(*_shown(terminal, self.data, report))
-        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
+        wrong = report.doubts.at("wrong")
         if self.strict and wrong:
-            what = ", ".join(dict.fromkeys(finding.subject for finding in wrong))
             raise DatasetError(
-                f"{self.data}: {len(wrong)} findings are wrong ({what}); without --strict this is no error."
+                f"{self.data}: {len(wrong)} things are wrong ({wrong.subjects}); without --strict this is no error."
             )
         return content
 
 
 def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
-    """One paragraph per finding, worst first, and the numbers of every joint."""
+    """One paragraph per doubt, worst first, and the numbers of every joint."""
     from rich.text import Text
 
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
-    findings = findings_table(report.findings, terminal.worded)
+    doubts = doubts_table(report.doubts, terminal.worded)
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
-    return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
+    return [heading, doubts, _numbers(report, content)] if measured else [heading, doubts]
 
 
 def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:

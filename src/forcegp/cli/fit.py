@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,14 +26,13 @@ from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.estimates import estimates_table, what_is_open
 from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, facts, with_option_names
+from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
 NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
 HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
-MOST = 3
-"""Findings whose text is shown; the others by their subject."""
 USUAL_FORCES = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic"
 LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torques:both"
 
@@ -179,10 +178,11 @@ class Fit(RobotOptions, Overwriting):
             looked_at = (replace(dataset, model=None), None) if without else (dataset, model)
             found = forcegp.checks.quick_check(*looked_at)
             of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
-            used = [each for each in found if each.subject not in of_accelerations]
+            used = Doubts(each for each in found if each.about not in of_accelerations)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
                 see = f"See {shlex.join(['forcegp', 'check', str(self.data), *self.words(*ROBOT_OPTIONS)])}"
-                terminal.warn(findings_in_one_line(used, used[0].remedy.rstrip(".") if self.contact else see))
+                see = used[0].advice.rstrip(".") if self.contact else see
+                terminal.warn(f"{used.in_one_line()}. {see} (--no-checks does not look)")
         warnings.simplefilter("ignore", ContactWarning)
 
     def _rows(self, dataset: forcegp.Dataset, model: forcegp.Model) -> tuple[forcegp.Dataset, str | None]:
@@ -239,14 +239,6 @@ def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> N
         note = f"of each body's ten inertial directions the log holds nothing of: {held}"
         known = known.with_robot(known.robot.with_note(note))
     known.to_urdf(folder / f"{name}.urdf")
-
-
-def findings_in_one_line(findings: Sequence[forcegp.checks.Finding], following: str) -> str:
-    """The worst findings, the subjects of the others, and what to do next."""
-    shown = [f"{each.subject}: {each.seen.rstrip('.')}" for each in findings[:MOST]]
-    more = dict.fromkeys(each.subject for each in findings[MOST:])
-    others = [f"further {', '.join(more)}"] if more else []
-    return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
 
 
 def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 import forcegp.mechanics
 from forcegp.data.contact_residual import BLOCKS, Residual, missing_contact, moved_points, tensors
 from forcegp.data.dataset import Dataset
-from forcegp.data.findings import Finding, look, wrong
 from forcegp.data.row_selection import move_on
 from forcegp.data.successive_rows import white_noise
+from forcegp.doubts import Doubt, look, wrong
 from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
@@ -168,7 +168,7 @@ NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
 
-def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list[Finding]:
+def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list[Doubt]:
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
@@ -188,7 +188,7 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list
             return []  # states that no contact bears: who computes with them raises what is wrong
 
 
-def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> list[Finding]:
+def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> list[Doubt]:
     touching = np.ones(len(rows), dtype=bool)
     motions = _point_motions(rows, model, noise_seen)
     for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
@@ -225,13 +225,13 @@ def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, .
             touching[acts] &= along
             continue
         numbers = {"kind": "off", "contact": index, "share": share, "distance": far}
-        return [wrong(subject="contact", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]
+        return [wrong(about="contact", what=f"{what}{seen}", do=remedy, numbers=numbers)]
     if touching.sum() < FEWEST_ROWS:
         return []
     return _forces(rows.rows(touching), model)
 
 
-def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
+def _forces(rows: Dataset, model: forcegp.Model) -> list[Doubt]:
     """Whether forces act at the points that the contacts state, and whether there are any."""
     if len(rows) * (rows.nv - len(model.contacts)) < 2 * (3 * rows.nv + 5 * len(model.contacts)):
         return []
@@ -255,10 +255,10 @@ def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
             text = ",".join(f"{value + 0.0:.3g}" for value in np.round(point, 4))
             doubts.append(
                 look(
-                    subject="contact",
-                    seen=f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
+                    about="contact",
+                    what=f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
                     f"{100.0 * min(size, 1.0):.2g} cm ± {100.0 * uncertain:.1g} cm beside the stated point.",
-                    remedy=f"Check the contact's point (near {text}?), or what else presses against the robot.",
+                    do=f"Check the contact's point (near {text}?), or what else presses against the robot.",
                     numbers={
                         "kind": "point",
                         "contact": index,
@@ -271,16 +271,16 @@ def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
     if not doubts and necessary < NO_FORCE:
         doubts.append(
             look(
-                subject="contact",
-                seen="the accelerations show no force of the stated contact: they fit as well without it.",
-                remedy="If nothing was touched, leave the contact out (`contacts=none`).",
+                about="contact",
+                what="the accelerations show no force of the stated contact: they fit as well without it.",
+                do="If nothing was touched, leave the contact out (`contacts=none`).",
                 numbers={"kind": "no force", "gain": necessary},
             )
         )
     return doubts
 
 
-def _missing(rows: Dataset, model: forcegp.Model) -> list[Finding]:
+def _missing(rows: Dataset, model: forcegp.Model) -> list[Doubt]:
     """A point of a last link that stays on a plane or sphere, with a force that accelerations need."""
     found = missing_contact(rows, model)
     if found is None:
@@ -294,10 +294,10 @@ def _missing(rows: Dataset, model: forcegp.Model) -> list[Finding]:
         where = "a sphere" if isinstance(surface, forcegp.mechanics.Sphere) else "a surface"
     return [
         look(
-            subject="contact",
-            seen=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations "
+            about="contact",
+            what=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations "
             "need a force along its normal.",
-            remedy="State it (`contacts`), or leave out the rows in contact.",
+            do="State it (`contacts`), or leave out the rows in contact.",
             numbers={"kind": "missing", "frame": contact.frame, "gain": gain},
         )
     ]

@@ -64,7 +64,7 @@ def check_figure(report: CheckReport) -> Figure:
             title += f": {100.0 * left:.2g} % unexplained" if np.isfinite(left) else ": constant torque"
         style.quiet(panel, title=title, y=unit, x="time [s]" if lowest else "")
     counts = report.to_dict()["counts"]
-    wrong = ", ".join(dict.fromkeys(finding.subject for finding in report.findings if finding.severity == "wrong"))
+    wrong = report.doubts.at("wrong").subjects
     told = f"{counts['wrong']} wrong{wrong and f' ({wrong})'}, {counts['look']} to look at, {counts['ok']} ok"
     style.legend_above(halves[0], f"Check: {told}", *(panel for panel, _ in panels), markerscale=4)
     left, right = halves[1].subplots(1, 2, squeeze=False)[0]

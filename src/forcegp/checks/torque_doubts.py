@@ -1,4 +1,4 @@
-"""Findings of the comparison of torques with inverse dynamics: factor, unit, delay, what is left."""
+"""Doubts of the comparison of torques with inverse dynamics: factor, unit, delay, what is left."""
 
 from collections.abc import Iterator
 
@@ -8,7 +8,7 @@ from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.hypotheses import Hypothesis
 from forcegp.data import Delay, estimate_delay
 from forcegp.data.delay import SIGNIFICANT
-from forcegp.data.findings import Finding, listed, look, ok, wrong
+from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.summary import plain
 
@@ -21,13 +21,13 @@ LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 
 
-def torque_findings(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
+def torque_doubts(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     """Factor and unit, delay, and what remains unexplained, of a log with the errors corrected that were found."""
-    for findings in (_factors, _passive, _unexplained, _delays):
-        yield from findings(inputs, log)
+    for doubts in (_factors, _passive, _unexplained, _delays):
+        yield from doubts(inputs, log)
 
 
-def _factors(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
+def _factors(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     """Torques that are a multiple of what the motion needs."""
     fit = log.fit
     with np.errstate(invalid="ignore"):
@@ -55,20 +55,20 @@ def _factors(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
         if np.abs(np.log(factors / size)).max() < np.log(ROUGHLY):
             what = f"the measured torque of {listed(joints)} is {common:.4g} times what the motion needs"
             seen = f"{what}: it looks like {unit}."
-            remedy = f"forcegp import --unit u={unit}, or a factor."
+            remedy = "Use a factor." if alike else f"forcegp import --unit u={unit}, or a factor."
             correction = {"unit": {"u": (unit,)}} if alike else {}
-    yield Finding(
-        severity="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
-        subject="torque unit",
-        seen=seen,
-        remedy=remedy,
+    yield Doubt(
+        level="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
+        about="torque unit",
+        what=seen,
+        do=remedy,
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
         correction=correction,
     )
 
 
-def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
+def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     """Joints whose torque is zero throughout although the motion needs one."""
     for joint, name in enumerate(inputs.names):
         u, tau = log.rows.u[:, joint], log.tau[:, joint]
@@ -77,16 +77,16 @@ def _passive(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
         others = [np.std(log.tau[:, other]) for other in range(len(inputs.names)) if np.ptp(log.rows.u[:, other]) > 0]
         if np.std(tau) > 0.1 * max(others, default=np.inf):
             yield wrong(
-                subject="dead torque",
-                seen=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
+                about="dead torque",
+                what=f"the torque of {name} is {u[0]:.4g} in every row, but the motion needs one of "
                 f"{np.std(tau):.3g} {'Nm' if inputs.rotates[joint] else 'N'} rms.",
-                remedy="The channel is dead, unless the joint has no motor and the URDF is wrong.",
+                do="The channel is dead, unless the joint has no motor and the URDF is wrong.",
                 joints=(name,),
                 numbers={"needed": float(np.std(tau))},
             )
 
 
-def _unexplained(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
+def _unexplained(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     """How well the torques fit at all."""
     left = log.fit.unexplained
     known = np.isfinite(left)
@@ -98,21 +98,21 @@ def _unexplained(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
         seen = (
             f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance "
         )
-        yield ok(subject="torque", seen=f"{seen}of a torque unexplained ({inputs.names[worst]}).")
+        yield ok(about="torque", what=f"{seen}of a torque unexplained ({inputs.names[worst]}).")
         return
     shares = ", ".join(f"{inputs.names[k]} {100.0 * left[k]:.0f} %" for k in bad)
     yield look(
-        subject="torque",
-        seen=f"most of some torques is not what inverse dynamics with a factor and friction gives: {shares} of "
+        about="torque",
+        what=f"most of some torques is not what inverse dynamics with a factor and friction gives: {shares} of "
         "their variance.",
-        remedy="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
+        do="The channel, unit or zero may be wrong, the joint may be held or touch something, or its torque is "
         "nearly all friction or noise.",
         joints=inputs.named(bad),
         numbers={"unexplained": plain(left[bad])},
     )
 
 
-def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
+def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     assert inputs.compared is not None
     if inputs.prepared is None:
         return  # without an order
@@ -133,17 +133,17 @@ def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Finding]:
             yield _delay((name,), delay, own, std, remains)
 
 
-def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, remains: float) -> Finding:
+def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, remains: float) -> Doubt:
     one = len(names) == 1
     late = "later" if seconds > 0.0 else "earlier"
     friction = " In a joint with much friction this can also be the friction's own lag." if one else ""
-    return Finding(
-        severity="wrong" if remains < MUCH and not one else "look",
-        subject="delay",
-        seen=f"the torque of {names[0] if one else 'all joints'} is logged {1e3 * abs(seconds):.1f} ms ± "
+    return Doubt(
+        level="wrong" if remains < MUCH and not one else "look",
+        about="delay",
+        what=f"the torque of {names[0] if one else 'all joints'} is logged {1e3 * abs(seconds):.1f} ms ± "
         f"{1e3 * std:.1f} ms {late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained "
         f"remains.{friction}",
-        remedy="If the other joints show none, leave it: shifting one joint can hide friction."
+        do="If the other joints show none, leave it: shifting one joint can hide friction."
         if one
         else "forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
         joints=names,
@@ -151,13 +151,13 @@ def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, rem
     )
 
 
-def not_compared(inputs: CheckInput) -> Finding:
-    """The finding where torques cannot be compared."""
+def not_compared(inputs: CheckInput) -> Doubt:
+    """The doubt where torques cannot be compared."""
     if inputs.contacts:
         return ok(
-            subject="torque",
-            seen="not compared with inverse dynamics: the robot touches something, and the forces of contacts are not "
+            about="torque",
+            what="not compared with inverse dynamics: the robot touches something, and the forces of contacts are not "
             "known. Check a log of free motion, too.",
         )
     seen = "not compared with inverse dynamics: no robot was given."
-    return look(subject="torque", seen=seen, remedy="Give the robot: `model`.")
+    return look(about="torque", what=seen, do="Give the robot: `model`.")
