@@ -532,7 +532,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ImportOptions": (
         forcegp.ImportOptions,
-        lambda: {"gap": None, "rate": "auto", "start": None, "end": None, "most_rows": 10},
+        lambda: {"gap": None, "rate": "auto", "start": None, "end": None},
     ),
     "KukaSurfaceConfig": (
         forcegp.KukaSurfaceConfig,

@@ -212,7 +212,7 @@ WRONG = {
     "ColumnMapping": {"step": "x"},
     "ColumnMapping ": {"unit": 5},
     "ImportOptions": {"gap": "x"},
-    "ImportOptions ": {"most_rows": None},
+    "ImportOptions ": {"start": "x"},
     "KukaSurfaceConfig": {"patch_factor": None},
     "Windows": {"signal": np.ones(3)},
     "JointFriction": {"joints": torch.tensor(5.0)},

@@ -271,7 +271,6 @@ BROKEN = {
     "columns of another robot": Broken(with_urdf(GOOD, "shoulder", "elbow", "wrist"), "no column 'q_wrist'", ROBOT),
     "too few columns": Broken(GOOD, "u has 1 columns for 2 joints", FLAGS.replace("u_{joints}", "u_elbow")),
     "not linear": Broken(GOOD, "this is not linear", FLAGS.replace("--q q_{joints}", "--q q_shoulder*q_elbow,q_elbow")),
-    "too many rows": Broken(GOOD, "more than 100 rows", f"{FLAGS} --max-rows 100"),
     "nothing between": Broken(GOOD, "no row lies between", f"{FLAGS} --start 5"),
     "unknown key": Broken(with_mapping("qq: a\n"), "log.yaml: no key 'qq' in a mapping of columns", ""),
     "key twice": Broken(with_mapping("q: a\nq: b\n"), "'q' stands twice", ""),

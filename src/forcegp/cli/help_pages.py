@@ -20,7 +20,7 @@ from tyro.conf import Positional
 from forcegp.cli.command import Command
 
 GROUPS: Mapping[str, str] = {
-    "Input": "baseline task free free_seconds mapping episodes headerless delimiter side_by_side max_rows",
+    "Input": "baseline task free free_seconds mapping episodes headerless delimiter side_by_side",
     "Columns": "time q v u a step joints orientation axes ned unit sign episode unwrap",
     "Timing": "start end gap rate",
     "Preparation": "cutoff differentiate delay lag stance every trim",

@@ -95,8 +95,6 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
     """Continue angles of joints that jump by a turn."""
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
-    max_rows: Annotated[int, arg(metavar="N")] = 100_000_000
-    """Refuse a log with more rows."""
     stance: Literal["log", "auto"] = "log"
     """auto: set the switches of contacts to what motion and forces show, and leave out rows that leave one open."""
 
@@ -110,7 +108,7 @@ class LogOptions(PreparationOptions, RobotOptions, Overwriting):
         if self.rate not in ("auto", "log"):
             complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."
             [given["rate"]] = numbers_of(self.rate, complaint, one=True)
-        return forcegp.ImportOptions(most_rows=self.max_rows, stance="auto", **given)
+        return forcegp.ImportOptions(stance="auto", **given)
 
     def _model(self) -> forcegp.Model | None:
         """The robot of the options, with the known forces and contacts of --identified, or with feet and wheels."""

@@ -25,7 +25,6 @@ OTHERWISE = {
     "contacts": "contact",
     "folder": "out",
     "locked": "lock",
-    "most_rows": "max_rows",
     "model": "robot",
 }
 """Options whose argument has another name in Python."""

@@ -1,14 +1,13 @@
-"""CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow in pieces."""
+"""CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow."""
 
 import csv
 import gzip
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 from pyarrow import csv as arrow_csv
 from typing_extensions import override
@@ -20,82 +19,11 @@ from forcegp.recordings.source import (
     arrow_numbers,
     reading,
     require_distinct,
-    require_plausible_gzip,
+    require_plausible_size,
 )
 
 FIRST_BYTES = 2**16
 """What is looked at to detect the header, the delimiter and whether there are comments."""
-
-COMMENT = b"#"
-_COMMENT_LINE = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
-_BLANKS = re.compile(rb"[ \t]+")
-_OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
-
-
-def opened(path: Path) -> io.BufferedReader:
-    """The bytes of a text file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
-    compressed = path.suffix.lower() == ".gz"
-    if compressed:
-        require_plausible_gzip(path)
-    raw: Any = gzip.GzipFile(path, "rb") if compressed else io.FileIO(path)
-    stream = io.BufferedReader(raw, 2**20)
-    try:
-        first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
-        if not first.strip():
-            raise FileFormatError(f"{path} is empty; give a log with rows.")
-        _require_text(path, first)
-    except BaseException:
-        stream.close()
-        raise
-    return stream
-
-
-def _require_text(path: Path, first: bytes) -> None:
-    if b"\0" in first:
-        raise FileFormatError(
-            f"{path} holds binary data, not text; if it is another format, give it that format's extension."
-        )
-    try:
-        first[: first.rfind(b"\n") + 1 or None].decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path} is not UTF-8 text (byte {error.start} is {first[error.start]:#04x}); save it as UTF-8."
-        ) from error
-
-
-class CleanLines(io.RawIOBase):
-    """A stream without comment lines and, if `blanks`, with one tab between the words of a line."""
-
-    def __init__(self, stream: io.BufferedReader, *, blanks: bool) -> None:
-        self.stream = stream
-        self.blanks = blanks
-        self._ready = b""
-
-    @override
-    def readable(self) -> bool:
-        return True
-
-    @override
-    def readinto(self, buffer) -> int:
-        while not self._ready:
-            raw = self.stream.read(2**20)
-            if not raw:
-                return 0
-            if not raw.endswith(b"\n"):
-                raw += self.stream.readline(2**24)
-            self._ready = self._clean(raw)
-        count = min(len(buffer), len(self._ready))
-        buffer[:count] = self._ready[:count]
-        self._ready = self._ready[count:]
-        return count
-
-    def _clean(self, raw: bytes) -> bytes:
-        if COMMENT in raw:
-            raw = _COMMENT_LINE.sub(b"", raw)
-        if self.blanks:
-            raw = _BLANKS.sub(b"\t", _OUTER_BLANKS.sub(b"", raw.replace(b"\r\n", b"\n")))
-        return raw
-
 
 BLOCK = 2**22
 """Bytes that pyarrow parses at a time; no line may be longer."""
@@ -104,6 +32,8 @@ BLANKS = "blanks"
 DELIMITERS = {"comma": ",", "tab": "\t", "semicolon": ";", "blanks": BLANKS}
 """By the names that people may use for them."""
 
+_COMMENT_LINE = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
+_OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _LONG_INTEGER = re.compile(r"\d{16,19}")
 _CONVERSION = re.compile(
@@ -128,62 +58,88 @@ class DelimitedText(Source):
         super().__init__(path)
         if headerless is not None and headerless < 1:
             raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
-        with reading(path, "text"), opened(path) as stream:
-            self._look(stream, headerless, delimiter)
-        self._long_integers = {
-            name for name, text in zip(self._columns, self._first, strict=False) if _LONG_INTEGER.fullmatch(text)
-        }
+        with reading(path, "text"), self._opened() as stream:
+            self._look(stream.peek(1), headerless, delimiter)
 
-    def _look(self, stream, headerless: int | None, delimiter: str | None) -> None:
+    def _opened(self) -> io.BufferedReader:
+        """The bytes of the file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
+        path, compressed = self.path, self.path.suffix.lower() == ".gz"
+        if compressed:
+            size = path.stat().st_size
+            with path.open("rb") as file:
+                if file.read(2) != b"\x1f\x8b":
+                    raise FileFormatError(
+                        f"{path} is called .gz but is not compressed with gzip; rename or compress it."
+                    )
+                file.seek(max(size - 4, 0))
+                declared = int.from_bytes(file.read(4), "little")  # RFC 1952: ISIZE, modulo 2^32
+            require_plausible_size(path, "what is compressed", declared, size)
+        raw: Any = gzip.GzipFile(path, "rb") if compressed else io.FileIO(path)
+        stream = io.BufferedReader(raw, 2**20)
+        try:
+            first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
+            if not first.strip():
+                raise FileFormatError(f"{path} is empty; give a log with rows.")
+            if b"\0" in first:
+                raise FileFormatError(
+                    f"{path} holds binary data, not text; if it is another format, give it that format's extension."
+                )
+            first[: first.rfind(b"\n") + 1 or None].decode("utf-8")
+        except BaseException as error:
+            stream.close()
+            if isinstance(error, UnicodeDecodeError):
+                where = f"byte {error.start} is {first[error.start]:#04x}"
+                raise FileFormatError(f"{path} is not UTF-8 text ({where}); save it as UTF-8.") from error
+            raise
+        return stream
+
+    def _look(self, first: bytes, headerless: int | None, delimiter: str | None) -> None:
         """Find header, delimiter, number of lines before the first row, and whether there are comments."""
-        lines, comments, skipped = [], [], 0
-        first = stream.peek(1)
-        for raw in stream.peek(len(first)).splitlines(keepends=True):
+        lines, comments, self._lines_before = [], [], 0
+        for raw in first.splitlines(keepends=True):
             text = raw.decode("utf-8", "replace").lstrip("\ufeff").strip("\r\n")
             if text.lstrip().startswith("#"):
                 comments.append(text.lstrip()[1:].strip())
             elif text.strip():
                 lines.append(text)
-            if not lines:
-                skipped += 1
+            self._lines_before += not lines
             if len(lines) == 2:
                 break
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
         self._delimiter = delimiter or _detected_delimiter(lines, self.path)
-        self._lines_before = skipped
-        fields = self._fields(lines[0])
+        fields = row = self._fields(lines[0])
+        numbers = all(_NUMBER.fullmatch(field) for field in fields)
         self._lines_per_row = 1
         if headerless is not None:
-            self._without_header(fields, headerless)
-        elif all(_NUMBER.fullmatch(field) for field in fields):
-            named = self._fields(comments[-1]) if comments else []
-            if len(named) != len(fields):
+            if not numbers:
+                raise FileFormatError(
+                    f"{self.path} begins with {fields[0]!r}, which is no number; leave `headerless` out."
+                )
+            if len(fields) not in (1, headerless):
+                raise FileFormatError(
+                    f"{self.path} has {len(fields)} numbers on its first line; `headerless` is {headerless}. "
+                    "Either so many stand on every line, or one."
+                )
+            self._columns = [f"c{index + 1}" for index in range(headerless)]
+            self._lines_per_row = headerless // len(fields)
+        elif numbers:
+            self._columns = self._fields(comments[-1]) if comments else []
+            if len(self._columns) != len(fields):
                 raise FileFormatError(
                     f"{self.path} begins with numbers, not with names of columns; add `headerless` {len(fields)}, "
                     "or how many numbers make a row where every line holds one."
                 )
-            self._columns, self._first = named, fields
         else:
-            self._columns = [name or f"column{index + 1}" for index, name in enumerate(fields)]
-            self._first = self._fields(lines[1]) if len(lines) > 1 else []
-            self._lines_before += 1
-            if not self._first:
+            if len(lines) < 2:
                 raise FileFormatError(f"{self.path} has a header but no rows.")
+            self._columns = [name or f"column{index + 1}" for index, name in enumerate(fields)]
+            row = self._fields(lines[1])
+            self._lines_before += 1
         require_distinct(self.path, self._columns)
-
-    def _without_header(self, fields: list[str], width: int) -> None:
-        if not all(_NUMBER.fullmatch(field) for field in fields):
-            raise FileFormatError(f"{self.path} begins with {fields[0]!r}, which is no number; leave `headerless` out.")
-        if len(fields) not in (1, width):
-            raise FileFormatError(
-                f"{self.path} has {len(fields)} numbers on its first line; `headerless` is {width}. "
-                "Either so many stand on every line, or one."
-            )
-        self._columns = [f"c{index + 1}" for index in range(width)]
-        self._lines_per_row = width // len(fields)
-        self._first = fields if len(fields) == width else []
+        whole = zip(self._columns, row if self._lines_per_row == 1 else (), strict=False)
+        self._long_integers = {name for name, text in whole if _LONG_INTEGER.fullmatch(text)}
 
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:
@@ -203,50 +159,45 @@ class DelimitedText(Source):
         return f"row {row} (line {self._lines_before + row * self._lines_per_row + 1})"
 
     @override
-    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
-        try:
-            yield from self._read(names, threads=True)
-        except FileFormatError as error:
-            if isinstance(error.__cause__, ValueError):  # pyarrow counts rows on one thread only
-                for _ in self._read(names, threads=False):
-                    pass
-            raise
-
-    def _read(self, names: Sequence[str], *, threads: bool) -> Iterator[Columns]:
+    def table(self, names: Sequence[str]) -> Columns:
         stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns
-        kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}
         wanted = stored if stacked else list(names)
-        stream = opened(self.path)
-        with stream, reading(self.path, "text"):
-            for _ in range(self._lines_before):
-                stream.readline()
-            blanks = self._delimiter == BLANKS
-            source = CleanLines(stream, blanks=blanks) if blanks or self._comments else stream
-            try:
-                batches = arrow_csv.open_csv(
-                    source,
-                    read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
-                    parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
-                    convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
-                )
-                columns = ({name: arrow_numbers(batch.column(name)) for name in wanted} for batch in batches)
-                if stacked:
-                    yield self._stacked(np.concatenate([batch["c1"] for batch in columns]), names)
-                else:
-                    yield from columns
-            except pa.ArrowInvalid as error:
-                raise self._told_by_pyarrow(error) from error
-
-    def _stacked(self, values: np.ndarray, names: Sequence[str]) -> Columns:
-        """Rows from a file with one number per line."""
-        width = self._lines_per_row
+        kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}
+        table = self._parsed(stored, wanted, kinds)
+        columns = {name: arrow_numbers(table.column(name)) for name in wanted}
+        if not stacked:
+            return columns
+        values, width = columns["c1"], self._lines_per_row
         if len(values) % width:
             raise FileFormatError(
                 f"{self.path} has {len(values)} numbers, which is no multiple of {width}; another `headerless` may be "
                 "right, or the file is truncated."
             )
         return {name: values[self._columns.index(name) :: width] for name in names}
+
+    def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], threads: bool = True) -> Any:
+        blanks = self._delimiter == BLANKS
+        with reading(self.path, "text"), self._opened() as stream:
+            for _ in range(self._lines_before):
+                stream.readline()
+            source: Any = stream
+            if blanks or self._comments:
+                text = _COMMENT_LINE.sub(b"", stream.read())
+                if blanks:
+                    text = re.sub(rb"[ \t]+", b"\t", _OUTER_BLANKS.sub(b"", text.replace(b"\r\n", b"\n")))
+                source = io.BytesIO(text)
+            try:
+                return arrow_csv.read_csv(
+                    source,
+                    read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
+                    parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
+                    convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
+                )
+            except pa.ArrowInvalid as error:
+                if threads:  # pyarrow counts rows on one thread only
+                    return self._parsed(stored, wanted, kinds, threads=False)
+                raise self._told_by_pyarrow(error) from error
 
     def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
         text = str(error)
@@ -286,7 +237,8 @@ def _detected_delimiter(lines: Sequence[str], path: Path) -> str:
         counts = {line.count(letter) for line in lines}
         if letter in lines[0] and (len(counts) == 1 or letter == ","):
             return letter
-    if all(len(line.split()) == len(lines[0].split()) for line in lines) and len(lines[0].split()) > 1:
+    words = {len(line.split()) for line in lines}
+    if len(words) == 1 and words != {1}:
         return BLANKS
     if any(letter in lines[0] for letter in ";|") or len(lines[0].split()) > 1:
         raise FileFormatError(f"{path}: its delimiter cannot be detected; add `delimiter`.")

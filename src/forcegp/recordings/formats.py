@@ -1,6 +1,6 @@
 """Which reader reads which file: `open_source`; and several files that make up one recording."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -8,9 +8,8 @@ from typing_extensions import override
 
 from forcegp.data import is_dataset
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.recordings.array_file import ArrayFile, NumpyArchive
+from forcegp.recordings.arrays import ArrayFile, HDF5Arrays, NumpyArchive, matlab_file
 from forcegp.recordings.delimited_text import DelimitedText
-from forcegp.recordings.hdf5_and_matlab import HDF5Arrays, matlab_file
 from forcegp.recordings.parquet import ParquetFile
 from forcegp.recordings.ros_bag import RosBag
 from forcegp.recordings.source import Columns, Source
@@ -58,7 +57,7 @@ class SideBySide(Source):
         return tuple(note for source in self.sources.values() for note in source.notes())
 
     @override
-    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
+    def table(self, names: Sequence[str]) -> Columns:
         own: dict[Source, dict[str, str]] = {}
         for name in names:
             source, column = self._owners[name]
@@ -68,7 +67,7 @@ class SideBySide(Source):
         if len(set(rows.values())) > 1:
             listed = ", ".join(f"{name} {count}" for name, count in rows.items())
             raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
-        yield {name: read[source][column] for name, (source, column) in self._owners.items() if name in names}
+        return {name: read[source][column] for name, (source, column) in self._owners.items() if name in names}
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")

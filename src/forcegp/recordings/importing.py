@@ -12,18 +12,18 @@ import forcegp.mechanics
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
-from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import Stamps, episode_rows, read_stamps
+from forcegp.recordings.arrays import ArrayFile
 from forcegp.recordings.formats import SideBySide, open_source
-from forcegp.recordings.joined_topics import on_one_clock
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.reading import (
-    RawRecording,
+from forcegp.recordings.recording import (
+    Recording,
+    Stamps,
     read_recording,
+    read_stamps,
     require_plausible_positions,
 )
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
-from forcegp.recordings.source import MOST_ROWS, Source
+from forcegp.recordings.source import Source
 
 ROUND_RATE = 1e-3
 """A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
@@ -44,7 +44,6 @@ class ImportOptions:
     start, end: seconds from the first row of each episode that are kept.
     unwrap: add whole turns to positions of turning joints where they jump by more than half a turn.
     beyond_limits: accept positions beyond the limits of the URDF.
-    most_rows: of one recording.
     stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of
         what was done names them: `Preparation(stance="auto")` has to find them. "log" refuses such logs.
 
@@ -57,7 +56,6 @@ class ImportOptions:
     end: float | None = None
     unwrap: bool = False
     beyond_limits: bool = False
-    most_rows: int = MOST_ROWS
     stance: Literal["log", "auto"] = "log"
 
     @usable_arguments("ImportOptions")
@@ -70,8 +68,6 @@ class ImportOptions:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
         if self.stance not in ("log", "auto"):
             raise InvalidInput(f"stance is {self.stance!r}; allowed: 'log' or 'auto'.")
-        if self.most_rows < 1:
-            raise InvalidInput(f"max-rows is {self.most_rows}; it must be at least 1.")
 
 
 def import_recordings(
@@ -100,9 +96,7 @@ def import_recordings(
         wheels = {robot.layout.bodies[robot.frame(each.frame)[0]].name for each in rolling}
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
-    joined = [on_one_clock(source, signal_plan(mapping, source, model, **lacks)) for _, source in sources]
-    sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
-    plans = [plan for _, plan in joined]
+    plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):
@@ -112,7 +106,7 @@ def import_recordings(
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         report(index, len(sources), f"reading {label}")
-        found = read_recording(source, own, label, unwrap=options.unwrap, most_rows=options.most_rows)
+        found = read_recording(source, own, label, unwrap=options.unwrap)
         if not options.beyond_limits:
             require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
         recordings.append(found)
@@ -120,17 +114,16 @@ def import_recordings(
     step = _even_step(stamps, options)
     done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
     pieces: list[dict[str, np.ndarray]] = []
-    for recording, own, each in zip(recordings, stamps, plans, strict=True):
-        for stretch in own.stretches:
-            rows = stretch.rows
+    for recording, own in zip(recordings, stamps, strict=True):
+        for number, rows in own.stretches:
             for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
                 for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
                     raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
-            piece = episode_rows(recording, rows, each.layout, step)
+            piece = recording.rows(rows, step)
             count, stamp = len(piece["time"]), recording.begin + float(recording.time[rows[0]])
             pieces.append(piece | {"episode": np.full(count, len(pieces))})
-            told = {"recording": recording.label, "number": stretch.number, "row": int(rows[0]), "begin": stamp}
+            told = {"recording": recording.label, "number": number, "row": int(rows[0]), "begin": stamp}
             done["episodes"].append(told | {"rows": count})
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
@@ -186,7 +179,7 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
 def _what_was_done(
     mapping: ColumnMapping,
     plan: SignalPlan,
-    recordings: Sequence[RawRecording],
+    recordings: Sequence[Recording],
     stamps: Sequence[Stamps],
     step: float | None,
     options: ImportOptions,
@@ -212,13 +205,13 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
-                "seconds": float(sum(np.ptp(recording.time[x.rows]) for x in own.stretches)),
+                "seconds": float(sum(np.ptp(recording.time[rows]) for _, rows in own.stretches)),
                 "median_step": own.step,
                 "largest_deviation_of_a_step": own.worst,
                 "repeated_stamps_dropped": own.repeated,
                 "gaps": list(own.gaps),
                 "rows_in_stretches_too_short": own.dropped_rows,
-                "notes": [*recording.source.notes(), *recording.notes],
+                "notes": list(recording.notes),
             }
             for recording, own in zip(recordings, stamps, strict=True)
         ],

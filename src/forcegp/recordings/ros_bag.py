@@ -14,15 +14,15 @@ from typing_extensions import override
 from forcegp.errors import FileFormatError, InvalidInput, required_extra
 from forcegp.recordings.source import (
     LONGEST_VECTOR,
-    ROWS_AT_A_TIME,
     Columns,
     Source,
-    as_column,
     reading,
     require_plausible_size,
 )
 
 LOG_TIME = "log_time"
+ROWS_AT_A_TIME = 2**16
+"""Numbers of Python take ten times the memory of those in an array."""
 STAMP = "header.stamp"
 LOOKED_AT = 100
 """Messages of each topic that decide which columns there are: publishers may share a topic."""
@@ -41,7 +41,7 @@ class RosBag(Source):
     Fields are `/wrench:wrench.force.x`, `/commands:data[3]`; those of a sensor_msgs/JointState go by joint name,
     `/joint_states:position.elbow`. Times are `TOPIC:header.stamp` (when it was measured) and `TOPIC:log_time` (when the
     recorder got it), in ns. One table is one topic, with a row for every message that has all columns asked for;
-    `JoinedTopics` puts several on one clock.
+    `read_on_one_clock` joins several.
 
     Raises MissingExtra without `rosbags`.
     """
@@ -139,7 +139,7 @@ class RosBag(Source):
         return next(topic for topic, names in self._topics.items() if name in names)
 
     @override
-    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
+    def table(self, names: Sequence[str]) -> Columns:
         topics = sorted({self.topic_of(name) for name in names})
         if len(topics) != 1:
             raise InvalidInput(
@@ -155,13 +155,14 @@ class RosBag(Source):
                 raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
             messages = reader.messages(connections)
             fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
+            pieces: dict[str, list[np.ndarray]] = {name: [np.zeros(0, int)] for name in names}
             while batch := list(islice(messages, ROWS_AT_A_TIME)):
                 found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
                 table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
                 self._left_out += len(batch) - len(table)
-                if table:
-                    columns = zip(*table, strict=True)
-                    yield {name: as_column(np.array(column)) for name, column in zip(names, columns, strict=True)}
+                for name, column in zip(names, zip(*table, strict=True), strict=False):
+                    pieces[name].append(np.array(column))
+        return {name: np.concatenate(own[1:] or own) for name, own in pieces.items()}
 
 
 def numbers(message: Any, fields: Collection[str] | None = None) -> dict[str, int | float]:
