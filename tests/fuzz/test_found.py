@@ -212,7 +212,6 @@ WRONG = {
     "ColumnMapping": {"step": "x"},
     "ColumnMapping ": {"unit": 5},
     "ImportOptions": {"gap": "x"},
-    "ImportOptions ": {"start": "x"},
     "KukaSurfaceConfig": {"patch_factor": None},
     "Windows": {"signal": np.ones(3)},
     "JointFriction": {"joints": torch.tensor(5.0)},

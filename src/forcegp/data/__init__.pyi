@@ -2,9 +2,8 @@ from .row_selection import (
     time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
     repeated_rows as repeated_rows, require_disjoint as require_disjoint,
 )
-from .contact_evidence import (
-    contact_rows as contact_rows, rows_in_contact as rows_in_contact, contact_doubts as contact_doubts,
-)
+from .contacts import contact_rows as contact_rows, rows_in_contact as rows_in_contact
+from .contact_doubts import contact_doubts as contact_doubts
 from .dataset import Dataset as Dataset
 from .memory import with_memory as with_memory
 from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 import forcegp.mechanics
-from forcegp.data.contact_residual import tensors
+from forcegp.data.contacts import tensors
 from forcegp.data.dataset import Dataset
 from forcegp.errors import ContactError, DatasetError, DataWarning
 

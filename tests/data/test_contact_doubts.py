@@ -79,7 +79,7 @@ def test_an_arm_on_a_line(noise):
 @pytest.mark.parametrize("seed", range(10, 30))
 def test_clean_logs_of_many_seeds_are_not_doubted(seed):
     for _, data in clean_logs(seed):
-        assert contact_doubts(data) == []
+        assert contact_doubts(data) == ()
     for surface in ("plane", "tilted", "sphere"):
         for noise in (0.0, 0.1):
             data = simulated(seed, surface, noise)
