@@ -30,7 +30,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset, Preparation, farthest_rows, resample, units_for
-from forcegp.data.motion_records import RecordedMotions, recorded_motions
+from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.evidence import Windows
 from forcegp.fit import fit

@@ -35,18 +35,9 @@ def all_motion(data: Dataset, sign: list[float], names: str = "qva") -> Dataset:
     return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
 
 
-ALL, LAST_TWO = ("pan", "lift", "bend"), ("lift", "bend")
+ALL = ("pan", "lift", "bend")
 DEFECTS: dict[str, tuple[Callable[[Dataset], Dataset], str, str, tuple[str, ...]]] = {
-    "torque sign of all": (lambda d: replace(d, u=-d.u), "wrong", "torque sign", ALL),
-    "torques turned around": (lambda d: exchanged(d, "u", [1, 2, 0]), "wrong", "joints exchanged", ALL),
-    "motions exchanged": (lambda d: exchanged(d, "qva", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
-    "joints exchanged": (lambda d: exchanged(d, "qvau", [0, 2, 1]), "wrong", "joints exchanged", LAST_TWO),
-    "motion sign": (lambda d: all_motion(d, [1, -1, 1]), "wrong", "motion sign", ("lift",)),
-    "positions in degrees": (lambda d: all_motion(d, [DEGREES] * 3, "q"), "wrong", "velocity", ALL),
     "velocities late": (lambda d: replace(d, v=np.roll(d.v, 4, axis=0)), "look", "velocity", ALL),
-    "torque before a gear": (lambda d: column(d, "u", 1, lambda x: x / 50), "wrong", "torque unit", ("lift",)),
-    "torques 20 ms late": (lambda d: late(d, 0.02), "look", "delay", ALL),
-    "one torque late": (lambda d: late(d, 0.02, slice(1, 2)), "look", "delay", ("lift",)),
     "dead position": (lambda d: column(d, "q", 1, lambda x: 0 * x + 0.3), "wrong", "constant channel", ("lift",)),
     "beyond a limit": (lambda d: column(d, "q", 2, lambda x: x + 4.0), "look", "limits", ("bend",)),
     "a joint that stays": (lambda d: all_motion(d, [1e-3, 1, 1]), "look", "excitation", ("pan",)),
@@ -101,13 +92,6 @@ def test_a_joint_that_is_held_in_one_episode_is_named():
     (found,) = check(replace(both, u=both.u * 0 + np.sin(both.time[:, None]))).doubts.of("held joint")
     assert found.joints == ("lift",)
     assert found.numbers["stretches"] == [1]
-
-
-def test_noise_that_is_as_large_as_a_torque_is_told():
-    data = clean(3, pendulum())
-    loud = replace(data, q=data.q + 3e-3 * np.random.default_rng(0).normal(size=data.q.shape))
-    found = check(loud, preparation=Preparation(cutoff=20.0)).doubts.of("noise")
-    assert any("worth more than half of a torque" in item.what for item in found)
 
 
 def test_a_prepared_log_is_told_with_the_price_that_was_paid():

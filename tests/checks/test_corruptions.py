@@ -26,9 +26,6 @@ from tests.checks.corruptions import (
 from forcegp.checks import check, quick_check
 from forcegp.checks.parameters import parameter_doubts
 
-ONLY_CHECK = ("coarse positions",)
-"""What a fit does not mention: real encoders are coarse."""
-
 
 def log_of(place: int):
     """Robots, rates and kinds of noise in turn."""
@@ -43,7 +40,7 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     assert named(said_by_check(data), words), said_by_check(data)
     line = said_by_fit(data)
     assert "\n" not in line
-    assert name in ONLY_CHECK or named(line, words), line
+    assert named(line, words), line
 
 
 @pytest.mark.parametrize("name", CONTACT_CORRUPTIONS)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import CheckInput, numbers_of
-from forcegp.data.successive_rows import white_noise
+from forcegp.data.noise import white_noise
 from forcegp.doubts import Doubt, listed, look, ok
 from forcegp.errors import InvalidInput
 from forcegp.evidence.identifiability import base_parameters, excitation
@@ -17,7 +17,6 @@ MUCH = 0.2  # noise relative to the spread of the signal from which a filter is 
 
 STATED_OFF = 3.0  # factor either way between stated and seen noise of the acceleration that is reported
 FAR_OFF = 10.0
-LARGE_TORQUE = 0.5  # noise times M, relative to the spread of the torque
 
 
 def stated_noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
@@ -83,7 +82,6 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
             do=f"forcegp import DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
             joints=inputs.named(loud),
         )
-    yield from _in_torques(inputs, after)
     if len(left):
         names = inputs.named(left)
         yield look(
@@ -93,28 +91,6 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
             do="Move faster, filter lower, or learn from torques instead of accelerations.",
             joints=names,
         )
-
-
-def _in_torques(inputs: CheckInput, after: np.ndarray) -> Iterator[Doubt]:
-    """Noise of the acceleration that is as large as the torques when multiplied by M."""
-    assert inputs.prepared is not None
-    noise = torque_noise(inputs, after)
-    if noise is None or inputs.contacts:
-        return
-    spread = np.std(inputs.prepared.dataset.u, axis=0)
-    with np.errstate(invalid="ignore"):
-        loud = np.flatnonzero((noise > LARGE_TORQUE * spread) & (spread > 0.0))
-    if not len(loud):
-        return
-    text = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
-    yield look(
-        about="noise",
-        what=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
-        do="Filter lower for anything that compares torques (identification by torques); a likelihood of "
-        "accelerations bears it.",
-        joints=inputs.named(loud),
-        numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
-    )
 
 
 def torque_noise(inputs: CheckInput, noise: np.ndarray) -> np.ndarray | None:

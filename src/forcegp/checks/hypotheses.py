@@ -18,13 +18,15 @@ from forcegp.checks.torques import (
     TorqueFit,
     estimated_gravity,
     fit_torques,
-    inverse_dynamics,
+    needed_torques,
+    torques_of_laws,
     unexplained_shares,
     with_gravity,
 )
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
 from forcegp.doubts import Doubt, listed, wrong
+from forcegp.forces import JointLaw
 from forcegp.robots import Robot
 
 SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
@@ -58,13 +60,14 @@ def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarr
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A log with errors corrected: the robot, what was changed, rows compared, their inverse dynamics and the fit.
+    """A log with errors corrected: robot and laws, what was changed, rows compared, torques they need and the fit.
 
     `cost` is subtracted from what it explains: of two explanations the simpler one is reported. `concerns` are the
     joints that it must explain.
     """
 
     robot: Robot
+    laws: tuple[JointLaw, ...]
     changes: tuple[Change, ...]
     rows: Dataset
     tau: Float[np.ndarray, "rows nv"]
@@ -74,24 +77,31 @@ class Hypothesis:
     concerns: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, robot: Robot, rows: Dataset, changes: tuple[Change, ...], **more: Any) -> "Hypothesis":
+    def of(
+        cls, robot: Robot, laws: tuple[JointLaw, ...], rows: Dataset, changes: tuple[Change, ...], **more: Any
+    ) -> "Hypothesis":
         """The hypothesis whose last change is yet to be made in `rows`."""
         rows = changes[-1](rows)
-        tau = inverse_dynamics(robot, rows)
-        return cls(robot=robot, changes=changes, rows=rows, tau=tau, fit=fit_torques(robot, tau, rows), **more)
+        tau = needed_torques(robot, rows, laws)
+        fit = fit_torques(robot, tau, rows)
+        return cls(robot=robot, laws=laws, changes=changes, rows=rows, tau=tau, fit=fit, **more)
 
     def tried(
         self, change: Change, robot: Robot | None = None, cost: float = 0.0, concerns: tuple[int, ...] = (), **said: Any
     ) -> "Hypothesis":
         """With one more change, or under another robot, and the doubt that says so."""
         more = {"cost": cost, "concerns": concerns, "doubt": wrong(**said)}
-        return Hypothesis.of(robot or self.robot, self.rows, (*self.changes, change), **more)
+        return Hypothesis.of(robot or self.robot, self.laws, self.rows, (*self.changes, change), **more)
 
     def applied(self, dataset: Dataset) -> Dataset:
         """The same changes of another dataset."""
         for change in self.changes:
             dataset = change(dataset)
         return dataset
+
+    def without_laws(self, rows: Dataset) -> Dataset:
+        """Rows whose u lacks what the known laws need."""
+        return replace(rows, u=rows.u - torques_of_laws(self.robot, rows, self.laws)) if self.laws else rows
 
     @property
     def score(self) -> float:
@@ -103,7 +113,7 @@ class Hypothesis:
 def best_hypothesis(inputs: CheckInput) -> tuple[Hypothesis, list[Doubt]]:
     """The corrected log and one doubt for each correction, chosen greedily. Needs a robot, without contacts."""
     assert inputs.robot is not None
-    now = Hypothesis.of(inputs.robot, inputs.rows(), (changed(),))
+    now = Hypothesis.of(inputs.robot, inputs.laws, inputs.rows(), (changed(),))
     found: list[Doubt] = []
     for _ in range(MAX_CORRECTIONS):
         if not np.nanmax(now.fit.unexplained, initial=0.0) > EXPLAINED:

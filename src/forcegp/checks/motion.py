@@ -10,7 +10,7 @@ from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.filtering import JITTER
-from forcegp.data.row_selection import consecutive
+from forcegp.data.views import consecutive
 from forcegp.doubts import Doubt, Level, listed, look, ok
 
 LOST = 1.8  # median steps at which at least one sample is missing

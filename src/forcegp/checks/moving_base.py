@@ -16,8 +16,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, thruster_columns
 from forcegp.data.configurations import in_base
-from forcegp.data.row_selection import consecutive
-from forcegp.data.successive_rows import whole_windows
+from forcegp.data.views import consecutive, whole_windows
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.model import Model
 from forcegp.robots.manifold import Group, difference, pose

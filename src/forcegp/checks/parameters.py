@@ -7,13 +7,13 @@ every value, and the value is found that leaves least of all torques unexplained
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.checks.torques import SLOW, columns_of, inverse_dynamics, with_gravity
+from forcegp.checks.torques import SLOW, columns_of, needed_torques, with_gravity
 from forcegp.data import Dataset
 from forcegp.doubts import Doubt, look
 from forcegp.robots import Robot
@@ -28,23 +28,41 @@ FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))  # values that are tried for a fac
 REMEDY = "Correct the URDF, or the unit of the signal; or let forcegp fit --forces bodies estimate it from this log."
 
 
+def _powers(degree: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda x: np.stack([x**k for k in range(degree + 1)], axis=1)
+
+
+LINEAR = _powers(1)
+
+
+def _waves(x: np.ndarray) -> np.ndarray:
+    return np.stack([x**0, np.cos(x), np.sin(x), np.cos(2 * x), np.sin(2 * x)], axis=1)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Variation:
-    """The torques tau(x) for every value x of one number: `weights` (values, k) times `taus` (k, rows, nv).
+    """One number x of the robot: the torques that rows need at some `samples` of it, `taus` (samples, rows, nv).
 
-    `stated` is the value that the robot has and `least` the least change of it, on the scale of `values`, that is
-    reported; `what` says what a value means and `cost` is subtracted from what it explains.
+    With `functions` of x, as many as samples, those of all `values` follow. `stated` is the value that the robot has
+    and `least` the least change of it that is reported; `what` says what a value means and `cost` is subtracted from
+    what it explains.
     """
 
     about: str
     what: Callable[[float], str]
-    values: Float[np.ndarray, " values"]
-    weights: Float[np.ndarray, "values k"]
-    taus: Float[np.ndarray, "k rows nv"]
+    taus: Float[np.ndarray, "samples rows nv"]
+    samples: tuple[float, ...] = (0.0, 1.0)
+    functions: Callable[[np.ndarray], np.ndarray] = LINEAR
+    values: Float[np.ndarray, " values"] = field(default_factory=lambda: FACTORS)
     stated: float = 1.0
     least: float = 0.1
     cost: float = 0.0
     joints: tuple[str, ...] = ()
+
+    @property
+    def weights(self) -> Float[np.ndarray, "values samples"]:
+        """Of `taus`, at each of the values."""
+        return self.functions(self.values) @ np.linalg.inv(self.functions(np.array(self.samples)))
 
 
 class Unexplained:
@@ -67,13 +85,12 @@ class Unexplained:
     def logarithms(self, taus: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "values nv"]:
         """Logarithm of the share of each torque that remains, for `weights` (values, k) of `taus` (k, rows, nv)."""
         shares = []
+        factors = np.concatenate([np.ones((len(weights), 1)), weights], axis=1)
         for joint, (basis, rotor) in enumerate(zip(self.bases, self.rotors, strict=True)):
             parts = np.concatenate([self.u[:, [joint]], -taus[:, :, joint].T], axis=1)
             parts = parts - basis @ (basis.T @ parts)
-            factors = np.concatenate([np.ones((len(weights), 1)), weights], axis=1)
             left = np.einsum("xi,ij,xj->x", factors, parts.T @ parts, factors)
-            inertia = factors @ (parts.T @ rotor)  # a rotor's inertia is positive
-            left = left - np.square(np.maximum(inertia, 0.0))
+            left = left - np.square(np.maximum(factors @ (parts.T @ rotor), 0.0))  # a rotor's inertia is positive
             left = np.maximum(left, 0.0) + self.noise[joint]
             shares.append(np.log(np.maximum(left / self.power[joint], FLOOR)))
         return np.stack(shares, axis=1)
@@ -90,7 +107,7 @@ def parameter_doubts(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"
     with torch.no_grad():
         M = robot.mass_matrix(torch.tensor(rows.q, device=robot.device)).cpu().numpy()
     left = Unexplained(robot, rows, np.sqrt(np.square(M).mean(axis=0) @ np.square(noise)))
-    tau = inverse_dynamics(robot, rows)
+    tau = needed_torques(robot, rows)
     now = left.logarithms(tau[None], np.ones((1, 1)))[0]
     if np.exp(now).max() < 100.0 * FLOOR:
         return []
@@ -112,41 +129,32 @@ def parameter_doubts(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"
     }
     others.pop(best.what(1.0), None)  # a mass with and without its inertia reads the same
     also = f" Nearly as well: {'; '.join(others.values())}." if others else ""
-    return [
-        look(
-            about=best.about,
-            what=f"{best.what(value)}; then {100.0 * np.exp(-gain / rows.nv):.2g} % of what was unexplained remains."
-            f"{also}",
-            do=REMEDY,
-            joints=best.joints,
-            numbers={"value": value, "gain": gain},
-        )
-    ]
+    remains = f"then {100.0 * np.exp(-gain / rows.nv):.2g} % of what was unexplained remains.{also}"
+    numbers = {"value": value, "gain": gain}
+    what = f"{best.what(value)}; {remains}"
+    return [look(about=best.about, what=what, do=REMEDY, joints=best.joints, numbers=numbers)]
 
 
 def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation]:
     names, tree, layout = robot.joint_names, robot.tree, robot.layout
     bodies = [(names[drive.joint], joint.child) for joint, drive in zip(layout.bodies, layout.drives, strict=True)]
-    linear = np.stack([1.0 - FACTORS, FACTORS], axis=1)  # of the torques at 0 and at 1
 
     def with_tree(**changes: torch.Tensor) -> np.ndarray:
-        return inverse_dynamics(replace(robot, tree=replace(tree, **changes)), rows)
+        return needed_torques(replace(robot, tree=replace(tree, **changes)), rows)
 
-    def factor(subject: str, meaning: Callable[[float], str], at_zero: np.ndarray, **more: object) -> Variation:
-        taus = np.stack([at_zero, tau])
-        return Variation(about=subject, what=meaning, values=FACTORS, weights=linear, taus=taus, **more)  # type: ignore[arg-type]
+    def factor(about: str, text: str, at_zero: np.ndarray, *joints: str, cost: float = 0.0) -> Variation:
+        return Variation(about=about, what=text.format, taus=np.stack([at_zero, tau]), cost=cost, joints=joints)
 
-    # torque constants and masses
     for joint, name in enumerate(names):
         text = (
             f"the torque of {name} is {{:.3g}} times what the motion needs, that of the others is not (its torque "
             "constant, gear ratio or unit)"
         )
         kept = np.where(np.arange(len(names)) == joint, 0.0, tau)
-        yield factor("torque constant", text.format, kept, joints=(name,))
+        yield factor("torque constant", text, kept, name)
     if len(names) > 1:
         text = "all torques fit {:.3g} times the masses of the URDF (or the torque unit is another)"
-        yield factor("masses", text.format, 0.0 * tau, cost=-0.1)
+        yield factor("masses", text, 0.0 * tau, cost=-0.1)
     for body, (name, link) in enumerate(bodies):
         J = tree.inertias[body, :, :, 0]
         if float(J[3, 3]) <= 0.0:
@@ -156,75 +164,50 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
             inertias = tree.inertias.clone()
             inertias[body, :, :, 0] -= part
             text = f"the torques fit a mass of {link} of {{:.3g}} times that of the URDF"
-            yield factor("masses", text.format, with_tree(inertias=inertias), joints=(name,))
-    powers = np.array([0.5, 1.0, 2.0])
-    quadratic = np.stack([FACTORS**0, FACTORS, FACTORS**2], axis=1) @ np.linalg.inv(
-        np.stack([powers**0, powers, powers**2], axis=1)
-    )
+            yield factor("masses", text, with_tree(inertias=inertias), name)
     for body, (name, _) in enumerate(bodies):
         length = float(torch.linalg.vector_norm(tree.rest[body, :3, 3, 0]))
         if length == 0.0 or layout.parents[body] < 0:
             continue  # where the whole robot stands changes nothing
-        taus = []
-        for x in powers:
-            rest = tree.rest.clone()
+        scaled = [tree.rest.clone() for _ in range(3)]
+        for x, rest in zip((0.5, 1.0, 2.0), scaled, strict=True):
             rest[body, :3, 3] *= x
-            taus.append(with_tree(rest=rest))
         yield Variation(
             about="lengths",
             what=lambda x, name=name, length=length: (
                 f"the torques fit {x:.3g} times the length from {name} to the joint before ({x * length:.3g} instead "
                 f"of {length:.3g} m)"
             ),
-            values=FACTORS,
-            weights=quadratic,
-            taus=np.stack(taus),
+            taus=np.stack([with_tree(rest=rest) for rest in scaled]),
+            samples=(0.5, 1.0, 2.0),
+            functions=_powers(2),
             cost=0.2,
             joints=(name,),
         )
-    yield from _zeros(robot, rows)
-    yield from _gravity(robot, rows, tau)
-
-
-def _zeros(robot: Robot, rows: Dataset) -> Iterator[Variation]:
-    """Positions that are counted from elsewhere."""
-    angles, samples = np.linspace(-np.pi, np.pi, 181), 2.0 * np.pi * np.arange(5) / 5.0
-
-    def waves(x: np.ndarray) -> np.ndarray:
-        return np.stack([x**0, np.cos(x), np.sin(x), np.cos(2 * x), np.sin(2 * x)], axis=1)
-
-    weights = waves(angles) @ np.linalg.inv(waves(samples))
-    for joint, name in enumerate(robot.joint_names):
+    for joint, name in enumerate(names):
         if robot.joints[joint].type == "prismatic":
             continue
-        one = np.eye(rows.nv)[joint]
-        taus = [inverse_dynamics(robot, replace(rows, q=rows.q + x * one)) for x in samples]
+        samples, one = tuple(2.0 * np.pi * np.arange(5) / 5.0), np.eye(rows.nv)[joint]
         yield Variation(
             about="joint zero",
             what=lambda x, name=name: (
                 f"the torques fit positions of {name} that are {x:+.3g} rad ({np.rad2deg(x):+.0f} "
                 "degrees) from the logged ones: its zero is elsewhere"
             ),
-            values=angles,
-            weights=weights,
-            taus=np.stack(taus),
+            taus=np.stack([needed_torques(robot, replace(rows, q=rows.q + x * one)) for x in samples]),
+            samples=samples,
+            functions=_waves,
+            values=np.linspace(-np.pi, np.pi, 181),
             stated=0.0,
             least=0.06,
             cost=0.3,
             joints=(name,),
         )
-
-
-def _gravity(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation]:
-    """More or less gravity; none; or any where the robot has none."""
+    # more or less gravity; none; or any where the robot has none
     nominal = robot.gravity.cpu().numpy()
     size = float(np.linalg.norm(nominal))
-    free = inverse_dynamics(with_gravity(robot, np.zeros(3)), rows) if size else tau
-    values = np.linspace(-1.5, 3.0, 226) if size else np.linspace(0.0, 1.5, 76)  # with 0 and 1
-    axes = [nominal / size] if size else [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
-    for axis in axes:
+    for axis in [nominal / size] if size else [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]:
         along = (size or STANDARD_GRAVITY) * axis
-        pulled = tau if size else inverse_dynamics(with_gravity(robot, along), rows)
         text = ",".join(f"{value + 0.0:.3g}" for value in along)
         stated = "" if size else f", but the robot states none (`gravity={text}`)"
         yield Variation(
@@ -234,9 +217,8 @@ def _gravity(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variation
                 if abs(x) < NO_GRAVITY
                 else f"the torques fit {x:.3g} times gravity along ({text}) m/s²{stated}"
             ),
-            values=values,
-            weights=np.stack([1.0 - values, values], axis=1),
-            taus=np.stack([free, pulled]),
+            taus=np.stack([needed_torques(with_gravity(robot, x * along), rows) for x in (0.0, 1.0)]),
+            values=np.linspace(-1.5, 3.0, 226) if size else np.linspace(0.0, 1.5, 76),  # with 0 and 1
             stated=1.0 if size else 0.0,
             cost=0.1,
         )

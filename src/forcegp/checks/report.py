@@ -159,8 +159,8 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
             return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
     doubts, _ = _doubts(CheckInput.quick(dataset, model), model)
     said = [each for each in doubts if each.level == "look" and each.about in BEFORE_A_FIT]
-    if dataset.nv > 1:  # friction of one joint can look like a delay
-        said = [each for each in said if each.about != "delay" or len(each.joints) > 1]
+    if dataset.nv == 1:  # friction of one joint can look like a delay
+        said = [each for each in said if each.about != "delay"]
     return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
@@ -181,7 +181,7 @@ def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Hypot
         compared = list(torque_doubts(inputs, comparison))
         noise = inputs.compared_noise
         if noise is not None and ("torque unit", "wrong") not in {(each.about, each.level) for each in compared}:
-            numbers = parameter_doubts(comparison.robot, comparison.rows, noise)
+            numbers = parameter_doubts(comparison.robot, comparison.without_laws(comparison.rows), noise)
             compared = [each for each in compared if not numbers or each.about != "torque unit"] + numbers
         doubts += [*corrections, *compared]
     return doubts, comparison

@@ -1,4 +1,4 @@
-"""Does each channel carry a signal: constant and frozen channels, saturation, limits, resolution."""
+"""Does each channel carry a signal: constant and frozen channels, saturation, limits."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -8,8 +8,7 @@ import numpy as np
 from forcegp.checks.check_input import CheckInput
 from forcegp.data import Dataset
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.row_selection import consecutive
-from forcegp.data.successive_rows import runs
+from forcegp.data.views import consecutive, runs
 from forcegp.doubts import Doubt, listed, look, wrong
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
@@ -22,20 +21,15 @@ MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
 CLIPPED_ROWS = 10
 TOLERANCE = 0.01  # of the range between limits, by which a position may exceed them: calibration
-COARSE = {
-    "q": 1e-3,
-    "v": 1e-2,
-    "u": 1e-2,
-}  # of the range, below which steps are no doubt; positions are differentiated twice
 
 
 def signal_doubts(inputs: CheckInput) -> list[Doubt]:
-    """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
+    """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
     clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
     found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
-    return [*found, *_limits(inputs), *_resolution(inputs)]
+    return [*found, *_limits(inputs)]
 
 
 def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
@@ -210,27 +204,3 @@ def _limits(inputs: CheckInput) -> Iterator[Doubt]:
             joints=beyond,
             numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
         )
-
-
-def _resolution(inputs: CheckInput) -> Iterator[Doubt]:
-    """Channels with few different values, and how coarse they are against their range."""
-    for name, quantity in QUANTITY.items():
-        quantized, quanta = [], {}
-        for joint, label in enumerate(inputs.names):
-            values = np.unique(getattr(inputs.log, name)[:, joint])
-            if len(values) < 3 or len(values) > 0.2 * len(inputs.log):
-                continue
-            steps = np.diff(values)
-            quantum = float(np.median(steps[steps > 1e-9 * np.ptp(values)]))
-            if quantum < COARSE[name] * np.ptp(values):
-                continue
-            quantized.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
-            quanta[label] = quantum
-        if quantized:
-            yield look(
-                about="resolution",
-                what=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
-                do="Log more digits, or expect noise from this.",
-                joints=tuple(quanta),
-                numbers={"quantity": name, "quantum": quanta},
-            )

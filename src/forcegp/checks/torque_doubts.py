@@ -6,8 +6,7 @@ import numpy as np
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.hypotheses import Hypothesis
-from forcegp.data import Delay, estimate_delay
-from forcegp.data.delay import SIGNIFICANT
+from forcegp.data import estimate_delay
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.summary import plain
@@ -116,39 +115,24 @@ def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     assert inputs.compared is not None
     if inputs.prepared is None:
         return  # without an order
-    data = log.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared.dataset)
+    data = log.without_laws(log.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared.dataset))
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:
         return  # too short
     step = float(np.median(np.diff(inputs.even.time)))
-    if abs(delay.significant) > LEAST_DELAY * step:
-        yield _delay(inputs.names, delay, delay.significant, delay.common_std, delay.remains)
-    for joint, name in enumerate(inputs.names):
-        own, std = float(delay.seconds[joint]), float(delay.std[joint])
-        remains = float(delay.residual[1, joint] / max(delay.residual[0, joint], 1e-12))
-        differs = abs(own - delay.significant) > max(SIGNIFICANT * std, 2.0 * step, 2e-3)
-        worth = remains < MUCH and delay.residual[0, joint] > 1e-4 and log.fit.rests_on_robot[joint]
-        if np.isfinite(own) and differs and worth and abs(own) > SIGNIFICANT * std:
-            yield _delay((name,), delay, own, std, remains)
-
-
-def _delay(names: tuple[str, ...], delay: Delay, seconds: float, std: float, remains: float) -> Doubt:
-    one = len(names) == 1
-    late = "later" if seconds > 0.0 else "earlier"
-    friction = " In a joint with much friction this can also be the friction's own lag." if one else ""
-    return Doubt(
-        level="wrong" if remains < MUCH and not one else "look",
-        about="delay",
-        what=f"the torque of {names[0] if one else 'all joints'} is logged {1e3 * abs(seconds):.1f} ms ± "
-        f"{1e3 * std:.1f} ms {late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained "
-        f"remains.{friction}",
-        do="If the other joints show none, leave it: shifting one joint can hide friction."
-        if one
-        else "forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
-        joints=names,
-        numbers={"delay": seconds, "std": std, "remains": remains, "per_joint": plain(delay.seconds)},
-    )
+    seconds, remains = delay.significant, delay.remains
+    if abs(seconds) > LEAST_DELAY * step:
+        late = "later" if seconds > 0.0 else "earlier"
+        yield Doubt(
+            level="wrong" if remains < MUCH else "look",
+            about="delay",
+            what=f"the torque of all joints is logged {1e3 * abs(seconds):.1f} ms ± {1e3 * delay.common_std:.1f} ms "
+            f"{late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained remains.",
+            do="forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
+            joints=inputs.names,
+            numbers={"delay": seconds, "std": delay.common_std, "remains": remains, "per_joint": plain(delay.seconds)},
+        )
 
 
 def not_compared(inputs: CheckInput) -> Doubt:

@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
 from forcegp.data import Dataset
-from forcegp.forces.columns import usual_columns
+from forcegp.forces import Law
+from forcegp.forces.columns import law_columns, usual_columns
 from forcegp.robots import Robot
 
 CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding
@@ -60,11 +61,16 @@ def columns_of(robot: Robot, rows: Dataset, widths: Sequence[float] = (SLOW,)) -
     return usual_columns(robot, rows.q, rows.v, rows.u, rows.a, widths)
 
 
-def inverse_dynamics(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
-    """Torques of the rigid bodies [Nm or N]."""
+def needed_torques(robot: Robot, rows: Dataset, laws: Sequence[Law] = ()) -> Float[np.ndarray, "rows nv"]:
+    """What the rigid bodies and these laws of joints need at these rows [Nm or N]."""
     with torch.no_grad():
         q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
-        return robot.inverse_dynamics(q, v, a).cpu().numpy()
+        return robot.inverse_dynamics(q, v, a).cpu().numpy() + torques_of_laws(robot, rows, laws)
+
+
+def torques_of_laws(robot: Robot, rows: Dataset, laws: Sequence[Law]) -> Float[np.ndarray, "rows nv"]:
+    """What these known laws of joints need [Nm or N]."""
+    return sum(law_columns(laws, robot, rows.q, rows.v, rows.u, rows.a), np.zeros_like(rows.v))
 
 
 def fit_torques(

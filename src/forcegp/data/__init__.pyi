@@ -1,11 +1,11 @@
 from .row_selection import (
-    time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
+    time_blocks as time_blocks, farthest as farthest, farthest_point_sampling as farthest_point_sampling,
+    farthest_rows as farthest_rows,
     repeated_rows as repeated_rows, require_disjoint as require_disjoint,
 )
 from .contacts import contact_rows as contact_rows, rows_in_contact as rows_in_contact
 from .contact_doubts import contact_doubts as contact_doubts
 from .dataset import Dataset as Dataset
-from .memory import with_memory as with_memory
 from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints
 from .filtering import (
     differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass
@@ -14,7 +14,10 @@ from .filtering import (
 )
 from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
 from .hdf5 import is_dataset as is_dataset
-from .motion_records import RecordedMotions as RecordedMotions, recorded_motions as recorded_motions
+from .views import (
+    RecordedMotions as RecordedMotions, Select as Select, evenly as evenly, recorded_motions as recorded_motions,
+    with_memory as with_memory,
+)
 from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
 from .spectrum import MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum
 from .stance import Stance as Stance, estimate_stance as estimate_stance

@@ -19,8 +19,8 @@ from torch import Tensor
 import forcegp.mechanics
 from forcegp.data.contacts import ALONG_NORMAL, CREEP, FARTHEST, PointMotion, point_motions, recovery_of, tensors
 from forcegp.data.dataset import Dataset
-from forcegp.data.row_selection import move_on
-from forcegp.data.successive_rows import white_noise
+from forcegp.data.noise import white_noise
+from forcegp.data.views import evenly, move_on
 from forcegp.doubts import Doubts, look, wrong
 from forcegp.errors import ForceGPError
 
@@ -65,7 +65,7 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
         return Doubts()
     seen = [white_noise(dataset, signal=name) if move_on(dataset) else None for name in ("v", "a")]
     noise = tuple(np.zeros(dataset.nv) if each is None else np.nan_to_num(each) for each in seen)
-    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
+    rows = dataset.rows(evenly(dataset, MOST_ROWS))
     with torch.no_grad():
         try:
             return _stated(rows, model.to("cpu"), noise) if model.contacts else _missing(rows, model.to("cpu"))

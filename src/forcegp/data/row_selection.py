@@ -1,11 +1,7 @@
-"""Which rows: stretches of time, whole episodes, and few rows that cover the visited states evenly.
-
-Neighbouring rows of one motion are nearly equal: a random split of rows tests memory, not prediction. Splits are
-therefore by episode, and `require_disjoint` refuses a pair that overlaps.
-"""
+"""Which rows: stretches of time, rows that two logs share, and few rows that cover the visited states evenly."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
@@ -107,13 +103,14 @@ def farthest_point_sampling(
     return chosen
 
 
-def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
-    """The `count` rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`.
+def farthest(dataset: Dataset, count: int, *, start: int = 0) -> Int[np.ndarray, " count"]:
+    """The rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`."""
+    return farthest_point_sampling(np.hstack([dataset.q, dataset.v, dataset.u]), count, start=start)
 
-    A model trained on fewer points takes the first ones: `farthest_rows(data, 1000).rows(slice(100))`.
-    """
-    points = np.hstack([dataset.q, dataset.v, dataset.u])
-    return dataset.rows(farthest_point_sampling(points, count, start=start))
+
+def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
+    """A Dataset of the rows that are `farthest`: one of fewer points takes the first, `farthest_rows(...)[:100]`."""
+    return dataset.rows(farthest(dataset, count, start=start))
 
 
 def _standardized_columns(table: np.ndarray) -> np.ndarray:
@@ -125,21 +122,3 @@ def _standardized_columns(table: np.ndarray) -> np.ndarray:
     spread[spread < ROUNDING] = 0.0
     centred = columns - columns.mean(axis=1, keepdims=True)
     return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)
-
-
-LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
-
-
-def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
-    """Whether the next row belongs to the same episode and follows; False for the last row."""
-    return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
-
-
-def move_on(dataset: Dataset) -> bool:
-    """Whether rows that follow each other belong to one motion; a sample of rows or of random states leaps about."""
-    steps = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]]
-    spread = dataset.q.std(axis=0)
-    moving = spread > 0.0
-    if not len(steps) or not moving.any():
-        return bool(len(steps))
-    return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.data import Dataset, contact_doubts
+from forcegp.data import Dataset, contact_doubts, evenly
 from forcegp.errors import ContactWarning, DataWarning, InvalidInput
 from forcegp.evidence.contacts import FAR_FROM_SURFACE
 from forcegp.evidence.likelihood import MarginalLikelihood, checked_values
@@ -187,7 +187,7 @@ def refuse_what_looks_alike(model: Model, dataset: Dataset) -> None:
     titles = [force_title(law) for law in model.laws if law.learned]
     if twice := [title for title in dict.fromkeys(titles) if titles.count(title) > 1]:
         raise InvalidInput(f"forces hold {twice[0]!r} twice, which no log tells apart; leave one of them out.")
-    few = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, min(ROWS_LOOKED_AT, len(dataset))).astype(int)))
+    few = dataset.rows(evenly(dataset, ROWS_LOOKED_AT))
     states = [torch.as_tensor(np.array(x), device=model.robot.device) for x in (few.q, few.v, few.u)]
     with torch.no_grad():
         state = model.state(*states)

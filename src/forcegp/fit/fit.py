@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset import require_rows
-from forcegp.data.memory import with_memory
+from forcegp.data.views import with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows
 from forcegp.evidence.contacts import check_distance

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, evenly
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import thickened
@@ -73,7 +73,7 @@ def fit_physical(
     robot, thick = thickened(model.robot) if _estimates_bodies(model) else (model.robot, ())
     model = replace(model, robot=robot)
     most = rows_at_most(robot) if rows is None else rows
-    logs = [log.rows(np.unique(np.linspace(0, len(log) - 1, min(most, len(log))).astype(int))) for log in logs]
+    logs = [log.rows(evenly(log, most)) for log in logs]
     typical = typical_sizes(model, logs)
     model = with_payloads_placed(model, logs, typical)
     space = ParameterSpace(model, typical)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
-from forcegp.checks.torques import inverse_dynamics
+from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, Preparation, episodes_in_order, motion_spectrum
 from forcegp.data.configurations import as_vectors, space_of
 from forcegp.scores.figures import style
@@ -87,7 +87,7 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
         style.draw_line(axes, shown.time, values[:, joint], style.TRUTH, 1.0, label)
         return style.joint_units(shown, "q")[joint]
     rows = log.applied(shown)
-    tau = inverse_dynamics(log.robot, rows)
+    tau = needed_torques(log.robot, rows, log.laws)
     measured, fitted = rows.u[:, joint], log.fit.at(log.robot, tau, rows)[:, joint]
     if not np.array_equal(measured, shown.u[:, joint]):
         style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")
