@@ -98,12 +98,12 @@ def test_a_prepared_log_is_told_with_the_price_that_was_paid():
     noisy = clean(3)
     noisy = replace(noisy, q=noisy.q + 1e-4 * np.random.default_rng(0).normal(size=noisy.q.shape))
     prepared = Preparation(cutoff=8.0, every=4, trim=0.2).apply(noisy)
-    report = check(prepared.dataset)
+    report = check(prepared)
     assert report.doubts.level == "ok", told(report)
     assert report.inputs.prepared is not None
-    assert report.inputs.prepared.preparation.cutoff is None  # it is not filtered twice
+    assert report.inputs.prepared.metadata["preparation"]["cutoff"] is None  # it is not filtered twice
     assert report.to_dict()["cutoff"] == 8.0
-    paid = prepared.report["acceleration_noise"]["after"]
+    paid = prepared.metadata["preparation"]["acceleration_noise"]["after"]
     assert [each["noise_after"] for each in report.per_joint()] == pytest.approx(paid)
     assert "when this dataset was prepared" in report.doubts.of("noise")[0].what
 

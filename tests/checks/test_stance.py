@@ -112,7 +112,7 @@ def test_a_heel_that_turns_under_a_flat_foot_is_named_and_left_out():
     assert 0.04 < angle[row] < 0.07
     assert "--stance auto" in doubt.advice
     with pytest.warns(DataWarning, match="stance open in 3.% of the rows"):
-        kept = Preparation(stance="auto").apply(log).dataset  # what the remedy does
+        kept = Preparation(stance="auto").apply(log)  # what the remedy does
     assert not of(kept)
     assert len(kept) > 0.5 * len(log)
     assert not of(rocking(0.03)[0])

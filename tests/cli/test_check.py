@@ -93,7 +93,7 @@ REFUSALS = {
         "x.h5",
     ): "nothing to do: give --cutoff, --delay, --lag, --stance",
     ("import", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
-    ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
+    ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100 Hz",
     ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
     ("import", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
     ("import", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",

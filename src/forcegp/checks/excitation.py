@@ -56,9 +56,9 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         yield ok(about="noise", what="the positions show no noise worth a filter.")
         return
     before, after = (numbers_of(measured[when]) for when in ("before", "after"))
-    spread = np.std(inputs.prepared.dataset.a, axis=0)
+    spread = np.std(inputs.prepared.a, axis=0)
     why = "`cutoff` auto" if inputs.automatic else "as asked for"
-    if report is not inputs.prepared.report:
+    if inputs.cutoff is None:
         why = "when this dataset was prepared"
     if np.isfinite(after).any():
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
@@ -114,7 +114,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     """Joints that hardly move or never turn back, and how well base parameters are determined."""
     if inputs.prepared is None:
         return
-    rows = inputs.prepared.dataset
+    rows = inputs.prepared
     still, one_way, motions = [], [], []
     for joint, name in enumerate(inputs.names):
         v = rows.v[:, joint]
@@ -144,7 +144,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
 def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
     """Joints that stand still in whole stretches although they move in others."""
     assert inputs.prepared is not None
-    rows = inputs.prepared.dataset
+    rows = inputs.prepared
     if len(rows.episodes) < 2:
         return
     spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])

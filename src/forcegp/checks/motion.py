@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
-from forcegp.data.filtering import JITTER
+from forcegp.data.sampling import JITTER
 from forcegp.data.views import consecutive
 from forcegp.doubts import Doubt, Level, listed, look, ok
 
@@ -119,7 +119,7 @@ def motion_doubts(inputs: CheckInput) -> list[Doubt]:
     """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, joint by joint."""
     if inputs.prepared is None:
         return []
-    cutoff = inputs.prepared.preparation.cutoff
+    cutoff = inputs.cutoff
     even = inputs.even
     if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(cutoff), signals=("q", "v", "a"))

@@ -115,7 +115,7 @@ def _delays(inputs: CheckInput, log: Hypothesis) -> Iterator[Doubt]:
     assert inputs.compared is not None
     if inputs.prepared is None:
         return  # without an order
-    data = log.without_laws(log.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared.dataset))
+    data = log.without_laws(log.applied(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared))
     try:
         delay = estimate_delay(data, log.robot)
     except DatasetError:

@@ -207,20 +207,19 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         """Rows to learn from, the same at the full rate, and what was done."""
         first = replace(wanted, every=1, stance="log")
         try:
-            chosen = first.apply(raw)
+            numbers = first.resolved(raw)
         except DatasetError as error:
             if self.lag != "auto" or wanted.lag != "auto":
                 raise
             terminal.note(f"rotors are taken to follow at once: {error}")
-            chosen = replace(first, lag=0.0).apply(raw)
-        numbers = chosen.preparation
+            numbers = replace(first, lag=0.0).resolved(raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         numbers = replace(numbers, trim=max(self.trim, period), stance=wanted.stance)
         every = numbers.thinning(raw) if self.every is None else wanted.every
         rows = replace(numbers, every=every).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
-            rows.dataset.save(temporary)
-        return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
+            rows.save(temporary)
+        return rows, numbers.apply(raw), dict(rows.metadata["preparation"])
 
     def _scored(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model

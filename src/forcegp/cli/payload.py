@@ -93,9 +93,9 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
         with terminal.progress(f"preparing {path}"):
             raw = replace(dataset, model=model)
             prepared = self.with_delay_that_shows(terminal, self._preparation(), raw).apply(raw)
-        why = prepared.report["why"]
+        why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
-        return model, prepared.dataset
+        return model, prepared
 
 
 def with_payload(

@@ -187,8 +187,8 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
         preparation = preparation.resolved(raw)
         if self.every is None:
             preparation = replace(preparation, every=preparation.thinning(raw))
-        rows = preparation.apply(raw).dataset
-        recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw).dataset
+        rows = preparation.apply(raw)
+        recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw)
         if preparation.cutoff is not None and (self.split or "auto").startswith(("blocks", "auto")):
             # a filter mixes what lies on both sides of a border
             memory = 1.0 / (math.pi * float(preparation.cutoff) * math.sin(0.5 * math.pi / preparation.order))

@@ -7,10 +7,12 @@ from .contacts import contact_rows as contact_rows, rows_in_contact as rows_in_c
 from .contact_doubts import contact_doubts as contact_doubts
 from .dataset import Dataset as Dataset
 from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints
-from .filtering import (
-    differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass
-    as low_pass, low_pass_gain as low_pass_gain, resample as resample, uniform_step as uniform_step, zero_phase_low_pass
-    as zero_phase_low_pass,
+from .filters import (
+    Filter as Filter, Lag as Lag, Later as Later, LowPass as LowPass, Mean as Mean, low_pass as low_pass,
+)
+from .sampling import (
+    differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order,
+    resample as resample, uniform_step as uniform_step,
 )
 from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
 from .hdf5 import is_dataset as is_dataset
@@ -18,7 +20,7 @@ from .views import (
     RecordedMotions as RecordedMotions, Select as Select, evenly as evenly, recorded_motions as recorded_motions,
     with_memory as with_memory,
 )
-from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
+from .preparation import Preparation as Preparation, preparation_report as preparation_report
 from .spectrum import MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum
 from .stance import Stance as Stance, estimate_stance as estimate_stance
 from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag, thruster_columns as thruster_columns

@@ -5,18 +5,17 @@ Of both, the number of seconds is taken at which inverse dynamics fits the torqu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 import forcegp.robots
 from forcegp.data.dataset import Dataset, require_rows
-from forcegp.data.filtering import episodes_in_order
+from forcegp.data.filters import Lag
+from forcegp.data.sampling import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 
 LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s
@@ -188,37 +187,6 @@ def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
     return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
 
 
-def delayed(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"], seconds: float) -> np.ndarray:
-    """`values` at `time + seconds`, by a cubic spline; the values at the ends hold beyond them."""
-    if seconds == 0.0:
-        return values
-    return CubicSpline(time, values)(np.clip(time + seconds, time[0], time[-1]))
-
-
-def lagged(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"], seconds: float) -> np.ndarray:
-    """What an actuator of first order with that time constant makes of `values`, at rest with the first of them.
-
-    By Tustin's rule (trapezoids), exact for values that are linear between equal steps of time up to the square of
-    step over time constant.
-    """
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if seconds <= 0.25 * step:
-        return values
-    ratio = 2.0 * seconds / step
-    moved = lfilter([1.0, 1.0], [1.0 + ratio, 1.0 - ratio], values - values[0])
-    return np.asarray(moved) + values[0]
-
-
-def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
-    """The dataset with each actuator's force taken so many seconds later, after a lag [s] where one is given."""
-    u = dataset.u.copy()
-    for number, rows, _ in episodes_in_order(dataset):
-        for joint, shift in enumerate(seconds):
-            acting = lagged(rows.u[:, joint], rows.time, lags[joint] if len(lags) else 0.0)
-            u[dataset.episode == number, joint] = delayed(acting, rows.time, shift)
-    return replace(dataset, u=u, truth={})
-
-
 class _Shifts:
     """The rows that are compared, and how to shift a torque against them."""
 
@@ -245,7 +213,7 @@ class _Shifts:
         for own, time, at in self.episodes:
             if self.kind == "lag":
                 rows = np.searchsorted(time, at)
-                parts.append(np.stack([lagged(u[own], time, lag)[rows] for lag in self.shifts]))
+                parts.append(np.stack([Lag(lag)(u[own], time)[rows] for lag in self.shifts]))
             elif len(at):
                 parts.append(CubicSpline(time, u[own])(at + self.shifts[:, None]))
         return np.concatenate(parts, axis=1)

@@ -2,18 +2,18 @@
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 from warnings import warn
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
-from forcegp.data.configurations import actuators, as_vectors, space_of
+from forcegp.data.configurations import actuators
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import estimate_delay, shifted, torques_of_joints
-from forcegp.data.filtering import Signal, differentiated, episodes_in_order, low_pass, low_pass_gain, uniform_step
+from forcegp.data.delay import estimate_delay, torques_of_joints
+from forcegp.data.filters import PASSED, LowPass, Signal, low_pass, shifted
+from forcegp.data.sampling import differentiated, episodes_in_order, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
@@ -22,7 +22,7 @@ from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
-PASSED, FEW = 3.0, 2_000  # rows in a period of the cut-off, of which more repeat their neighbours; of a whole log
+FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 
 
@@ -33,7 +33,6 @@ class Preparation:
     cutoff: zero-phase Butterworth low-pass of that many Hz on q and u (with `differentiate="v"` on v as well), after
         which v and a are computed anew; "auto" reads it from the spectrum (`motion_spectrum`), None leaves q, v, a
         and u as they are.
-    order: of the filter; it runs forwards and backwards.
     delay: how much later than it acts u was logged [s], one number or one per actuator: `u(t) := u_logged(t + delay)`;
         "auto" estimates one for all joints (`estimate_delay`), used where it is sure and explains something.
     lag: time constant of the actuators [s], one or one per actuator: `u` becomes what an actuator of first order makes
@@ -43,24 +42,24 @@ class Preparation:
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
     stance: "auto" sets the switches of contacts in u to what motion and forces show (`estimate_stance`), after the
         filter, and drops rows that leave one open; "log" keeps them.
+    why: reasons for the numbers in place of "auto", of a preparation that was `resolved`.
 
     Raises InvalidInput for values that are not allowed.
     """
 
     cutoff: float | Literal["auto"] | None = None
-    order: int = 4
     delay: float | tuple[float, ...] | Literal["auto"] = 0.0
     lag: float | tuple[float, ...] | Literal["auto"] = 0.0
     every: int = 1
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
     stance: Literal["log", "auto"] = "log"
+    why: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     @usable_arguments("Preparation")
     def __post_init__(self) -> None:
         if self.cutoff not in (None, "auto") and not (_finite(self.cutoff) and self.cutoff > 0):
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
-        whole_number("order", self.order, 1, 12)
         for name in LATE:
             given = getattr(self, name)
             if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
@@ -90,38 +89,38 @@ class Preparation:
     @property
     def changes_nothing(self) -> bool:
         """Whether the rows stay as they are."""
-        return self == Preparation(order=self.order, differentiate=self.differentiate)
+        return self == Preparation(differentiate=self.differentiate)
 
     def resolved(self, dataset: Dataset) -> "Preparation":
-        """The same with numbers in place of "auto". Raises as `motion_spectrum` and `estimate_delay`."""
-        return _resolve(self, dataset)[0]
+        """The same with numbers in place of "auto", and `why`. Raises as `motion_spectrum` and `estimate_delay`."""
+        return _resolve(self, dataset)
 
     def rows(self, dataset: Dataset) -> Dataset:
         """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
         chosen = self.resolved(dataset)
         return _chosen_rows(chosen, dataset, _filtered(chosen, dataset))[0]
 
-    def apply(self, dataset: Dataset) -> "Prepared":
-        """The prepared Dataset and its price.
+    def apply(self, dataset: Dataset) -> Dataset:
+        """The prepared Dataset, with its price under "preparation" in the metadata.
 
-        `truth` and `noise_std` are dropped as `low_pass` and `differentiated` drop them. Raises DatasetError for rows
-        that are out of order, sampled unevenly or too few, and InvalidInput for a cut-off above half the sample rate.
+        The price holds the settings; "why" for what was chosen; "rows" and "sample_rate" [Hz] before and after; per
+        joint "acceleration_noise" before and after the filter [rad/s^2 or m/s^2] (None where the log shows no noise
+        floor); and the price that was paid "earlier". `truth` and `noise_std` are dropped as `low_pass` and
+        `differentiated` drop them. Raises DatasetError for rows that are out of order, sampled unevenly or too few, and
+        InvalidInput for a cut-off above half the sample rate.
         """
-        chosen, reasons = _resolve(self, dataset)
-        filtered = _filtered(chosen, dataset)
-        prepared, found = _chosen_rows(chosen, dataset, filtered)
-        report = _report(chosen, reasons, dataset, filtered, prepared) | found
-        metadata = {**dataset.metadata, "preparation": report}
+        chosen = self.resolved(dataset)
+        prepared, found = _chosen_rows(chosen, dataset, _filtered(chosen, dataset))
+        report = _report(chosen, dataset, prepared) | found
         if "preparation" in dataset.metadata:
-            metadata["preparation"] = {**report, "earlier": dataset.metadata["preparation"]}
-        prepared = replace(prepared, metadata=metadata)
-        return Prepared(dataset=prepared, report=metadata["preparation"], preparation=chosen)
+            report["earlier"] = dataset.metadata["preparation"]
+        return replace(prepared, metadata={**dataset.metadata, "preparation": report})
 
 
 def memory(metadata: Mapping[str, Any]) -> float:
     """Time in s within which rows of a filtered log repeat their neighbours; 0 where the metadata name no filter."""
     cutoff = preparation_report(metadata).get("cutoff")
-    return 0.0 if cutoff is None else 1.0 / (PASSED * float(cutoff))
+    return 0.0 if cutoff is None else LowPass(float(cutoff)).memory
 
 
 def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -130,22 +129,8 @@ def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     return report if isinstance(report, Mapping) and {"cutoff", "why", "rows"} <= report.keys() else {}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Prepared:
-    """A prepared Dataset, the preparation with numbers in place of "auto", and its price as plain JSON.
-
-    `report`: the settings; "why" for what was chosen; "rows" and "sample_rate" [Hz] before and after; per joint
-    "acceleration_noise" before and after the filter [rad/s^2 or m/s^2] (None where the log shows no noise floor) and
-    "power_removed", the share of the variance of q, v, a and u that the filter took.
-    """
-
-    dataset: Dataset
-    report: dict[str, Any]
-    preparation: Preparation
-
-
-def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[str, Any]]:
-    reasons: dict[str, Any] = {}
+def _resolve(given: Preparation, dataset: Dataset) -> Preparation:
+    reasons: dict[str, Any] = dict(given.why)
     for name in LATE:
         value = getattr(given, name)
         if isinstance(value, tuple) and len(value) != (count := actuators(dataset)):
@@ -160,7 +145,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         model = dataset.model
         if cutoff is not None and model is not None and not model.contacts and torques_of_joints(dataset):
             with contextlib.suppress(DatasetError):  # too short, or sampled too slowly: the spectrum has to do
-                best, tried = held_out_cutoff(dataset, model.robot, cutoff, given.differentiate, given.order)
+                best, tried = held_out_cutoff(dataset, model.robot, cutoff, given.differentiate)
                 shares = ", ".join(f"{100.0 * share:.2g} % at {frequency:g} Hz" for frequency, share in tried.items())
                 reasons["cutoff"] += f"; of held-out torques stay unexplained {shares}"
                 cutoff = best
@@ -181,7 +166,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> tuple[Preparation, dict[st
         reasons[name] = found.reason
         reasons[f"{name}_common"], reasons[f"{name}_common_std"] = plain(np.array([found.common, found.common_std]))
         reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = plain(found.seconds), plain(found.std)
-    return chosen, reasons
+    return replace(chosen, why=reasons)
 
 
 BEYOND_BASE = 8.0
@@ -213,7 +198,7 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     assert chosen.cutoff != "auto"
     if chosen.cutoff is not None:
         signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
-        dataset = low_pass(dataset, float(chosen.cutoff), order=chosen.order, signals=signals)
+        dataset = low_pass(dataset, float(chosen.cutoff), signals=signals)
         dataset = differentiated(dataset, chosen.differentiate)
     shifts, lags = (_per_actuator(given, dataset) for given in (chosen.delay, chosen.lag))
     if not any((*shifts, *lags)):
@@ -271,18 +256,14 @@ def _chosen_rows(chosen: Preparation, raw: Dataset, filtered: Dataset) -> tuple[
     return rows, {"stance": {"standing": stands, "open_rows": len(kept) - len(rows)}}
 
 
-def _report(
-    chosen: Preparation, reasons: dict[str, Any], raw: Dataset, filtered: Dataset, prepared: Dataset
-) -> dict[str, Any]:
-    per_joint = {name: _per_actuator(getattr(chosen, name), raw) for name in LATE}
+def _report(chosen: Preparation, raw: Dataset, prepared: Dataset) -> dict[str, Any]:
     report: dict[str, Any] = {
         "cutoff": chosen.cutoff,
-        "order": chosen.order,
-        **per_joint,
+        **{name: _per_actuator(getattr(chosen, name), raw) for name in LATE},
         "every": chosen.every,
         "trim": chosen.trim,
         "differentiate": chosen.differentiate if chosen.cutoff is not None else None,
-        "why": reasons,
+        "why": chosen.why,
         "rows": [len(raw), len(prepared)],
     }
     if chosen.changes_nothing:
@@ -295,21 +276,9 @@ def _report(
     if max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) >= FEWEST_ROWS:
         spectrum = motion_spectrum(raw, chosen.differentiate)
         before = spectrum.acceleration_noise()
-        after = spectrum.acceleration_noise(lambda f: low_pass_gain(f, rate, float(chosen.cutoff or 0.0), chosen.order))
+        after = spectrum.acceleration_noise(LowPass(float(chosen.cutoff)))
     report["acceleration_noise"] = {"before": plain(before), "after": plain(after)}
-    unshifted = _filtered(replace(chosen, delay=0.0, lag=0.0), raw) if any(map(any, per_joint.values())) else filtered
-    report["power_removed"] = {name: _power_removed(raw, unshifted, name) for name in ("q", "v", "a", "u")}
     return report
-
-
-def _power_removed(before: Dataset, after: Dataset, name: str) -> list[float | None]:
-    """Share of the variance of each column that is gone: the variance of the difference over that before."""
-    old, new = getattr(before, name), getattr(after, name)
-    change, space = old - new, space_of(before)
-    if name == "q" and not space.is_vector_space:
-        old, change = as_vectors(before), space.difference(*(torch.tensor(x) for x in (new, old))).numpy()
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return plain(np.minimum(np.var(change, axis=0) / np.var(old, axis=0), 1.0))
 
 
 def _finite(value: object) -> bool:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 import forcegp.mechanics
 from forcegp.data.contacts import tensors
 from forcegp.data.dataset import Dataset
+from forcegp.data.filters import Mean
 from forcegp.errors import ContactError, DatasetError, DataWarning
 
 WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
@@ -137,8 +138,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
         smooth = np.empty_like(own)
         for rows, width in zip(episodes, widths, strict=True):
-            smooth[rows] = _averaged(own[rows], width)
-            force[rows, k] = np.linalg.norm(_averaged(needed[rows], width), axis=1)
+            smooth[rows] = Mean(width)(own[rows])
+            force[rows, k] = np.linalg.norm(Mean(width)(needed[rows]), axis=1)
         speed[:, k] = np.linalg.norm(smooth, axis=1)
         noise[k] = max(_noise(smooth, episodes, [times * width for width in widths]) for times in (1, 2))
     slow = np.maximum(SLOW, DEVIATIONS * noise)
@@ -156,7 +157,7 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         weight = float(gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
-        falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
+        falls = np.linalg.norm(Mean(width)(whole[rows]), axis=1) < FALLS * weight
         stands = (flags[rows] == 1.0).any(axis=1)
         flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
     flags[tilting(dataset, model, names, flags)] = np.nan
@@ -224,14 +225,6 @@ def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], stri
         return 0.0
     each = np.quantile(np.abs(np.concatenate(differences)), 0.25, axis=0) / (QUARTER * 20.0**0.5)
     return float(np.linalg.norm(each))
-
-
-def _averaged(values: Float[np.ndarray, "rows m"], width: int) -> Float[np.ndarray, "rows m"]:
-    """Means over windows of so many rows, which are shorter at the ends."""
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    rows: Int[np.ndarray, " rows"] = np.arange(len(values))
-    first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
-    return (total[last] - total[first]) / (last - first)[:, None]
 
 
 def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import jackknife, lagged, least_squares, lowest
-from forcegp.data.filtering import episodes_in_order
+from forcegp.data.delay import jackknife, least_squares, lowest
+from forcegp.data.filters import Lag
+from forcegp.data.sampling import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.manifold import Group
 
@@ -80,7 +81,7 @@ def thruster_columns(model: forcegp.Model | None) -> dict[int, int]:
 def _causes(
     part: Dataset, columns: list[int], powers: np.ndarray, group: Group, seconds: float
 ) -> Float[np.ndarray, "rows causes"]:
-    late = np.stack([lagged(part.u[:, column], part.time, seconds) for column in columns], axis=1)
+    late = Lag(seconds)(part.u[:, columns], part.time)
     thrust = np.where(powers == 2, late * np.abs(late), late)
     v, w = part.v[:, group.rows][:, :3], part.v[:, group.rows][:, 3:]
     axes = Rotation.from_quat(part.q[:, group.places][:, group.motion.turn]).as_matrix().reshape(-1, 9)
@@ -109,8 +110,7 @@ def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:
 
 def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:
     """Without what a low pass of first order leaves, where that has settled."""
-    slow = np.stack([lagged(column, time, FAST) for column in values.T], axis=1) if values.size else values
-    return (values - slow)[time - time[0] > SETTLED]
+    return (values - Lag(FAST)(values, time))[time - time[0] > SETTLED]
 
 
 def _misfits(X: Float[np.ndarray, "rows causes"], target: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " parts"]:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.interpolate import make_interp_spline
 
 import forcegp.robots
-from forcegp.data.filtering import JITTER
+from forcegp.data.sampling import JITTER
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.joined_topics import Read, read_on_one_clock
 from forcegp.recordings.moving_base import Jumps, Layout, read_poses

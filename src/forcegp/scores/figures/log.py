@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import needed_torques
-from forcegp.data import Dataset, Preparation, episodes_in_order, motion_spectrum
+from forcegp.data import Dataset, episodes_in_order, motion_spectrum
 from forcegp.data.configurations import as_vectors, space_of
 from forcegp.scores.figures import style
 
@@ -116,9 +116,9 @@ def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     if shown.size:
         top = 5.0 * float(shown.max())
         axes.set_ylim(max(0.1 * float(shown.min()), top * 10.0**-DECADES), top)
-    preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
+    cutoff = inputs.cutoff
     title = "Acceleration as logged: no filter"
-    if preparation.cutoff is not None:
-        axes.axvline(float(preparation.cutoff), color=style.TRUTH, linestyle="--", linewidth=1.0, label="cut-off")
-        title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
+    if cutoff is not None:
+        axes.axvline(float(cutoff), color=style.TRUTH, linestyle="--", linewidth=1.0, label="cut-off")
+        title = f"Acceleration as logged, and the cut-off at {float(cutoff):.3g} Hz"
     style.quiet(axes, title=title, x="frequency [Hz]", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

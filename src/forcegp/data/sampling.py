@@ -1,6 +1,6 @@
-"""Low-pass filtering, differentiation and resampling of logs; every function returns new arrays or a new Dataset."""
+"""Steps of time of a log: differences, other times, and what is done episode by episode."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -13,54 +13,10 @@ from forcegp.data.configurations import actuators, continuous, rates, space_of, 
 from forcegp.data.dataset import Dataset
 from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 JITTER = 0.01
 """Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
-
-TRANSIENT = 1e-3
-"""What is left of a filter's transient at the ends of a recording; sets the length of the padding."""
-
-Signal = Literal["q", "v", "u", "a"]
-
-
-def zero_phase_low_pass(
-    values: Float[np.ndarray, "rows columns"], sample_rate: float, cutoff: float, order: int = 4
-) -> Float[np.ndarray, "rows columns"]:
-    """Butterworth low-pass, run forwards and backwards so that nothing is delayed.
-
-    Both ends are continued by point reflection until the filter's transient has died out, so that straight lines pass.
-    Two passes square the gain: `1 / (1 + (tan(pi f / f_s) / tan(pi f_c / f_s))^(2 order))`, so 1/2 at `cutoff` [Hz].
-    Raises InvalidInput for a cut-off at or above half the sample rate [Hz] and DatasetError for too few rows.
-    """
-    if not (np.isfinite(sample_rate) and sample_rate > 0):
-        raise InvalidInput(f"sample_rate is {sample_rate} Hz; it must be > 0.")
-    if not 0 < cutoff < sample_rate / 2:
-        raise InvalidInput(
-            f"cutoff is {cutoff} Hz; it must be > 0 and below {sample_rate / 2} Hz, half the sample rate."
-        )
-    whole_number("order", order, 1, 12)
-    from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
-
-    sections = butter(order, cutoff, fs=sample_rate, output="sos")
-    slowest = np.abs(butter(order, cutoff, fs=sample_rate, output="zpk")[1]).max()
-    padding = max(int(np.ceil(np.log(TRANSIENT) / np.log(slowest))), order + 1)
-    if len(values) <= padding:
-        raise DatasetError(
-            f"{len(values)} rows are too few for a filter of order {order} with a cut-off at {cutoff} Hz; "
-            f"more than {padding} are needed. Use a higher cut-off or a lower order, or leave the episode out."
-        )
-    return sosfiltfilt(sections, values, axis=0, padlen=padding)
-
-
-def low_pass_gain(
-    frequency: Float[np.ndarray, " frequencies"], sample_rate: float, cutoff: float, order: int = 4
-) -> Float[np.ndarray, " frequencies"]:
-    """Gain of `zero_phase_low_pass` at these frequencies [Hz]: of amplitudes, not of power."""
-    with np.errstate(over="ignore"):  # infinite at half the sample rate, where nothing passes
-        warped = np.tan(np.pi * frequency / sample_rate) / np.tan(np.pi * cutoff / sample_rate)
-        return 1.0 / (1.0 + np.abs(warped) ** (2 * order))
 
 
 def differentiate(
@@ -95,36 +51,6 @@ def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording")
     return float((time[-1] - time[0]) / (len(time) - 1))
 
 
-def low_pass(
-    dataset: Dataset, cutoff: float, *, order: int = 4, signals: Sequence[Signal] = ("q", "v", "u", "a")
-) -> Dataset:
-    """The Dataset with the named signals low-pass filtered (`zero_phase_low_pass`) within each episode.
-
-    Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Filtering q,
-    v or u drops `truth`: with it, the equation of motion would no longer hold in the changed rows. Switches of contacts
-    stay as they are. Raises as `zero_phase_low_pass` and `uniform_step`, naming the episode; DatasetError for rows that
-    are not in order of time, for positions that jump by a turn, and for a base that turns faster than the filter
-    passes.
-    """
-    if not signals or not set(signals) <= {"q", "v", "u", "a"}:
-        raise InvalidInput(f"signals are {tuple(signals)!r}; allowed: one or more of q, v, u, a.")
-
-    def filtered(name: str, rows: Dataset, label: str) -> np.ndarray:
-        def smooth(values: np.ndarray) -> np.ndarray:
-            return zero_phase_low_pass(values, 1.0 / uniform_step(rows.time, label), cutoff, order)
-
-        if name == "q":
-            require_no_turns(rows, label)
-            return through(space_of(rows), rows.q, smooth)
-        values = getattr(rows, name)
-        forces = actuators(rows) if name == "u" else rows.nv
-        return np.concatenate([smooth(values[:, :forces]), values[:, forces:]], axis=1)
-
-    changed = _by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
-    noise_std = None if "a" in signals else dataset.noise_std
-    return replace(dataset, **changed, truth=dataset.truth if set(signals) == {"a"} else {}, noise_std=noise_std)
-
-
 def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset:
     """The Dataset with `a` computed from `v` by central differences, or `v` and `a` from `q`, within each episode.
 
@@ -143,7 +69,7 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
         return {"v": velocity, "a": differentiate(velocity, rows.time)}
 
     truth = dataset.truth if source == "v" else {}
-    return replace(dataset, **_by_episode(dataset, derivatives), truth=truth, noise_std=None)
+    return replace(dataset, **by_episode(dataset, derivatives), truth=truth, noise_std=None)
 
 
 def resample(dataset: Dataset, step: float) -> Dataset:
@@ -197,7 +123,7 @@ def sums_before(
     return sums
 
 
-def _by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Apply `change` to each episode and put its rows back where they came from."""
     result: dict[str, np.ndarray] = {}
     for number, rows, label in episodes_in_order(dataset):
