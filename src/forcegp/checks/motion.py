@@ -1,6 +1,6 @@
 """Are the rows even in time, and do q, v and a belong to each other."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
+from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.delay import lowest
 from forcegp.data.sampling import JITTER
 from forcegp.data.views import consecutive
@@ -115,22 +116,22 @@ SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
 
 
-def motion_doubts(inputs: CheckInput) -> list[Doubt]:
-    """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, joint by joint."""
+def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> list[Doubt]:
+    """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, of all joints or of some."""
     if inputs.prepared is None:
         return []
-    cutoff = inputs.cutoff
     even = inputs.even
-    if cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
-        even = low_pass(even, float(cutoff), signals=("q", "v", "a"))
+    if inputs.cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
+        even = low_pass(even, float(inputs.cutoff), signals=("q", "v", "a"))
+    joints = range(even.nv) if joints is None else joints
     pieces = [even.select_episodes([number]) for number in even.episodes]
     found: list[Doubt] = []
     for name, source in (("v", "q"), ("a", "v")):
         if name == "a" and any(doubt.level != "ok" for doubt in found):
             break  # of wrong velocities nothing better can come
-        compared = ((joint, _compared(pieces, name, source, joint)) for joint in range(even.nv))
+        compared = ((joint, _compared(pieces, name, source, joint)) for joint in joints)
         fits = {joint: fit for joint, fit in compared if fit is not None}
-        found += _differences(inputs, name, source, fits)
+        found += _differences(inputs, name, source, fits, len(joints))
         if not found and fits and name == "v":
             error = max(unexplained for _, _, unexplained in fits.values())
             seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
@@ -162,7 +163,7 @@ def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tupl
 
 
 def _differences(
-    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]]
+    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]], count: int
 ) -> Iterator[Doubt]:
     """One doubt for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
@@ -180,7 +181,7 @@ def _differences(
     what = "velocity" if name == "v" else "acceleration"
     for (kind, known), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
-        named, every = inputs.named(joints), len(joints) == len(inputs.names) > 2
+        named, every = inputs.named(joints), len(joints) == count > 2
         one = f"the {what} of {'all joints' if every else listed(named)} is"
         severity: Level = "wrong"
         seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
@@ -210,8 +211,10 @@ def _differences(
         correction: dict[str, Any] = {}
         if name == "v" and severity == "wrong" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
-        elif name == "v" and severity == "wrong" and known in UNITS and named == inputs.names:
-            correction = {"unit": {"v": (UNITS[known],)}}
+        elif name == "v" and severity == "wrong" and known in UNITS and len(joints) == count:
+            now = unit_of_each("v", inputs.log.units["v"], inputs.log.nv)
+            each = [UNITS[known] if joint in fits else unit for joint, unit in enumerate(now)]
+            correction = {"unit": {"v": tuple(each[:1] if len(set(each)) == 1 else each)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)

@@ -1,7 +1,7 @@
 """`check`: one log against itself and its robot, as a list of doubts that a person acts on."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,9 +17,9 @@ from forcegp.checks.signals import signal_doubts
 from forcegp.checks.stance import gravity_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.checks.torque_doubts import not_compared, torque_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
+from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.data.dataset_fields import unit_of_each
-from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
+from forcegp.doubts import LEVELS, Doubt, Doubts, look
 from forcegp.errors import InvalidInput, require_type
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -27,21 +27,13 @@ from forcegp.summary import Summary, plain
 
 
 def robot_doubts(robot: Robot) -> Iterator[Doubt]:
-    """Moving links without inertia, equal inertias, centres of mass and radii of gyration beyond the robot's reach."""
+    """Equal inertias of all links, centres of mass and radii of gyration beyond the robot's reach."""
     moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
     heavy = [link for link in moving if link.mass > 0.0]
     # the distances between joints, and the largest of a centre of mass from its joint [m]
     origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
     centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
     reach = origins + max(centers, default=0.0) if origins > 0.0 else 0.0
-    children = {joint.child for joint in robot.layout.bodies}
-    alone = [link.name for link in moving if link.mass == 0.0 and link.name in children]
-    if alone:
-        yield look(
-            about="URDF",
-            what=f"{listed(alone)} move with a joint of their own but have no mass.",
-            do="Add their <inertial>, or expect their inertia to be missing.",
-        )
     shapes = {(link.mass, link.inertia) for link in heavy}
     if len(heavy) > 2 and len(shapes) == 1:
         yield look(
@@ -200,27 +192,9 @@ def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = N
 
 def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Doubt]:
     """Whether q, v and a of the joints of one degree of freedom belong together; quick where there is no filter."""
-    rows = robot.space.single_rows
-    if not rows or not dataset.time_ordered:
+    if not robot.space.single_rows or not dataset.time_ordered:
         return
-    places = [robot.position_names.index(name) for name in robot.single_joint_names]
-    each = {name: unit_of_each(name, dataset.units[name], dataset.nv) for name in ("q", "v", "u", "a")}
-    alone = Dataset(
-        q=dataset.q[:, places], v=dataset.v[:, rows], a=dataset.a[:, rows], u=np.zeros((len(dataset), len(rows))),
-        time=dataset.time, episode=dataset.episode, joint_names=robot.single_joint_names, metadata=dataset.metadata,
-        units={name: tuple(units[row] for row in rows) for name, units in each.items()} | {"time": "s"},
-    )  # fmt: skip
+    alone = replace(dataset, model=None, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
     with contextlib.suppress(InvalidInput):  # too short
         inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
-        for doubt in motion_doubts(inputs):  # gaps may be rows whose feet are not known
-            yield _for_all_columns(doubt, rows, {"unit": each["v"], "sign": (1.0,) * dataset.nv})
-
-
-def _for_all_columns(doubt: Doubt, rows: list[int], columns: Mapping[str, Sequence[Any]]) -> Doubt:
-    """The doubt with a correction for the joints in these rows as one for all columns, those of the base as now."""
-    correction: dict[str, dict[str, tuple[Any, ...]]] = {}
-    for what, of_signal in doubt.correction.items():
-        for signal, own in of_signal.items():
-            whole = dict(enumerate(columns[what])) | dict(zip(rows, own * (len(rows) // len(own)), strict=True))
-            correction[what] = {signal: tuple(whole.values())}
-    return replace(doubt, correction=correction)
+        yield from motion_doubts(inputs, robot.space.single_rows)  # gaps may be rows whose feet are not known

@@ -28,9 +28,7 @@ MOST_ROWS = 240
 FEWEST_ROWS = 10
 
 FAR = 0.01  # m
-HARDLY_ANY = 0.2
-"""Share of rows that move along a surface, below which it is another one."""
-
+HARDLY_ANY = 0.2  # Share of rows that move along a surface, below which it is another one
 BROKEN, NOISE = 0.2, 3.0
 """|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
 
@@ -40,16 +38,10 @@ MOVED_GAIN = 0.7
 NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
-MANY_ROWS = 40
-"""From which on friction may also turn a link about the normal of a contact."""
-
-BLOCKS = 6
-"""Stretches that are left out in turn, for standard deviations."""
-
+MANY_ROWS = 40  # From which on friction may also turn a link about the normal of a contact
+BLOCKS = 6  # Stretches that are left out in turn, for standard deviations
 STEP = 1e-3  # m
-SLOW = 0.1
-"""Of the root mean square velocity: where dry friction turns over."""
-
+SLOW = 0.1  # Of the root mean square velocity: where dry friction turns over
 FLOOR = 1e-14
 
 
@@ -269,9 +261,7 @@ def moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Mode
 NEEDED, FEWEST_SLIDING = 2.0, 20
 """Logarithm of what remains of accelerations without the contact over what remains with it, over all joints; rows."""
 
-STAYS = 3e-3
-"""Mean square velocity along a direction, relative to what joints that move independently would give."""
-
+STAYS = 3e-3  # Mean square velocity along a direction, relative to what joints that move independently would give
 ARM = 0.3
 """Size in m of a link: of several points that stay on a surface, one not farther from its frame than that is likely."""
 

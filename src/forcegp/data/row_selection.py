@@ -61,8 +61,7 @@ def require_disjoint(train: Dataset, test: Dataset) -> None:
         )
 
 
-ROUNDING = 1e-13
-"""Standard deviation, relative to the largest entry, below which a column is constant but for rounding."""
+ROUNDING = 1e-13  # Standard deviation, relative to the largest entry, below which a column is constant but for rounding
 
 
 def farthest_point_sampling(

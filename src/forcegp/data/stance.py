@@ -35,11 +35,9 @@ of all that they carry: nothing, and surely bearing."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
 to which its absence decides."""
-TILTS = 0.05
-"""rad by which a foot held flat leans away from the median of its stretch of stance."""
+TILTS = 0.05  # rad by which a foot held flat leans away from the median of its stretch of stance
 FEW = 10
-MANY_OPEN = 0.25
-"""Share of open rows that more than changes of stance leave."""
+MANY_OPEN = 0.25  # Share of open rows that more than changes of stance leave
 CHUNK = 4000
 
 
@@ -259,10 +257,8 @@ def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
     return filled
 
 
-EARTH, NEAR, OFTEN = 9.81, 0.5, 0.1
-"""m/s^2: of free fall, and about it; share of the rows in which a robot falls so."""
-ALONG = 0.05
-"""Of a unit vector: parts below this are none."""
+EARTH, NEAR, OFTEN = 9.81, 0.5, 0.1  # m/s^2: of free fall, and about it; share of the rows in which a robot falls so
+ALONG = 0.05  # Of a unit vector: parts below this are none
 
 
 def missing_gravity(dataset: Dataset, model: forcegp.Model) -> tuple[str, str] | None:

@@ -14,8 +14,7 @@ from forcegp.model import Model
 Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 """Which rows: numbers of at most so many of a log, such as `evenly` and `farthest` give."""
 
-EVEN_STEPS = 1e-3
-"""Time steps of a recording count as equal within this fraction."""
+EVEN_STEPS = 1e-3  # Time steps of a recording count as equal within this fraction
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
 
 

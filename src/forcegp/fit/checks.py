@@ -22,15 +22,10 @@ from forcegp.summary import listed
 
 INVISIBLE = 1e-9
 """|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
-ROUNDING = 1e-12
-"""|M^-1 B_c| relative to the largest of them below which a latent moves nothing."""
-EQUAL = 1e-9
-"""Relative difference of two latents' effects and features below which they are the same."""
-
-LEFT_OUT = 0.1
-"""Share of what the known forces do that may lie where no latent acts, without a word."""
-SPAN = 1e-9
-"""Singular values of unit effects relative to the largest below which they are one effect fewer."""
+ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
+EQUAL = 1e-9  # Relative difference of two latents' effects and features below which they are the same
+LEFT_OUT = 0.1  # Share of what the known forces do that may lie where no latent acts, without a word
+SPAN = 1e-9  # Singular values of unit effects relative to the largest below which they are one effect fewer
 ROWS_LOOKED_AT = 500
 
 

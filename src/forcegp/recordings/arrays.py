@@ -28,8 +28,7 @@ from forcegp.recordings.source import (
 from forcegp.summary import listed
 
 SEPARATOR = "/"
-MOST_NAMES = 12
-"""Of arrays in a message."""
+MOST_NAMES = 12  # Of arrays in a message
 
 
 class ArrayFile(Source):

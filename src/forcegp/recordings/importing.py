@@ -25,8 +25,7 @@ from forcegp.recordings.recording import (
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import Source
 
-ROUND_RATE = 1e-3
-"""A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
+ROUND_RATE = 1e-3  # A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz
 
 Progress = Callable[[int, int, str], None]
 

@@ -161,8 +161,7 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
 BEYOND = 0.1
 """Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
 
-TURNS = 4.0 * np.pi
-"""rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees."""
+TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
 
 
 def require_plausible_positions(
@@ -202,9 +201,7 @@ GAP = 10.0
 frequency f (Hall & Meyer 1976): across 10 steps at 1 kHz 0.013 % at 5 Hz and 3 % at 20 Hz. Longer pauses end an
 episode."""
 
-FEWEST_ROWS = 5
-"""Of an episode: two derivatives by central differences need so many."""
-
+FEWEST_ROWS = 5  # Of an episode: two derivatives by central differences need so many
 SLOWEST, FASTEST = 2.0, 2e5
 """Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
 

@@ -15,9 +15,7 @@ from forcegp.errors import FileFormatError, ForceGPError, require_known
 Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
 
-LONGEST_VECTOR = 4096
-"""Columns of a table in one array; wider ones are pictures and the like, not signals of joints."""
-
+LONGEST_VECTOR = 4096  # Columns of a table in one array; wider ones are pictures and the like, not signals of joints
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 
 
@@ -135,8 +133,7 @@ def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[Non
 LARGEST_EXPANSION = 200
 """Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
 
-HARMLESS = 100 * 2**20
-"""Bytes; what expands to no more than this is never refused."""
+HARMLESS = 100 * 2**20  # Bytes; what expands to no more than this is never refused
 
 
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:
