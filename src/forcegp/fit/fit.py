@@ -18,7 +18,7 @@ from forcegp.evidence import Accelerations, Evidence, Motions, Torques, Training
 from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.fit.checks import check_forces, refuse_what_looks_alike, warn_of_contacts
+from forcegp.fit.doubts import check_forces, refuse_what_looks_alike, warn_of_contacts
 from forcegp.fit.joint import (
     CHANGE,
     MOST_ROUNDS,

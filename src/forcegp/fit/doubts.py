@@ -1,36 +1,37 @@
-"""What data cannot teach a prior, and whether they bear out the contacts: checked before anything is fitted."""
+"""What a log cannot teach a model, before a fit; and what speaks against what was found, after it."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.data import Dataset, contact_doubts, evenly
-from forcegp.errors import ContactWarning, DataWarning, InvalidInput
+from forcegp.data import Dataset, contact_doubts, evenly, thruster_columns
+from forcegp.doubts import Doubt, Doubts, look
+from forcegp.errors import ContactWarning, InvalidInput
 from forcegp.evidence.contacts import FAR_FROM_SURFACE
+from forcegp.evidence.identifiability import carrying
+from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
+from forcegp.evidence.payload_link import CLEARLY, left_by_least_squares
+from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.evidence.training_data import CONSTANT
-from forcegp.forces import JointLaw, Law, Normal, Offset
+from forcegp.forces import JointLaw, Law, Normal, Offset, RigidBodies
 from forcegp.mechanics import State
 from forcegp.model import Model
 from forcegp.summary import listed
 
-INVISIBLE = 1e-9
-"""|H B_c| relative to |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15."""
+INVISIBLE = 1e-9  # |H B_c| over |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15
 ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
-EQUAL = 1e-9  # Relative difference of two latents' effects and features below which they are the same
-LEFT_OUT = 0.1  # Share of what the known forces do that may lie where no latent acts, without a word
-SPAN = 1e-9  # Singular values of unit effects relative to the largest below which they are one effect fewer
+EQUAL = 1e-9  # relative difference of two latents' effects and features below which they are the same
+LEFT_OUT = 0.1  # share of what the known forces do that may lie where no latent acts, without a word
+SPAN = 1e-9  # singular values of unit effects relative to the largest below which they are one effect fewer
 ROWS_LOOKED_AT = 500
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, DataWarning, stacklevel=6)
 
 
 def check_forces(likelihood: MarginalLikelihood, known: Model | None = None) -> None:
@@ -42,28 +43,28 @@ def check_forces(likelihood: MarginalLikelihood, known: Model | None = None) -> 
     features that are constant, of latents that move nothing or that the constraint hides while others show, and, where
     the model leaves out forces that are `known`, of those that no latent can take over.
     """
-    dynamics = likelihood.dynamics
-    B, features = checked_values(likelihood.model.unknown, dynamics)
-    names = likelihood.model.unknown.latent_names(likelihood.model.robot)
+    dynamics, robot, unknown = likelihood.dynamics, likelihood.model.robot, likelihood.model.unknown
+    B, features = checked_values(unknown, dynamics)
+    names = unknown.latent_names(robot)
     if not names:
         return
-    _check_features(likelihood, names, features)
+    doubts = [*_of_features(likelihood, names, features)]
     effect = dynamics.H @ B
-    slices = likelihood.model.unknown.slices(likelihood.model.robot)
-    terms = [number for number, which in enumerate(slices) for _ in range(which.stop - which.start)]
-    shows = _check_visible(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
-    _check_distinct(names, terms, shows, effect, likelihood.standardization(features))
+    terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
+    shows, unseen = _of_effects(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
+    _refuse_equal(names, terms, shows, effect, likelihood.standardization(features))
+    doubts += unseen
     if known is not None and likelihood.model.carries_known_forces and not known.carries_known_forces:
         rows = likelihood.training
         with torch.no_grad():
             Q_K = known.to(rows.q.device).dynamics(rows.q, rows.v, rows.u).Q_K
-        _check_known_forces(effect, (dynamics.H @ Q_K[..., None])[..., 0])
+        doubts += _of_known_forces(effect, (dynamics.H @ Q_K[..., None])[..., 0])
+    Doubts(doubts).warn(stacklevel=5)
 
 
-def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
-    robot = likelihood.model.robot
-    labels = likelihood.model.unknown.feature_names(robot)
-    scalings = likelihood.model.unknown.scalings(robot)
+def _of_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> Iterator[Doubt]:
+    robot, unknown = likelihood.model.robot, likelihood.model.unknown
+    labels, scalings = unknown.feature_names(robot), unknown.scalings(robot)
     idle: dict[tuple[str, ...], list[str]] = {}
     for index, (name, z) in enumerate(zip(names, features, strict=True)):
         if not z.shape[-1]:
@@ -83,16 +84,20 @@ def _check_features(likelihood: MarginalLikelihood, names: Sequence[str], featur
         if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
             idle.setdefault(which, []).append(name)
     for which, latents in idle.items():
-        _warn(
-            f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} depends "
-            "on it; leave that input out (inputs=...), or give data in which it changes"
+        yield look(
+            about="features",
+            what=f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} "
+            "depends on it;",
+            do="leave that input out (inputs=...), or give data in which it changes",
         )
 
 
-def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> list[bool]:
-    """Which latents show; `free` is what each would do without the contacts, `effect` what it does (N, nv, C)."""
+def _of_effects(
+    names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor
+) -> tuple[list[bool], list[Doubt]]:
+    """Which latents show, and doubts; `free` is what each would do without the contacts, `effect` what it does."""
     size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
-    absent = (size <= ROUNDING * size.max()).tolist()
+    absent, doubts = (size <= ROUNDING * size.max()).tolist(), list[Doubt]()
     for term in set(terms):
         own = [index for index, number in enumerate(terms) if number == term]
         if all(absent[index] for index in own):
@@ -101,11 +106,10 @@ def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, eff
                 "contact of the prior, or leave it out"
             )
     if any(absent):
-        _warn(
-            f"{_few([name for name, nothing in zip(names, absent, strict=True) if nothing])} moves no joint at any "
-            "training row, so its posterior is its prior; give data in other postures, or leave it out "
-            "if the prior can do without"
-        )
+        idle = _few([name for name, nothing in zip(names, absent, strict=True) if nothing])
+        what = f"{idle} moves no joint at any training row, so its posterior is its prior;"
+        remedy = "give data in other postures, or leave it out if the prior can do without"
+        doubts.append(look(about="effects", what=what, do=remedy))
     hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
     blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
     remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
@@ -116,14 +120,13 @@ def _check_visible(names: Sequence[str], terms: Sequence[int], free: Tensor, eff
             f"of it; {remedy}"
         )
     if blind:
-        _warn(
-            f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, and "
-            f"its posterior and that of the normal force are the prior; {remedy}"
-        )
-    return shows
+        what = f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, "
+        what += "and its posterior and that of the normal force are the prior;"
+        doubts.append(look(about="effects", what=what, do=remedy))
+    return shows, doubts
 
 
-def _check_distinct(
+def _refuse_equal(
     names: Sequence[str], terms: Sequence[int], shows: Sequence[bool], effect: Tensor, features: Sequence[Tensor]
 ) -> None:
     """Latents of two terms with the same effect on the same features are one function; data see only their sum."""
@@ -141,7 +144,7 @@ def _check_distinct(
             )
 
 
-def _check_known_forces(effect: Tensor, known: Tensor) -> None:
+def _of_known_forces(effect: Tensor, known: Tensor) -> Iterator[Doubt]:
     """Whether the latents act where the known forces do: the part of `known` (N, nv) outside the span of `effect`."""
     step = -(-len(known) // ROWS_LOOKED_AT)
     effect, known = effect[::step], known[::step]
@@ -150,10 +153,11 @@ def _check_known_forces(effect: Tensor, known: Tensor) -> None:
     size = float(known.square().sum().sqrt())
     share = float((known - carried).square().sum().sqrt()) / size if size > 0.0 else 0.0
     if share > LEFT_OUT:
-        _warn(
-            f"without laws the unknown forces carry gravity, actuation and all else, but {share:.0%} of the "
-            "acceleration that these cause lies where none of them acts; give the model its laws, or add a force on "
-            "every joint, JointForces()"
+        yield look(
+            about="laws",
+            what=f"without laws the unknown forces carry gravity, actuation and all else, but {share:.0%} of the "
+            "acceleration that these cause lies where none of them acts;",
+            do="give the model its laws, or add a force on every joint, JointForces()",
         )
 
 
@@ -165,10 +169,8 @@ def warn_of_contacts(model: Model, dataset: Dataset) -> None:
     """Warn where rows contradict the contacts, which a model would learn away as a force (`contact_doubts`)."""
     if ("ignore", None, ContactWarning, None, 0) in warnings.filters:
         return  # whoever wants none, as the command line after its own look, need not pay for it
-    for doubt in contact_doubts(dataset, model):
-        if doubt.numbers.get("distance", 0.0) > FAR_FROM_SURFACE:
-            continue  # check_distance refuses the rows or warns
-        warnings.warn(str(doubt), ContactWarning, stacklevel=4)
+    doubts = contact_doubts(dataset, model)  # check_distance refuses rows that are far, or warns
+    Doubts(each for each in doubts if each.numbers.get("distance", 0.0) <= FAR_FROM_SURFACE).warn(ContactWarning, 3)
 
 
 def refuse_what_looks_alike(model: Model, dataset: Dataset) -> None:
@@ -186,21 +188,34 @@ def refuse_what_looks_alike(model: Model, dataset: Dataset) -> None:
     states = [torch.as_tensor(np.array(x), device=model.robot.device) for x in (few.q, few.v, few.u)]
     with torch.no_grad():
         state = model.state(*states)
-        pushes = [push for law in model.laws if law.learned for push in _pushes(law, state, model)]
         _refuse_offsets_of_idle_joints(model, state)
+        pushes = [push for law in model.laws if law.learned for push in _pushes(law, state, model)]
+        doubts = list[Doubt]()
         if idle := [push.name for push in pushes if push.share <= ROUNDING]:
-            _warn(f"no row shows {listed(idle)}, so each stays at its prior; leave it out, or give a log that does.")
+            remedy = "leave it out, or give a log that does."
+            doubts.append(
+                look(about="forces", what=f"no row shows {listed(idle)}, so each stays at its prior;", do=remedy)
+            )
         pushes = [push for push in pushes if push.share > ROUNDING]
-        _warn_of_same(pushes)
+        columns = [push.force.flatten() / torch.linalg.vector_norm(push.force) for push in pushes]
+        same = [
+            f"{one.name} and {other.name}"
+            for (one, a), (other, b) in combinations(zip(pushes, columns, strict=True), 2)
+            if one.law != other.law and float((a @ b).abs()) > 1.0 - EQUAL
+        ]
+        if same:
+            what = f"{listed(same)} are the same force in every row, so the priors decide what is whose;"
+            remedy = "leave one of them out, or give a log in which they differ."
+            doubts.append(look(about="forces", what=what, do=remedy))
         for title, term, _ in model.unknown.named(model.robot):
             B, features = term.direction(model.dynamics(*states)), term.features(model.dynamics(*states))
             imitated = [push for push in pushes if any(_imitates(z, B[..., c], push) for c, z in enumerate(features))]
             if imitated:
                 laws = listed(dict.fromkeys(push.law for push in imitated))
-                _warn(
-                    f"gp:{title} can be what {laws} is: rows show only the sum, and the priors decide what is whose. "
-                    f"Predictions are those of the sum; for numbers of {laws} by themselves leave gp:{title} out."
-                )
+                what = f"gp:{title} can be what {laws} is: rows show only the sum, and the priors decide what is whose."
+                remedy = f"Predictions are those of the sum; for numbers of {laws} by themselves leave gp:{title} out."
+                doubts.append(look(about="forces", what=what, do=remedy))
+    Doubts(doubts).warn(stacklevel=5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,20 +256,6 @@ def _pushes(law: Law, state: State, model: Model) -> list[_Push]:
     return [replace(push, share=push.share / max(largest, 1e-300)) for push in found]
 
 
-def _warn_of_same(pushes: Sequence[_Push]) -> None:
-    columns = [push.force.flatten() / torch.linalg.vector_norm(push.force) for push in pushes]
-    same = [
-        f"{one.name} and {other.name}"
-        for (one, a), (other, b) in combinations(zip(pushes, columns, strict=True), 2)
-        if one.law != other.law and float((a @ b).abs()) > 1.0 - EQUAL
-    ]
-    if same:
-        _warn(
-            f"{listed(same)} are the same force in every row, so the priors decide what is whose; leave one of them "
-            "out, or give a log in which they differ."
-        )
-
-
 def _imitates(z: Tensor, B: Tensor, push: _Push) -> bool:
     """Whether a function of `z` (rows, d) along `B` (rows, nv) can be this force."""
     size = B.square().sum(-1)
@@ -278,4 +279,93 @@ def _refuse_offsets_of_idle_joints(model: Model, state: State) -> None:
         raise InvalidInput(
             f"nothing drives {listed(names)}, so an offset there can carry the weight that the contact carries, with "
             "any sign; leave 'offset' out, or give Offset(Normal(0.0, std)) a std of 0 at it."
+        )
+
+
+BRAKED = 0.4
+"""Correlation of missing accelerations of a base with its velocity: below .2 in logs of feet, wheels and rotors without
+drag, .45 to .83 with drag or ground friction."""
+OTHER_ROBOT = 2.0  # factor between the masses of log and file, or of what holds the robot up, from which one is wrong
+
+
+def doubts_of_base(
+    given: Model, found: Model, rows: RecordedRows, residual: Float[np.ndarray, "rows nv"]
+) -> Iterator[Doubt]:
+    """Log and file have different masses, the base lacks a force of the size of gravity, or something brakes it."""
+    robot, missing = given.robot, 0.0
+    own = carrying(robot)
+    if not any(isinstance(law, RigidBodies) and len(law.bodies(own, robot)) == len(own) for law in given.laws):
+        return
+    masses = [sum(each.robot.tree.inertias[carrying(each.robot), 3, 3, 0].tolist()) for each in (given, found)]
+    if robot.base == "floating":
+        rotation = rows.kinematics.frame_pose(robot.layout.moving[0])[:, :3, :3].cpu().numpy()
+        missing = float(np.linalg.norm((rotation @ residual[:, :3, None]).mean(0)))
+    wrong = ""
+    if not masses[0] / OTHER_ROBOT <= masses[1] <= masses[0] * OTHER_ROBOT:
+        wrong = f"by this log the robot weighs {masses[1]:.3g} kg, by its file {masses[0]:.3g} kg"
+    elif missing * OTHER_ROBOT > np.linalg.norm(robot.gravity.cpu().numpy()) > 0.0:
+        wrong = f"accelerations of the base are wrong by {missing:.3g} m/s^2 on average"
+    linear = {"floating": 3, "planar": 2}.get(robot.base, 0)
+    missed, v = residual[:, :linear], rows.v[:, :linear]
+    braked = -float((missed * v).sum()) / max(float(np.linalg.norm(missed) * np.linalg.norm(v)), 1e-300)
+    if wrong:
+        what, remedy = f"{wrong}: what holds it up is not what the log states.", "flags of stance, thrust coefficients"
+        yield look(about="base", what=what, do=f"Check {remedy} and the unit of u.")
+    elif braked > BRAKED:
+        remedy = "Weigh it, since thrust and mass look alike, and let forcegp fit learn the forces."
+        if not thruster_columns(given):
+            remedy = "forcegp fit --forces rigid-bodies:LINK,gp:joint,gp:joint-friction learns both."
+        what = f"what the model lacks brakes the base (correlation {braked:.2g} with its velocity): ground friction or "
+        yield look(about="base", what=f"{what}drag, which this regression takes for mass.", do=remedy)
+
+
+ALIKE = 5.0  # times the error of a mass without offsets
+RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
+LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
+
+
+def doubts_of_offsets(
+    fit: Fit, offsets: Bool[np.ndarray, " terms"], slope: Float[np.ndarray, " 10"], own: slice
+) -> Iterator[Doubt]:
+    """Constant torques of joints look like the weight, since postures differ little; `slope` is that of the mass.
+
+    Small errors of a model are then large ones of the mass, of which intervals hold the random part only. `own` are the
+    coordinates of the payload, and the last ones those of `offsets`.
+    """
+    whole, seen = fit.information + fit.prior_information, np.zeros(len(fit.x))
+    seen[own] = slope
+    held = np.append(np.ones(len(seen) - len(offsets), dtype=bool), ~offsets)
+    known = whole[np.ix_(held, held)]
+    with_offsets, without = seen @ np.linalg.solve(whole, seen), seen[held] @ np.linalg.solve(known, seen[held])
+    if with_offsets > ALIKE**2 * without:
+        yield look(
+            about="payload",
+            what="constant torques of the joints ('offset') look like the payload's weight in these postures: with "
+            f"them its mass is {(with_offsets / without) ** 0.5:.0f} times as unsure, and small errors of the model "
+            "change it.",
+            do="Leave 'offset' out, or give a baseline, or a log of more postures.",
+        )
+
+
+def doubts_of_no_body(
+    fit: Fit, parameters: Float[np.ndarray, "10"], slopes: Float[np.ndarray, "10 10"], own: slice, link: str
+) -> Iterator[Doubt]:
+    """Ten free numbers in place of the payload's `parameters` explain much more: no body there does.
+
+    Inside of what bodies can have, the best numbers are those found, and free ones explain no more. `own` are the
+    coordinates of the payload, `slopes` derivatives of its parameters in them.
+    """
+    payload = fit.jacobian[..., own] @ np.linalg.inv(slopes)
+    white, others = fit.residual / fit.noise, np.delete(fit.jacobian, np.r_[own], axis=-1)
+    left, _ = left_by_least_squares(np.concatenate([payload, others], axis=-1) / fit.noise[:, None], white)
+    cost = 0.5 * float((white**2).sum())
+    more = cost - 0.5 * float((left**2).sum())
+    rough = np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(payload @ parameters)
+    if rough and more > max(CLEARLY, LEAST * cost):
+        yield look(
+            about="payload",
+            what=f"no body on {link} explains the log: free numbers in place of its mass, centre and inertia leave "
+            f"{more / cost:.0%} less. The payload is on another link, or links weigh less or otherwise than the URDF "
+            "states.",
+            do="Give link, or a baseline (a log without the payload), or identify all links.",
         )
