@@ -227,7 +227,6 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "a in degrees": (lambda d: at(d, "a", degrees(d)), "acceleration"),
     "u in mNm": (lambda d: at(d, "u", [1000.0] * 2), "torque unit"),
     "motor side of gears, u": (lambda d: at(d, "u", [1 / 50, 1 / 100]), "torque unit"),
-    "motor side of a gear, q v a": (lambda d: at(d, "qva", [1.0, 6.0]), "motion|gear"),
     "torque constant 30 % off": (lambda d: at(d, "u", [1.0, 1.3]), "torque constant|torque unit|mass"),
     "torque sign of one": (lambda d: at(d, "u", [1, -1]), "torque sign"),
     "torque sign of all": (lambda d: at(d, "u", [-1, -1]), "torque sign"),
@@ -257,7 +256,6 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
 }
 CONTACT_CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "contact 2 cm sideways": (lambda d: moved(d, (0.02, 0.0, 0.0)), "contact"),
-    "contact missing": (without_contacts, "contact"),
 }
 
 

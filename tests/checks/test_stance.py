@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forcegp import Dataset, Model, Preparation, Robot, check
+from forcegp import Dataset, Model, Robot, check
 from forcegp.checks import quick_check
 from forcegp.data import estimate_stance
-from forcegp.errors import DatasetError, DataWarning
-from forcegp.mechanics import fixed_frame, fixed_point
+from forcegp.errors import DatasetError
+from forcegp.mechanics import fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -83,39 +83,6 @@ def test_a_base_that_nobody_measured_is_named(log):
     assert "not measured" in doubts[0].what
     assert "motion capture" in doubts[0].advice
     assert "base='fixed'" in doubts[0].advice
-
-
-def rocking(lean: float):
-    """A body of 2 kg on a flat foot, whose heel turns slowly by so many rad in the last 12 of 20 s, and back."""
-    body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
-    robot = Robot.from_urdf_text(f'<robot name="r"><link name="foot">{body}</link></robot>', base="floating")
-    time = np.arange(1000) / 50
-    w = np.pi / 12.0
-    s = np.where(time >= 8.0, time - 8.0, 0.0)
-    angle, rate = lean * np.sin(w * s) ** 2, lean * w * np.sin(2.0 * w * s)
-    spin = 2.0 * lean * w**2 * np.cos(2.0 * w * s) * (time >= 8.0)
-    q, v, a = np.zeros((1000, 7)), np.zeros((1000, 6)), np.zeros((1000, 6))
-    heel = np.array([-0.1, 0.0, 0.0])  # from which the origin turns about y
-    q[:, 0], q[:, 2] = heel[0] - np.cos(angle) * heel[0], np.sin(angle) * heel[0]
-    q[:, 4], q[:, 6] = np.sin(0.5 * angle), np.cos(0.5 * angle)
-    v[:, 2], v[:, 4], a[:, 2], a[:, 4] = rate * heel[0], rate, spin * heel[0], spin
-    model = Model(robot, fixed_frame("foot", switch="stands"))
-    return Dataset(q=q, v=v, u=np.ones((1000, 1)), a=a, time=time, model=model), angle
-
-
-def test_a_heel_that_turns_under_a_flat_foot_is_named_and_left_out():
-    log, angle = rocking(0.12)
-    assert abs(log.v[:, 2]).max() < 0.01  # slower than what counts as motion
-    (doubt,) = of(log)
-    assert doubt.level == "wrong"
-    row = int(doubt.what.split("row ")[1].split(" ")[0])
-    assert 0.04 < angle[row] < 0.07
-    assert "--stance auto" in doubt.advice
-    with pytest.warns(DataWarning, match="stance open in 3.% of the rows"):
-        kept = Preparation(stance="auto").apply(log)  # what the remedy does
-    assert not of(kept)
-    assert len(kept) > 0.5 * len(log)
-    assert not of(rocking(0.03)[0])
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])

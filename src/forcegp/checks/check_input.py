@@ -130,7 +130,8 @@ class CheckInput:
             if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
                 lower = COMPARED * float(applied)
                 lowest = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest))
-                found["compared"] = lowest.rows(even)
+                with contextlib.suppress(DatasetError):  # too short for that
+                    found["compared"] = lowest.rows(even)
             # white noise as logged, or what the filter left
             left = preparation_report(prepared.metadata).get("acceleration_noise", {}).get("after")
             seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF

@@ -35,9 +35,6 @@ STILL_UNEXPLAINED = 0.6  # a joint of which more remains even then has not been 
 EXPLAINED = 0.1  # where no more than this remains in any joint there is nothing to explain
 MAX_CORRECTIONS = 4
 ALL_TRIED = 3  # joints up to which the motion of every one is tried in other directions and places
-# Gear ratios that are tried
-GEARS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 14.0, 20.0, 30.0, 50.0, 80.0, 100.0, 120.0, 160.0)
-NEARLY = 3.0  # factor either way that wrong masses explain
 TILTED = np.deg2rad(15.0)  # angle from which a direction of gravity is reported
 
 
@@ -187,7 +184,7 @@ def _torque_places(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
 
 
 def _motion_units(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
-    """Angles in degrees, or positions of one joint before its gear."""
+    """Angles in degrees."""
     largest = np.abs(now.rows.q * inputs.rotates).max()
     places = np.arange(len(inputs.names))
     if largest > 1.0:  # less than a degree of motion is not worth the question
@@ -206,23 +203,6 @@ def _motion_units(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:
                 joints=inputs.named(_places(turned)),
                 correction=units,
             )
-    for joint, name in enumerate(inputs.names):
-        if not now.fit.unexplained[joint] > STILL_UNEXPLAINED / 2:
-            continue
-        for ratio in GEARS:
-            slower = now.tried(
-                changed("qva", factor=np.where(places == joint, 1.0 / ratio, 1.0)),
-                cost=0.7,
-                concerns=(joint,),
-                about="motion unit",
-                what=f"positions and velocities of {name} fit the torques far better divided by about {ratio:g}: they "
-                "look like those of a motor before its gear.",
-                do=f"Divide the motion of this joint by its gear ratio (forcegp import --q '{name}/{ratio:g}').",
-                joints=(name,),
-                numbers={"factor": ratio},
-            )
-            if 1.0 / NEARLY < slower.fit.factor[joint] < NEARLY:  # else any small motion with a large factor would do
-                yield slower
 
 
 def _motion_signs(now: Hypothesis, inputs: CheckInput) -> Iterator[Hypothesis]:

@@ -19,40 +19,11 @@ from forcegp.checks.torque_doubts import not_compared, torque_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.doubts import LEVELS, Doubt, Doubts, look
+from forcegp.doubts import LEVELS, Doubt, Doubts
 from forcegp.errors import InvalidInput, require_type
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
-
-
-def robot_doubts(robot: Robot) -> Iterator[Doubt]:
-    """Equal inertias of all links, centres of mass and radii of gyration beyond the robot's reach."""
-    moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
-    heavy = [link for link in moving if link.mass > 0.0]
-    # the distances between joints, and the largest of a centre of mass from its joint [m]
-    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
-    centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
-    reach = origins + max(centers, default=0.0) if origins > 0.0 else 0.0
-    shapes = {(link.mass, link.inertia) for link in heavy}
-    if len(heavy) > 2 and len(shapes) == 1:
-        yield look(
-            about="URDF",
-            what=f"all {len(heavy)} moving links have the same mass and inertia ({heavy[0].mass:g} kg): a placeholder.",
-            do="Use the manufacturer's URDF, or identify the inertias (forcegp fit --forces bodies).",
-        )
-    for link in heavy:
-        gyration = float(np.sqrt(np.linalg.eigvalsh(np.array(link.inertia)).max() / link.mass))
-        center = float(np.linalg.norm(link.center_of_mass))
-        if reach > 0.0 and (gyration > reach or center > 2.0 * reach):
-            yield look(
-                about="URDF",
-                what=f"link {link.name} has a radius of gyration of {gyration:.3g} m and its centre of mass "
-                f"{center:.3g} m from its joint; the whole robot reaches about {reach:.3g} m.",
-                do="Check the units of this link (kg, m, kg m²).",
-                numbers={"gyration": gyration, "center": center, "reach": reach},
-            )
-
 
 BEFORE_A_FIT = frozenset(
     ("contact", "noise_std", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
@@ -131,8 +102,6 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
             return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
     inputs = CheckInput.of(dataset, model, preparation)
     doubts, comparison = _doubts(inputs, model)
-    if inputs.robot is not None:
-        doubts += robot_doubts(inputs.robot)
     if inputs.prepared is not None:
         doubts += [*excitation_doubts(inputs), *noise_doubts(inputs)]
     return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)

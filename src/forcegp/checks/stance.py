@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset, estimate_stance
-from forcegp.data.stance import TILTS, missing_gravity, tilting
+from forcegp.data.stance import missing_gravity
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import ContactError
 from forcegp.model import Model
@@ -33,22 +33,10 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     if missing_gravity(dataset, model) is not None:  # another doubt, without which forces show nothing
         return
     found = estimate_stance(dataset, model)
-    leans = tilting(dataset, model, found.names, dataset.u[:, [model.inputs.index(name) for name in found.names]])
     for k, name in enumerate(found.names):
         logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
         frame = next(contact.frame for contact in model.contacts if contact.switch == name)
         stands = logged > 0.5
-        leaning = float(leans[:, k].sum() / max(stands.sum(), 1))
-        if leaning > FEW:
-            yield wrong(
-                about="contact flag",
-                what=f"{frame!r}, which is held flat, leans by more than {TILTS:g} rad in {leaning:.0%} of the rows in "
-                f"which {name!r} is 1, row {every * int(np.flatnonzero(leans[:, k])[0])} for example: its heel or "
-                "toe turns.",
-                do="forcegp import log.h5 --stance auto --out data.h5 leaves these rows out; for a foot that is "
-                "never flat give the point that it stands on, --feet FRAME@x,y,z.",
-                numbers={"leaning": leaning},
-            )
         odd = int(((logged != 0.0) & (logged != 1.0)).sum())
         if odd:
             yield wrong(

@@ -6,7 +6,10 @@ from .row_selection import (
 from .contacts import contact_rows as contact_rows, rows_in_contact as rows_in_contact
 from .contact_doubts import contact_doubts as contact_doubts
 from .dataset import Dataset as Dataset
-from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints
+from .delay import (
+    Delay as Delay, estimate_delay as estimate_delay, estimate_thruster_lag as estimate_thruster_lag,
+    thruster_columns as thruster_columns, torques_of_joints as torques_of_joints,
+)
 from .filters import (
     Filter as Filter, Lag as Lag, Later as Later, LowPass as LowPass, Mean as Mean, low_pass as low_pass,
 )
@@ -23,5 +26,4 @@ from .views import (
 from .preparation import Preparation as Preparation, preparation_report as preparation_report
 from .spectrum import MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum
 from .stance import Stance as Stance, estimate_stance as estimate_stance
-from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag, thruster_columns as thruster_columns
 from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind

@@ -1,15 +1,14 @@
-"""Do the rows of a log bear out its contacts: where they are, that they push, and that none is missing.
+"""Do the rows of a log bear out its contacts: where they are, and that they push.
 
 How the point moves shows whether it stays on its surface (`forcegp.data.contacts`). Where the force acts shows in what
 is left of the accelerations once friction is fitted, by linear least squares: it is compared with the same under other
-contacts, with the point moved, without any, or with one that the motion shows.
+contacts, with the point moved, or without any.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -49,18 +48,18 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
-    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere), "no force"
-    or "missing". Not for contacts that hold several points of one body, nor for robots with closed loops.
+    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere) or
+    "no force". Not for contacts that hold several points of one body, nor for robots with closed loops.
     """
     model = dataset.model if model is None else model
-    if model is None or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
+    if model is None or not model.contacts or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
         return Doubts()
     seen = [white_noise(dataset, signal=name) if move_on(dataset) else None for name in ("v", "a")]
     noise = tuple(np.zeros(dataset.nv) if each is None else np.nan_to_num(each) for each in seen)
     rows = dataset.rows(evenly(dataset, MOST_ROWS))
     with torch.no_grad():
         try:
-            return _stated(rows, model.to("cpu"), noise) if model.contacts else _missing(rows, model.to("cpu"))
+            return _stated(rows, model.to("cpu"), noise)
         except (ForceGPError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
             return Doubts()  # states that no contact bears: who computes with them raises what is wrong
 
@@ -256,73 +255,3 @@ def moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Mode
             others.append(model.with_contacts(contacts))
         tangents.append(across)
     return others, tangents
-
-
-NEEDED, FEWEST_SLIDING = 2.0, 20
-"""Logarithm of what remains of accelerations without the contact over what remains with it, over all joints; rows."""
-
-STAYS = 3e-3  # Mean square velocity along a direction, relative to what joints that move independently would give
-ARM = 0.3
-"""Size in m of a link: of several points that stay on a surface, one not farther from its frame than that is likely."""
-
-
-def _missing(rows: Dataset, model: forcegp.Model) -> Doubts:
-    """A point of a last link that stays on a plane, with a force along the normal that accelerations need."""
-    best, found = NEEDED, Doubts()
-    bodies = model.robot.layout.bodies if len(rows) >= FEWEST_SLIDING and rows.nv > 1 else ()
-    for body, joint in enumerate(bodies):
-        contact = None if body in model.robot.layout.parents else _plane(rows, model.robot, joint.child)
-        if contact is None:
-            continue
-        others, _ = moved_points(rows, model.with_contacts([contact]))
-        with_it = Residual(rows, model.with_contacts([contact]), more=others)
-        _, left, weights = with_it.fitted(extra=True)  # the motion may show the surface, and not the point
-        free = Residual(rows, model, friction=with_it.friction).fitted(weights=weights)[1]
-        own = Residual(rows, model, friction=with_it.friction).fitted()[1]
-        gain = float(np.log(np.minimum(free, own) / left).sum())
-        if gain > best:
-            normal = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in contact.surface.normal)
-            doubt = look(
-                about="contact",
-                what=f"no contact is stated, but link {contact.frame!r} stays on a plane with the normal ({normal}), "
-                "and the accelerations need a force along its normal.",
-                do="State it (`contacts`), or leave out the rows in contact.",
-                numbers={"kind": "missing", "frame": contact.frame, "gain": gain},
-            )
-            best, found = gain, Doubts([doubt])
-    return found
-
-
-def _plane(rows: Dataset, robot: forcegp.Robot, frame: str) -> Any:
-    """The contact of an unknown point p of `frame` with a plane, along which the frame moves, if there is one.
-
-    A plane with the normal n holds n (v_o + w x R p) = 0, linear in n and n p^T. The smallest eigenvalues, relative to
-    joints that move independently, are constraints.
-    """
-    kinematics = robot.kinematics(torch.tensor(rows.q), torch.tensor(rows.v))
-    J, pose = kinematics.frame_jacobian(frame).numpy(), kinematics.frame_pose(frame).numpy()
-    R, origin = pose[:, :3, :3], pose[:, :3, 3]
-    turned = [np.cross(J[:, 3:], R[:, None, :, k], axisa=1, axisb=2).transpose(0, 2, 1) for k in range(3)]  # w x R e_k
-    z = np.stack([*(J[:, i] for i in range(3)), *(turned[k][:, i] for i in range(3) for k in range(3))], axis=1)
-    spread = np.sqrt(np.square(rows.v).mean(axis=0))
-    scale = 1.0 / np.maximum(np.sqrt(np.square(z * spread).mean(axis=(0, 2))), 1e-12)
-    z = z * scale[:, None]  # (rows, k, nv)
-    free = np.einsum("rkj,rlj,j->kl", z, z, spread**2) / len(rows)
-    moved = np.einsum("rkj,rj->rk", z, rows.v)
-    powers, directions = np.linalg.eigh(free)
-    kept = powers > 1e-6 * powers[-1]
-    basis = directions[:, kept] / np.sqrt(powers[kept])
-    ratios, vectors = np.linalg.eigh(basis.T @ (moved.T @ moved / len(rows)) @ basis)
-    small = ratios < STAYS
-    if len(rows) < 3 * kept.sum() or not small.any():
-        return None
-    space = scale[:, None] * (basis @ vectors[:, small])  # constraints, in the columns' own units
-    weight = np.where(np.arange(len(space)) < 3, 1.0, ARM)
-    shape = np.linalg.qr(space / weight[:, None])[0]
-    nearest = weight * (shape @ np.linalg.svd(shape[:3], full_matrices=False)[2][0])  # near the frame's origin
-    size = float(np.linalg.norm(nearest[:3]))
-    if not size > 0.0:
-        return None
-    normal, point = nearest[:3] / size, nearest[3:].reshape(3, 3).T @ nearest[:3] / size**2
-    height = float(((origin + R @ point) @ normal).mean())
-    return forcegp.mechanics.Contact(frame, tuple(point), forcegp.mechanics.Plane(tuple(normal), height))

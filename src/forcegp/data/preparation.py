@@ -11,12 +11,11 @@ from jaxtyping import Float
 
 from forcegp.data.configurations import actuators
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import estimate_delay, torques_of_joints
+from forcegp.data.delay import estimate_delay, estimate_thruster_lag, thruster_columns, torques_of_joints
 from forcegp.data.filters import PASSED, LowPass, Signal, low_pass, shifted
 from forcegp.data.sampling import differentiated, episodes_in_order, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
-from forcegp.data.thruster_lag import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
@@ -36,7 +35,7 @@ class Preparation:
     delay: how much later than it acts u was logged [s], one number or one per actuator: `u(t) := u_logged(t + delay)`;
         "auto" estimates one for all joints (`estimate_delay`), used where it is sure and explains something.
     lag: time constant of the actuators [s], one or one per actuator: `u` becomes what an actuator of first order makes
-        of it, T u_a' + u_a = u; "auto" as for the delay. Delay and lag look alike: estimate one of them.
+        of it, T u_a' + u_a = u; "auto" estimates that of thrusters (`estimate_thruster_lag`).
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -69,8 +68,6 @@ class Preparation:
                 raise InvalidInput(f"{name} is {given!r}; give seconds, one number per joint, or 'auto'.")
             if name == "lag" and given != "auto" and min(each) < 0.0:
                 raise InvalidInput(f"lag is {given!r}; an actuator acts after its command: at least 0 s.")
-        if self.delay == self.lag == "auto":
-            raise InvalidInput("delay and lag are both to be estimated, and look alike; give one of them in s.")
         whole_number("every", self.every, 1)
         if not _finite(self.trim) or self.trim < 0:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
@@ -151,21 +148,16 @@ def _resolve(given: Preparation, dataset: Dataset) -> Preparation:
                 cutoff = best
         chosen = replace(given, cutoff=cutoff)
         reasons["cutoff_per_joint"] = plain(each)
-    for name in LATE:
-        if getattr(given, name) != "auto":
-            continue
-        if name == "lag" and thruster_columns(dataset.model):
-            seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
-            pushing = thruster_columns(dataset.model)  # joints beside them do not follow so
-            each = tuple(seconds * (column in pushing) for column in range(actuators(dataset)))
-            chosen = replace(chosen, lag=seconds if all(each) else each)
-            reasons[name] = f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
-            continue
-        found = estimate_delay(_filtered(replace(chosen, **{name: 0.0}), dataset), kind=name)
-        chosen = replace(chosen, **{name: found.significant})
-        reasons[name] = found.reason
-        reasons[f"{name}_common"], reasons[f"{name}_common_std"] = plain(np.array([found.common, found.common_std]))
-        reasons[f"{name}_per_joint"], reasons[f"{name}_per_joint_std"] = plain(found.seconds), plain(found.std)
+    if given.lag == "auto":
+        seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
+        pushing = thruster_columns(dataset.model)  # joints beside them do not follow so
+        each = tuple(seconds * (column in pushing) for column in range(actuators(dataset)))
+        chosen = replace(chosen, lag=seconds if all(each) else each)
+        reasons["lag"] = f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
+    if given.delay == "auto":
+        found = estimate_delay(_filtered(replace(chosen, delay=0.0), dataset))
+        chosen = replace(chosen, delay=found.significant)
+        reasons["delay"] = found.reason
     return replace(chosen, why=reasons)
 
 

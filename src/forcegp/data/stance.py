@@ -35,7 +35,6 @@ of all that they carry: nothing, and surely bearing."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
 to which its absence decides."""
-TILTS = 0.05  # rad by which a foot held flat leans away from the median of its stretch of stance
 FEW = 10
 MANY_OPEN = 0.25  # Share of open rows that more than changes of stance leave
 CHUNK = 4000
@@ -110,7 +109,6 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     4. Where nothing but these contacts holds a base against gravity: rows in which none of them stands although
        something bears a fifth of the weight are open, and rows in which one stands although nothing does. Filters and
        averages move feet in stance as short as their memory (a hop recorded at 50 Hz), and motion alone calls it swing.
-    5. Rows in which a foot held flat leans by .05 rad from the median of its stretch of stance are open.
 
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
@@ -158,7 +156,6 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         falls = np.linalg.norm(Mean(width)(whole[rows]), axis=1) < FALLS * weight
         stands = (flags[rows] == 1.0).any(axis=1)
         flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
-    flags[tilting(dataset, model, names, flags)] = np.nan
     return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
 
 
@@ -182,29 +179,6 @@ def _motion_and_force(
             motion[k].append(rates[:, rows].cpu().numpy())
             asked[k].append(forces[:, rows].sum(1).cpu().numpy())
     return [np.concatenate(own) for own in motion], [np.concatenate(own) for own in asked]
-
-
-def tilting(
-    dataset: Dataset, model: forcegp.Model, names: tuple[str, ...], flags: np.ndarray
-) -> Bool[np.ndarray, "rows switches"]:
-    """Where feet that are held flat lean, as a heel that turns, although these flags (rows, switches) are 1."""
-    found, g = np.zeros(flags.shape, bool), model.robot.gravity
-    held = {(c.frame, c.switch): {x.point for x in model.contacts if x.frame == c.frame} for c in model.contacts}
-    for (frame, switch), points in held.items():
-        if switch is None or len(points) < 3 or not g.any():
-            continue
-        k = names.index(switch)
-        pose = model.robot.kinematics(torch.tensor(dataset.q, device=g.device)).frame_pose(frame)
-        # turns about gravity may be drift of an estimator
-        down = (pose[..., :3, :3].mT @ (g / g.norm())).cpu().numpy()
-        order = np.lexsort((dataset.time, dataset.episode))
-        number, stands = dataset.episode[order], flags[order, k] == 1.0
-        ends = np.flatnonzero((np.diff(number) != 0) | (np.diff(stands) != 0)) + 1
-        for rows in np.split(order, ends):
-            if flags[rows[0], k] == 1.0:
-                away = np.linalg.norm(down[rows] - np.median(down[rows], axis=0), axis=1)
-                found[rows, k] |= away > TILTS
-    return found
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:
