@@ -1,5 +1,7 @@
 """`forcegp fit` looks at its data: one line of what would spoil the model, none for a clean log, and none if asked."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 from tests.checks.corruptions import at, clean, on_a_line, two_links
@@ -59,7 +61,7 @@ def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
 
 def test_in_python_a_fit_warns_of_contacts_that_the_rows_contradict(folder, monkeypatch):
     doubt = look(about="contact", what="its force acts beside the point.")
-    monkeypatch.setattr("forcegp.fit.doubts.contact_doubts", lambda *_: Doubts([doubt]))
+    monkeypatch.setattr(import_module("forcegp.fit.doubts"), "contact_doubts", lambda *_: Doubts([doubt]))
     data = package.Dataset.load(folder / "line.h5")
     few = package.inference.OptimizerOptions(iterations=1)
     with pytest.warns(ContactWarning, match="beside the point"):

@@ -103,9 +103,7 @@ class PointMotion(NamedTuple):
 
 
 def point_motions(
-    dataset: Dataset,
-    model: forcegp.Model,
-    noise_seen: tuple[np.ndarray, ...] | None = None,
+    dataset: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...] | None = None
 ) -> list[PointMotion]:
     """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
     q, v, u, a = tensors(dataset)

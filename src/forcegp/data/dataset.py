@@ -23,13 +23,7 @@ from forcegp.data.dataset_fields import (
     validated_units,
 )
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.errors import (
-    DatasetError,
-    FileFormatError,
-    InvalidInput,
-    require_type,
-    usable_arguments,
-)
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
 from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
@@ -240,10 +234,7 @@ def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.nda
 
 
 def _truth(
-    given: Mapping[str, object],
-    joint_names: tuple[str, ...],
-    rows: int,
-    model: forcegp.model.Model | None,
+    given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model | None
 ) -> FrozenDict:
     def known(name: str) -> bool:  # or `Q_U.tool`, `force.tool-friction`, with a name that a file can carry
         ends = (name[len(kind) :] for kind in TRUTH_KINDS if name.startswith(kind))

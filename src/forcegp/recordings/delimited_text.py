@@ -13,14 +13,7 @@ from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
-from forcegp.recordings.source import (
-    Columns,
-    Source,
-    arrow_numbers,
-    reading,
-    require_distinct,
-    require_plausible_size,
-)
+from forcegp.recordings.source import Columns, Source, arrow_numbers, reading, require_distinct, require_plausible_size
 
 FIRST_BYTES = 2**16  # What is looked at to detect the header, the delimiter and whether there are comments
 BLOCK = 2**22  # Bytes that pyarrow parses at a time; no line may be longer

@@ -15,13 +15,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 from forcegp.recordings.arrays import ArrayFile
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.recording import (
-    Recording,
-    Stamps,
-    read_recording,
-    read_stamps,
-    require_plausible_positions,
-)
+from forcegp.recordings.recording import Recording, Stamps, read_recording, read_stamps, require_plausible_positions
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import Source
 

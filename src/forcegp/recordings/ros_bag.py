@@ -12,13 +12,7 @@ import numpy as np
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput, required_extra
-from forcegp.recordings.source import (
-    LONGEST_VECTOR,
-    Columns,
-    Source,
-    reading,
-    require_plausible_size,
-)
+from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, reading, require_plausible_size
 
 LOG_TIME = "log_time"
 ROWS_AT_A_TIME = 2**16  # Numbers of Python take ten times the memory of those in an array

@@ -85,11 +85,7 @@ class SignalPlan:
 
 
 def signal_plan(
-    mapping: ColumnMapping,
-    source: Source,
-    model: forcegp.Model | None,
-    *,
-    may_lack_switches: bool = False,
+    mapping: ColumnMapping, source: Source, model: forcegp.Model | None, *, may_lack_switches: bool = False
 ) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot if there is one.
 
