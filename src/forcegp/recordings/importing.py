@@ -15,7 +15,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 from forcegp.recordings.arrays import ArrayFile
 from forcegp.recordings.formats import SideBySide, open_source
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.recording import Recording, Stamps, read_recording, read_stamps, require_plausible_positions
+from forcegp.recordings.recording import Recording, read_recording
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import Source
 
@@ -99,16 +99,13 @@ def import_recordings(
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         report(index, len(sources), f"reading {label}")
-        found = read_recording(source, own, label, unwrap=options.unwrap)
-        if not options.beyond_limits:
-            require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
-        recordings.append(found)
-    stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
-    step = _even_step(stamps, options)
-    done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
+        believed = own.joints if "q" in mapping.unit else wheels
+        recordings.append(read_recording(source, own, label, options, robot, believed))
+    step = _even_step(recordings, options)
+    done = _what_was_done(mapping, plan, recordings, step, options, sources)
     pieces: list[dict[str, np.ndarray]] = []
-    for recording, own in zip(recordings, stamps, strict=True):
-        for number, rows in own.stretches:
+    for recording in recordings:
+        for number, rows in recording.stretches:
             for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
                 for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
@@ -150,9 +147,9 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
     return found
 
 
-def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
+def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float | None:
     """The step of even times that all episodes get, or None if every stamp stays."""
-    median = float(np.median([own.step for own in stamps]))
+    median = float(np.median([own.step for own in recordings]))
     if not isinstance(options.rate, str):
         if options.rate < 0.9 / median:
             warnings.warn(
@@ -162,8 +159,8 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
                 stacklevel=3,
             )
         return 1.0 / options.rate
-    alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in stamps)
-    if options.rate == "log" or (alike and all(own.even for own in stamps)):
+    alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in recordings)
+    if options.rate == "log" or (alike and all(own.even for own in recordings)):
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
@@ -173,7 +170,6 @@ def _what_was_done(
     mapping: ColumnMapping,
     plan: SignalPlan,
     recordings: Sequence[Recording],
-    stamps: Sequence[Stamps],
     step: float | None,
     options: ImportOptions,
     sources: Sequence[tuple[str, Source]],
@@ -198,15 +194,15 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
-                "seconds": float(sum(np.ptp(recording.time[rows]) for _, rows in own.stretches)),
-                "median_step": own.step,
-                "largest_deviation_of_a_step": own.worst,
-                "repeated_stamps_dropped": own.repeated,
-                "gaps": list(own.gaps),
-                "rows_in_stretches_too_short": own.dropped_rows,
+                "seconds": float(sum(np.ptp(recording.time[rows]) for _, rows in recording.stretches)),
+                "median_step": recording.step,
+                "largest_deviation_of_a_step": recording.worst,
+                "repeated_stamps_dropped": recording.repeated,
+                "gaps": list(recording.gaps),
+                "rows_in_stretches_too_short": recording.dropped,
                 "notes": list(recording.notes),
             }
-            for recording, own in zip(recordings, stamps, strict=True)
+            for recording in recordings
         ],
         "resampled_to_step": step,
         "unwrapped": options.unwrap,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,8 +29,9 @@ class Recording:
     signals: those that were logged, (rows, entries) in SI, in the order of a Dataset.
     time: (rows,) [s] from its first row on.
     begin: the stamp of the log at the first row, in s.
-    episodes: (n, 2) episode number of the log and row at which it begins; one row if the log numbers none.
-    ranges: (signals, 2) least and largest value of each signal of the plan, in SI.
+    stretches: episode number of the log and numbers of the rows, without gaps.
+    step: the median of the steps between rows that are used [s]; `worst` the largest relative deviation from it within
+        a stretch; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` [s].
     jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
         seen, and what to do.
     """
@@ -40,12 +41,20 @@ class Recording:
     signals: Mapping[str, Float[np.ndarray, "rows entries"]]
     time: Float[np.ndarray, " rows"]
     begin: float
-    episodes: Int[np.ndarray, "n 2"]
-    ranges: Float[np.ndarray, "signals 2"]
     jumps: tuple[Jumps, ...]
     layout: Layout
-    read: Read
     notes: tuple[str, ...]
+    stretches: tuple[tuple[int, Int[np.ndarray, " rows"]], ...]
+    step: float
+    worst: float
+    repeated: int
+    gaps: tuple[float, ...]
+    dropped: int
+
+    @property
+    def even(self) -> bool:
+        """Is every step within 1 % of the median?"""
+        return self.worst <= JITTER
 
     def rows(self, used: Int[np.ndarray, " rows"], step: float | None) -> dict[str, np.ndarray]:
         """Time and the signals q, v, u, a of these rows, `step` [s] apart, or for None at the times of the log."""
@@ -62,8 +71,18 @@ class Recording:
         return {"time": time, **self.layout.signals(signals, time)}
 
 
-def read_recording(source: Source, plan: SignalPlan, label: str, *, unwrap: bool) -> Recording:
-    """Read a table. Raises FileFormatError and DatasetError naming the file, the row, the time and the column."""
+def read_recording(
+    source: Source,
+    plan: SignalPlan,
+    label: str,
+    options: Any,
+    robot: forcegp.robots.Robot | None,
+    believed: Collection[str],
+) -> Recording:
+    """Read a table as the `ImportOptions` say; `believed` joints may turn often.
+
+    Raises FileFormatError and DatasetError naming the file, the row, the time and the column.
+    """
     if not plan.columns:
         raise FileFormatError(f"{label} has no rows; give a log with rows.")
     read = read_on_one_clock(source, plan)
@@ -73,13 +92,14 @@ def read_recording(source: Source, plan: SignalPlan, label: str, *, unwrap: bool
     values = np.stack([item.value(columns, rows) for item in plan.signals], axis=1)
     _require_finite(values, columns, plan, source, time)
     episodes = np.zeros((1, 2), np.int64) if plan.episode is None else _episodes(columns[plan.episode], source)
-    jumps = _continued(plan, values, episodes[:, 1], unwrap)
-    ranges = np.stack([values.min(axis=0), values.max(axis=0)], axis=1)
+    jumps = _continued(plan, values, episodes[:, 1], options.unwrap)
+    if not options.beyond_limits:
+        _require_plausible_positions(label, values, plan, robot, believed)
     signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
     signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
     layout = replace(plan.layout, held=read.held or plan.layout.held)
-    told = (*read.notes, *told)
-    return Recording(label, source, signals, time, begin, episodes, ranges, (*jumps, *turned), layout, read, told)
+    stretches = _stretches(label, source, time, episodes, read, options)
+    return Recording(label, source, signals, time, begin, (*jumps, *turned), layout, (*read.notes, *told), *stretches)
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
@@ -164,25 +184,24 @@ BEYOND = 0.1
 TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
 
 
-def require_plausible_positions(
-    recording: Recording, plan: SignalPlan, robot: forcegp.robots.Robot | None, believed: Collection[str]
+def _require_plausible_positions(
+    label: str,
+    values: Float[np.ndarray, "rows signals"],
+    plan: SignalPlan,
+    robot: forcegp.robots.Robot | None,
+    believed: Collection[str],
 ) -> None:
-    """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees.
-
-    `believed`: joints that may turn often, such as wheels; all where the unit of q was given.
-    Raises DatasetError naming the joint, its range and what to do.
-    """
+    """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees."""
     limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
-    for index, item in enumerate(plan.signals):
+    for item, column in zip(plan.signals, values.T, strict=True):
         if item.signal != "q":
             continue
-        low, high = recording.ranges[index]
+        low, high = float(column.min()), float(column.max())
         lower, upper = limits.get(item.joint, (-np.inf, np.inf))
         margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
-        beyond = low < lower - margin or high > upper + margin
         degrees = item.unit.name == "rad" and max(-low, high) > TURNS
-        where = f"{recording.label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
-        if beyond:
+        where = f"{label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
+        if low < lower - margin or high > upper + margin:
             seen = f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF."
             if degrees:
                 hint = "Is it in degrees? Then add `unit` q=deg. `beyond_limits` accepts it."
@@ -206,110 +225,70 @@ SLOWEST, FASTEST = 2.0, 2e5
 """Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
 
 
-@dataclass(frozen=True)
-class Stamps:
-    """The stamps of one recording: `stretches` without gap, as episode number of the log and numbers of the rows.
-
-    `step` is the median of the steps between rows that are used [s]; `worst` the largest relative deviation of a step
-    within a stretch from it.
-    """
-
-    stretches: tuple[tuple[int, Int[np.ndarray, " rows"]], ...]
-    step: float
-    worst: float
-    repeated: int
-    gaps: tuple[float, ...]
-    dropped_rows: int
-
-    @property
-    def even(self) -> bool:
-        """Is every step within 1 % of the median?"""
-        return self.worst <= JITTER
-
-
-def read_stamps(recording: Recording, gap: float | None, start: float | None, end: float | None) -> Stamps:
-    """Stretches of a recording between gaps of more than `gap` seconds (default `GAP` median steps).
+def _stretches(
+    label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
+) -> tuple[Any, ...]:
+    """Rows between gaps, their median step, its worst deviation, repeated stamps, gaps, and rows left out.
 
     Rows in a pause of one topic of several are left out. Of rows with the same stamp the first is kept: what comes
-    after it is a sample that was sent again, or one whose time is not known. `start` and `end` [s] are counted from the
-    first row of each episode. Raises DatasetError for time that runs backwards, and for rates that no robot is logged
-    at.
+    after it is a sample that was sent again, or one whose time is not known. Raises DatasetError for time that runs
+    backwards, and for rates that no robot is logged at.
     """
-    begins = recording.episodes[:, 1]
-    typical = _typical_step(recording)
-    _require_rate(recording, typical)
-    kept = np.diff(recording.time, prepend=-np.inf) >= REPEATED * typical
-    kept[begins] = True
-    repeated = len(kept) - int(kept.sum())
-    if start is not None or end is not None:
-        kept &= _between(recording, start, end)
-    paused = recording.read.paused(gap, GAP)
-    used = np.flatnonzero(kept & ~paused)
-    number = np.searchsorted(begins, used, side="right") - 1
-    same = np.diff(number) == 0
-    between = np.diff(recording.time[used])
-    step = float(np.median(between[same])) if same.any() else typical
-    limit = GAP * step if gap is None else gap
-    inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)
-    bounds = [0, *(np.flatnonzero(~inside) + 1).tolist(), len(used)]
-    stretches, dropped = [], 0
-    for first, last in pairwise(bounds):
-        if last - first < FEWEST_ROWS:
-            dropped += last - first
-            continue
-        stretches.append((int(recording.episodes[number[first], 0]), used[first:last]))
-    if not stretches:
-        raise DatasetError(
-            f"{recording.label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
-            "a longer `gap` may be right."
-        )
-    gaps = tuple(between[same & ~inside].tolist())
-    worst = float(np.abs(between[inside] / step - 1.0).max())
-    return Stamps(tuple(stretches), step, worst, repeated, gaps, dropped)
-
-
-def _typical_step(recording: Recording) -> float:
-    """The median step within episodes. Raises DatasetError for time that runs backwards or stands still."""
-    begins = recording.episodes[:, 1]
-    steps = np.diff(recording.time)
+    begins = episodes[:, 1]
+    steps = np.diff(time)
     steps[begins[begins > 0] - 1] = np.nan
     backwards = np.flatnonzero(steps < 0)
     if backwards.size:
         row = int(backwards[0]) + 1
         raise DatasetError(
-            f"{recording.label}: time runs backwards by {-steps[row - 1]:.6g} s at {recording.source.place(row)} "
-            f"({recording.time[row]:.6g} s from the start), {backwards.size} times in all. Sort the log, map another "
-            "column as the time, or name the column that numbers its episodes (`episode`)."
+            f"{label}: time runs backwards by {-steps[row - 1]:.6g} s at {source.place(row)} ({time[row]:.6g} s from "
+            f"the start), {backwards.size} times in all. Sort the log, map another column as the time, or name the "
+            "column that numbers its episodes (`episode`)."
         )
     positive = steps[steps > 0]
-    if len(recording.time) < FEWEST_ROWS:
-        raise DatasetError(f"{recording.label} has {len(recording.time)} rows; an episode has at least {FEWEST_ROWS}.")
+    if len(time) < FEWEST_ROWS:
+        raise DatasetError(f"{label} has {len(time)} rows; an episode has at least {FEWEST_ROWS}.")
     if not positive.size:
-        raise DatasetError(f"{recording.label}: all rows have the same time stamp; map another column as the time.")
-    return float(np.median(positive))
+        raise DatasetError(f"{label}: all rows have the same time stamp; map another column as the time.")
+    typical = float(np.median(positive))
+    _require_rate(label, typical)
+    kept = np.diff(time, prepend=-np.inf) >= REPEATED * typical
+    kept[begins] = True
+    repeated = len(kept) - int(kept.sum())
+    since = time - np.repeat(time[begins], np.diff([*begins, len(time)]))
+    start, end = -np.inf if options.start is None else options.start, np.inf if options.end is None else options.end
+    kept &= (since >= start) & (since <= end)
+    if not kept.any():
+        raise DatasetError(f"{label}: no row lies between `start` and `end`; it has {since.max():.6g} s.")
+    paused = read.paused(options.gap, GAP)
+    used = np.flatnonzero(kept & ~paused)
+    number = np.searchsorted(begins, used, side="right") - 1
+    same = np.diff(number) == 0
+    between = np.diff(time[used])
+    step = float(np.median(between[same])) if same.any() else typical
+    limit = GAP * step if options.gap is None else options.gap
+    inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)
+    pieces = np.split(np.arange(len(used)), np.flatnonzero(~inside) + 1)
+    stretches = [(int(episodes[number[own[0]], 0]), used[own]) for own in pieces if len(own) >= FEWEST_ROWS]
+    if not stretches:
+        raise DatasetError(
+            f"{label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
+            "a longer `gap` may be right."
+        )
+    worst = float(np.abs(between[inside] / step - 1.0).max())
+    dropped = len(used) - sum(len(rows) for _, rows in stretches)
+    return tuple(stretches), step, worst, repeated, tuple(between[same & ~inside].tolist()), dropped
 
 
-def _between(recording: Recording, start: float | None, end: float | None) -> np.ndarray:
-    """Rows from `start` to `end` seconds after the first of their episode. Raises DatasetError if there is none."""
-    begins = recording.episodes[:, 1]
-    counts = np.diff([*begins, len(recording.time)])
-    since = recording.time - np.repeat(recording.time[begins], counts)
-    inside = (since >= (-np.inf if start is None else start)) & (since <= (np.inf if end is None else end))
-    if not inside.any():
-        raise DatasetError(f"{recording.label}: no row lies between `start` and `end`; it has {since.max():.6g} s.")
-    return inside
-
-
-def _require_rate(recording: Recording, step: float) -> None:
+def _require_rate(label: str, step: float) -> None:
     rate = 1.0 / step
     if SLOWEST <= rate <= FASTEST:
         return
-    seen = f"{recording.label}: the median step is {step:.6g} s, {rate:.3g} rows per second, no rate of a robot's log."
+    seen = f"{label}: the median step is {step:.6g} s, {rate:.3g} rows per second, no rate of a robot's log."
     if rate > FASTEST:
         hint = "Is the time in s rather than in a smaller unit? Then add `unit` time=s."
         raise MistakenUnit(f"{seen} {hint}", "time", "s")
-    factors = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-    fitting = [unit for unit, factor in factors.items() if 10.0 <= rate * factor <= 2e4]
+    fitting = [unit for unit, factor in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if 10.0 <= rate * factor <= 2e4]
     if fitting:
         hint = f"Is the time in {' or '.join(fitting)}? Then add `unit` time={fitting[0]}."
         raise MistakenUnit(f"{seen} {hint}", "time", fitting[0])
