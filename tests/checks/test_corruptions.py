@@ -24,7 +24,7 @@ from tests.checks.corruptions import (
 )
 
 from forcegp.checks import check, quick_check
-from forcegp.checks.parameters import parameter_doubts
+from forcegp.checks.torques import parameter_doubts
 
 
 def log_of(place: int):

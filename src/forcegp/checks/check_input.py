@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.noise import white_noise
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
-from forcegp.data.views import consecutive, move_on, runs, whole_windows, window_means
+from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces import JointLaw
 from forcegp.model import Model

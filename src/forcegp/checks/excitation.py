@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import CheckInput, numbers_of
-from forcegp.data.noise import white_noise
+from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, ok
 from forcegp.errors import InvalidInput
 from forcegp.evidence.identifiability import base_parameters, excitation

@@ -9,13 +9,16 @@ import numpy as np
 
 from forcegp.checks.check_input import CheckInput, numbers_of
 from forcegp.checks.excitation import excitation_doubts, noise_doubts, stated_noise_doubts, torque_noise
-from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
-from forcegp.checks.motion import motion_doubts, sampling_doubts
-from forcegp.checks.moving_base import base_doubts, carried_doubts
-from forcegp.checks.parameters import parameter_doubts
-from forcegp.checks.signals import signal_doubts
-from forcegp.checks.stance import gravity_doubts, stance_doubts, unmeasured_base_doubts
-from forcegp.checks.torque_doubts import not_compared, torque_doubts
+from forcegp.checks.moving_base import (
+    base_doubts,
+    carried_doubts,
+    gravity_doubts,
+    stance_doubts,
+    unmeasured_base_doubts,
+)
+from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
+from forcegp.checks.torque_doubts import Hypothesis, best_hypothesis, not_compared, torque_doubts
+from forcegp.checks.torques import parameter_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows

@@ -1,15 +1,19 @@
-"""Does each channel carry a signal: constant and frozen channels, saturation, limits."""
+"""Does each channel carry a signal, are the rows even in time, and do q, v and a belong to each other."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import CheckInput
-from forcegp.data import Dataset
+from forcegp.checks.check_input import DEGREE, GAP, CheckInput
+from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.dataset_fields import unit_of_each
+from forcegp.data.delay import lowest
+from forcegp.data.filters import JITTER
 from forcegp.data.views import consecutive, runs
-from forcegp.doubts import Doubt, listed, look, wrong
+from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
@@ -204,3 +208,213 @@ def _limits(inputs: CheckInput) -> Iterator[Doubt]:
             joints=beyond,
             numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
         )
+
+
+LOST = 1.8  # median steps at which at least one sample is missing
+MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
+LITTLE_LOST = 1e-4  # share that every logger loses
+OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
+
+
+def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
+    """Rate and duration; jitter; lost samples and gaps; repeated rows."""
+    log = inputs.log
+    steps = np.diff(log.time)[consecutive(log)[:-1]]
+    if not len(steps):
+        return
+    median = float(np.median(steps))
+    count = len(log.episodes)
+    each = f"{count} episodes" if count > 1 else "one episode"
+    seconds = float(steps.sum())
+    yield ok(
+        about="sampling",
+        what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
+        numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
+    )
+    yield from _lost(inputs, steps, median)
+    regular = steps[steps < LOST * median]
+    spread = float(np.abs(regular - median).max()) / median
+    if spread > JITTER:
+        yield look(
+            about="jitter",
+            what=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
+            f"median {1e3 * median:.3g} ms.",
+            do="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
+            "(forcegp import does).",
+            numbers={"relative_deviation": spread},
+        )
+    yield from _repeated(inputs)
+
+
+def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Doubt]:
+    log = inputs.log
+    long = steps > LOST * median
+    if not long.any():
+        return
+    first_rows = np.flatnonzero(consecutive(log))
+    worst = int(first_rows[np.argmax(steps)])
+    lost = float((steps[long] - median).sum())
+    share = lost / float(steps.sum())
+    gaps = int((steps > GAP * median).sum())
+    yield Doubt(
+        level="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
+        about="lost samples",
+        what=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
+        f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
+        + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
+        do=""
+        if share <= LITTLE_LOST and not gaps
+        else "A derivative across a gap is no acceleration: split the log there (forcegp import does), and look "
+        "why the logger loses samples.",
+        numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
+    )
+
+
+def _repeated(inputs: CheckInput) -> Iterator[Doubt]:
+    """Rows in which every position is that of the row before although velocities show that the robot moves."""
+    log = inputs.log
+    follows = consecutive(log)[:-1]
+    same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
+    speed = np.abs(log.v).max(axis=1)[1:]
+    moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
+    share = float((same & moves).sum() / max(1, (moves & follows).sum()))
+    if share < OFTEN_REPEATED:
+        return
+    row = int(np.flatnonzero(same & moves)[0]) + 1
+    yield look(
+        about="repeated rows",
+        what=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
+        f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",
+        do="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
+        numbers={"share": share, "row": row},
+    )
+
+
+RPM = np.pi / 30.0
+FACTORS = {
+    1.0 / DEGREE: "deg/s where q is in rad, or q in rad where v is in deg/s",
+    DEGREE: "rad/s where q is in degrees",
+    1.0 / RPM: "rpm where q is in rad",
+    1000.0: "mrad/s",
+    0.001: "per millisecond",
+    1.0 / (2.0 * np.pi): "turns per second where q is in rad",
+}
+"""Ratios of v to dq/dt, and the unit of v that explains each."""
+
+UNITS = {1.0 / DEGREE: "deg/s", 1.0 / RPM: "rpm", 1000.0: "mrad/s", 0.5 / np.pi: "rev/s"}
+"""Of them those that `forcegp import --unit v=` takes where q is in rad."""
+
+CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
+UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
+FEW = 0.05  # share below which a factor is meant seriously
+TINY_SPEED = 1e-20  # of the mean square velocity of all joints
+SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
+LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
+
+
+def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> list[Doubt]:
+    """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, of all joints or of some."""
+    if inputs.prepared is None:
+        return []
+    even = inputs.even
+    if inputs.cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
+        even = low_pass(even, float(inputs.cutoff), signals=("q", "v", "a"))
+    joints = range(even.nv) if joints is None else joints
+    pieces = [even.select_episodes([number]) for number in even.episodes]
+    found: list[Doubt] = []
+    for name, source in (("v", "q"), ("a", "v")):
+        if name == "a" and any(doubt.level != "ok" for doubt in found):
+            break  # of wrong velocities nothing better can come
+        compared = ((joint, _compared(pieces, name, source, joint)) for joint in joints)
+        fits = {joint: fit for joint, fit in compared if fit is not None}
+        found += _differences(inputs, name, source, fits, len(joints))
+        if not found and fits and name == "v":
+            error = max(unexplained for _, _, unexplained in fits.values())
+            seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
+            found.append(ok(about="velocity", what=seen, numbers={"unexplained": error}))
+    return found
+
+
+def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tuple[float, float, float] | None:
+    """Factor, delay [s] and unexplained share of `name` against the derivative of `source`; None without motion."""
+    left, right = [], []
+    for rows in pieces:
+        inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
+        if inner.sum() < 3:
+            continue
+        left.append(CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None]))
+        right.append(differentiate(getattr(rows, source)[:, [joint]], rows.time)[inner, 0])
+    if not left:
+        return None
+    values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
+    power = np.square(values).sum(axis=1)
+    sizes = [float(np.square(getattr(rows, name)).mean()) for rows in pieces]
+    least = TINY_SPEED * max(*sizes, float(np.square(slopes).mean())) * len(slopes)
+    if not np.square(slopes).sum() > least or not power.min() > least:
+        return None  # a joint that stands still
+    factor = values @ slopes / np.square(slopes).sum()
+    unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
+    best = int(np.argmin(unexplained))
+    return float(factor[best]), lowest(unexplained, SHIFTS), float(max(0.0, unexplained[best]))
+
+
+def _differences(
+    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]], count: int
+) -> Iterator[Doubt]:
+    """One doubt for all joints in which v or a differs from the derivative in the same way."""
+    step = float(np.median(np.diff(inputs.even.time)))
+    groups: dict[tuple[str, float], list[int]] = {}
+    for joint, (factor, shift, unexplained) in fits.items():
+        known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
+        if unexplained > UNEXPLAINED:
+            groups.setdefault(("other", 0.0), []).append(joint)
+        elif unexplained < FEW and factor < 0.0:
+            groups.setdefault(("sign", 0.0), []).append(joint)
+        elif unexplained < FEW and abs(factor - 1.0) > CLOSE:
+            groups.setdefault(("factor", known), []).append(joint)
+        elif unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
+            groups.setdefault(("late", 0.0), []).append(joint)
+    what = "velocity" if name == "v" else "acceleration"
+    for (kind, known), joints in groups.items():
+        factor, shift, unexplained = fits[joints[0]]
+        named, every = inputs.named(joints), len(joints) == count > 2
+        one = f"the {what} of {'all joints' if every else listed(named)} is"
+        severity: Level = "wrong"
+        seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
+        remedy = f"Check which column {name} was read from; or leave it out, so that it is computed from {source}."
+        if kind == "other" and name == "a":
+            severity = "look"
+        elif kind == "sign":
+            seen = f"{one} of the opposite sign of d{source}/dt (factor {factor:.3g})."
+            remedy = f"Turn the sign of {name} or of {source} for this joint, whichever is wrong."
+        elif kind == "factor":
+            severity = "wrong" if abs(factor - 1.0) > 4 * CLOSE else "look"
+            guess = f": {name} looks like {FACTORS[known]}" if known and name == "v" else ""
+            seen = f"{one} {factor:.4g} times d{source}/dt{guess}."
+            remedy = f"Convert {name} or {source} to SI units, or remove the gear ratio."
+        elif kind == "late":
+            severity, late = "look", "later" if shift > 0 else "earlier"
+            seen = (
+                f"{one} logged {1e3 * abs(shift):.1f} ms {late} than d{source}/dt: {abs(shift) / step:.1f} time steps."
+            )
+            remedy = (
+                f"It was filtered by the robot: compute {name} from positions (forcegp import --cutoff auto "
+                "--differentiate q)."
+            )
+        factors = [fits[joint][0] for joint in joints]
+        if max(factors) - min(factors) >= CLOSE * abs(factor):
+            seen += f" Factors: {', '.join(f'{each:.3g}' for each in factors)}."
+        correction: dict[str, Any] = {}
+        if name == "v" and severity == "wrong" and kind == "sign" and abs(factor + 1.0) < CLOSE:
+            correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
+        elif name == "v" and severity == "wrong" and known in UNITS and len(joints) == count:
+            now = unit_of_each("v", inputs.log.units["v"], inputs.log.nv)
+            each = [UNITS[known] if joint in fits else unit for joint, unit in enumerate(now)]
+            correction = {"unit": {"v": tuple(each[:1] if len(set(each)) == 1 else each)}}
+        each = [
+            {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
+            for f, s, left in (fits[joint] for joint in joints)
+        ]
+        numbers = each[0] if len(each) == 1 else {"each": each}
+        yield Doubt(level=severity, about=what, what=seen, do=remedy, joints=named, numbers=numbers,
+                      correction=correction)  # fmt: skip

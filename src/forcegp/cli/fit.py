@@ -145,7 +145,7 @@ class Fit(RobotOptions, Overwriting):
         for note in [*forces_of(given), *notes, *found]:
             terminal.note(note)
         for doubt in forcegp.scores.unfinished_search(posterior):
-            terminal.warn(doubt)
+            terminal.warn(str(doubt))
         terminal.show(*tables)
         return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
 

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 import forcegp.forces
 import forcegp.robots
 from forcegp.data.dataset import Dataset, require_rows
-from forcegp.data.filters import Lag
-from forcegp.data.sampling import episodes_in_order
+from forcegp.data.filters import Lag, episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.columns import law_columns, usual_columns
 from forcegp.robots.manifold import Group

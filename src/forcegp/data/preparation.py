@@ -12,8 +12,16 @@ from jaxtyping import Float
 from forcegp.data.configurations import actuators
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, estimate_thruster_lag, thruster_columns, torques_of_joints
-from forcegp.data.filters import PASSED, LowPass, Signal, low_pass, shifted
-from forcegp.data.sampling import differentiated, episodes_in_order, uniform_step
+from forcegp.data.filters import (
+    PASSED,
+    LowPass,
+    Signal,
+    differentiated,
+    episodes_in_order,
+    low_pass,
+    shifted,
+    uniform_step,
+)
 from forcegp.data.spectrum import FEWEST_ROWS, MotionSpectrum, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments

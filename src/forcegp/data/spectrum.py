@@ -20,8 +20,16 @@ import forcegp.robots
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torque_columns
-from forcegp.data.filters import Filter, LowPass, Signal, low_pass, shifted
-from forcegp.data.sampling import differentiated, episodes_in_order, uniform_step
+from forcegp.data.filters import (
+    Filter,
+    LowPass,
+    Signal,
+    differentiated,
+    episodes_in_order,
+    low_pass,
+    shifted,
+    uniform_step,
+)
 from forcegp.errors import DatasetError
 
 SEGMENT = 4.0  # s

@@ -1,4 +1,4 @@
-"""Views of a log: rows that follow each other, windows, motions of equal length, and what laws remember at each row."""
+"""Views of a log: rows that follow each other, windows, motions of equal length, and which rows to take."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from forcegp.data.dataset import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import DatasetError, InvalidInput
 from forcegp.model import Model
+from forcegp.robots.arguments import whole_number
 
 Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 """Which rows: numbers of at most so many of a log, such as `evenly` and `farthest` give."""
@@ -170,3 +171,143 @@ def _even_steps(dataset: Dataset) -> tuple[float, Int[np.ndarray, " rows"]]:
         raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")
     dt = float(np.median(own))
     return dt, np.concatenate([[0], np.cumsum(np.abs(pauses - dt) > EVEN_STEPS * dt)])
+
+
+MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
+FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
+
+
+def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.ndarray, " nv"] | None:
+    """Standard deviation of noise on a signal, or on its means over `width` rows, from differences of successive ones.
+
+    The k-th difference of white noise has the variance binomial(2k, k), that of a smooth motion falls with k: NaN where
+    it is motion that is seen. Medians, since impacts are no noise. None for rows out of order and fewer than 30.
+    """
+    if not log.time_ordered:
+        return None
+    noise = []
+    for order, variance in ((3, 20.0), (4, 70.0)):
+        first = whole_windows(log, width * (order + 1))
+        if len(first) < FEWEST_DIFFERENCES:
+            return None
+        first = first[:: max(1, len(first) // MOST_DIFFERENCES)]
+        means = np.stack([window_means(getattr(log, signal), first + k * width, width) for k in range(order + 1)])
+        differences = np.diff(means, order, axis=0)[0]
+        noise.append(1.4826 * np.median(np.abs(differences), axis=0) / np.sqrt(variance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where((noise[0] < MOTION * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
+
+
+def time_blocks(
+    time: Float[np.ndarray, " rows"], episode: Int[np.ndarray, " _"], seconds: float
+) -> tuple[tuple[int, ...], ...]:
+    """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
+
+    To leave whole blocks out tests the prediction of a part of the motion that was not seen (block cross-validation;
+    Burman, Chow & Nolan 1994, "A cross-validatory method for dependent data").
+
+    `time` [s] and `episode` may come in any order, such as that of `farthest_rows`. Stretches are counted from the
+    first of these rows in every episode; those without rows give no block, so that every row is in exactly one.
+    Raises InvalidInput for a length that is not positive and finite, and for columns of different lengths.
+    """
+    if not 0.0 < seconds < float("inf"):
+        raise InvalidInput(f"seconds is {seconds}; it must be positive and finite.")
+    if time.shape != episode.shape:
+        raise InvalidInput(f"time has {len(time)} rows and episode {len(episode)}; give both for the same rows.")
+    blocks: dict[tuple[int, int], list[int]] = {}
+    first = {int(number): float(time[episode == number].min()) for number in np.unique(episode)}
+    for row in np.lexsort((time, episode)):
+        number = int(episode[row])
+        stretch = int((time[row] - first[number]) / seconds)
+        blocks.setdefault((number, stretch), []).append(int(row))
+    return tuple(tuple(rows) for rows in blocks.values())
+
+
+def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Dataset) -> Int[np.ndarray, " repeated"]:
+    """Numbers of the rows of `test` whose (q, v, u) is exactly one of those in `trained`, each (rows, k)."""
+    # -0.0 becomes 0.0: equal numbers have equal bytes
+    known, rows = (np.hstack(each) + 0.0 for each in (trained, (test.q, test.v, test.u)))
+    found = {row.tobytes() for row in known}
+    return np.array([number for number, row in enumerate(rows) if row.tobytes() in found], dtype=np.int64)
+
+
+def require_disjoint(train: Dataset, test: Dataset) -> None:
+    """Refuse a pair of Datasets in which the test repeats the training.
+
+    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both were simulated or recorded with
+    the same `metadata` (same seed, same configuration) and share an episode: two samples of one trajectory.
+    """
+    repeated = repeated_rows((train.q, train.v, train.u), test)
+    if repeated.size:
+        raise DatasetError(
+            f"{repeated.size} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
+            "Test on another trajectory: another episode, recording or seed."
+        )
+    shared = sorted(set(train.episodes) & set(test.episodes))
+    if train.metadata and train.metadata == test.metadata and shared:
+        raise DatasetError(
+            f"training and test rows come from the same trajectory: equal metadata, episodes {shared} in both. "
+            "Test on another episode, recording or seed."
+        )
+
+
+ROUNDING = 1e-13  # Standard deviation, relative to the largest entry, below which a column is constant but for rounding
+
+
+def farthest_point_sampling(
+    points: Float[np.ndarray, "rows features"], count: int, *, start: int = 0
+) -> Int[np.ndarray, " count"]:
+    """Numbers of `count` rows of which each is the farthest from all rows chosen before it.
+
+    Greedy k-centre (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance") with Euclidean distances
+    on columns standardised to zero mean and unit standard deviation. The first row is `start`. The
+    result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are the sample of
+    size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
+    Time O(rows * count * features), memory O(rows * features).
+
+    Raises InvalidInput if `points` is not a finite table, or for a `count` or `start` outside the rows.
+    """
+    table = np.asarray(points)
+    if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():
+        raise InvalidInput(
+            f"points must be a (rows, features) table of finite numbers; given: {table.dtype} {table.shape}."
+        )
+    rows = table.shape[0]
+    count = whole_number("count", count, 1, rows, "the number of rows")
+    columns = _standardized_columns(table)
+    distance = np.full(rows, np.inf)
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
+    for position in range(count):
+        if position:
+            chosen[position] = np.argmax(distance)  # the lowest row number among equals
+        row = chosen[position]
+        # Differences, not |x|^2 - 2 x.y + |y|^2: a repeated row must have distance exactly 0.
+        squared = np.zeros(rows)
+        for column in columns:
+            difference = column - column[row]
+            squared += difference * difference
+        np.minimum(distance, squared, out=distance)
+        distance[row] = -1.0  # never chosen again, not even among repeated rows
+    return chosen
+
+
+def farthest(dataset: Dataset, count: int, *, start: int = 0) -> Int[np.ndarray, " count"]:
+    """The rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`."""
+    return farthest_point_sampling(np.hstack([dataset.q, dataset.v, dataset.u]), count, start=start)
+
+
+def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
+    """A Dataset of the rows that are `farthest`: one of fewer points takes the first, `farthest_rows(...)[:100]`."""
+    return dataset.rows(farthest(dataset, count, start=start))
+
+
+def _standardized_columns(table: np.ndarray) -> np.ndarray:
+    """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
+    columns = np.ascontiguousarray(table.T, dtype=np.float64)
+    scale = np.abs(columns).max(axis=1, keepdims=True)
+    columns = columns / np.where(scale > 0, scale, 1.0)  # so that squaring in std cannot overflow or underflow
+    spread = columns.std(axis=1, keepdims=True)
+    spread[spread < ROUNDING] = 0.0
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)

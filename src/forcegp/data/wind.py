@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.sampling import episodes_in_order, sums_before
+from forcegp.data.filters import episodes_in_order, sums_before
 
 SECONDS = 0.3  # s: rows that lie this far apart count 1/e for each other's wind
 MOST_ROWS, FEWEST_ROWS = 3000, 400

@@ -1,4 +1,4 @@
-from .delimited_text import DELIMITERS as DELIMITERS
+from .tables import DELIMITERS as DELIMITERS
 from .formats import open_source as open_source
 from .importing import ImportOptions as ImportOptions, import_recordings as import_recordings
 from .mapping import (

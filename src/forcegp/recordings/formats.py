@@ -9,10 +9,9 @@ from typing_extensions import override
 from forcegp.data import is_dataset
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.recordings.arrays import ArrayFile, HDF5Arrays, NumpyArchive, matlab_file
-from forcegp.recordings.delimited_text import DelimitedText
-from forcegp.recordings.parquet import ParquetFile
 from forcegp.recordings.ros_bag import RosBag
 from forcegp.recordings.source import Columns, Source
+from forcegp.recordings.tables import DelimitedText, ParquetFile
 
 
 class SideBySide(Source):

@@ -11,10 +11,10 @@ from jaxtyping import Float, Int
 from scipy.interpolate import make_interp_spline
 
 import forcegp.robots
-from forcegp.data.sampling import JITTER
+from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
-from forcegp.recordings.joined_topics import Read, read_on_one_clock
 from forcegp.recordings.moving_base import Jumps, Layout, read_poses
+from forcegp.recordings.ros_bag import Read, read_on_one_clock
 from forcegp.recordings.signal_plan import SignalPlan
 from forcegp.recordings.source import Columns, Source
 
