@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from tests.checks.logs import arm, clean, column, late
 
-from forcegp import Dataset
+from forcegp import Dataset, Spring, Torques, fit, save_posterior
 from forcegp.data import resample
 
 
@@ -97,7 +97,7 @@ REFUSALS = {
     ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
     ("import", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
     ("import", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",
-    ("import", "noisy.h5", "--lag", "auto", "--delay", "auto", "--out", "x.h5"): "give one of them in s",
+    ("import", "noisy.h5", "--lag", "auto", "--out", "x.h5"): "this lag is that of thrusters",
     ("import", "noisy.h5", "--every", "0", "--out", "x.h5"): "--every 0 must be an integer of at least 1",
     ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("import", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 does not exist",
@@ -118,3 +118,15 @@ def test_what_cannot_be_done_is_refused_in_one_line(forcegp, folder, words):
     assert not done.stdout
     assert not (folder / "x.h5").exists()
     assert [path.name for path in (folder / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_laws_of_a_saved_posterior_belong_to_the_torques_that_are_expected(forcegp, folder):
+    data = clean(1)
+    sprung = replace(data, u=data.u + 40.0 * data.q, truth={})
+    sprung.save(folder / "sprung.h5")
+    assert "0 wrong, 0 to look at" not in forcegp("check", "sprung.h5", folder=folder).stdout
+    found = fit(data.model.with_forces(Spring()), sprung, Torques())
+    save_posterior(found, folder / "springs")
+    done = forcegp("check", "sprung.h5", "--identified", "springs", "--strict", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "0 wrong, 0 to look at" in done.stdout, done.stdout

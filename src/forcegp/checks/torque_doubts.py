@@ -1,4 +1,4 @@
-"""Doubts of the comparison of torques with inverse dynamics: wrong signs, joints and units; factor, delay, what is left.
+"""Doubts of the comparison of torques with inverse dynamics: wrong signs, joints, units; factor; delay; what is left.
 
 Each hypothesis corrects one error in a log. That under which inverse dynamics fits the torques best is reported if it
 leaves far less unexplained than the log as it is; then the next is sought, on top of it.

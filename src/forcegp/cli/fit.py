@@ -24,7 +24,7 @@ from forcegp.atomic_files import file_digest, write_json, write_text
 from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Overwriting, listed, numbers_of, unless_given
 from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
 from forcegp.cli.estimates import estimates_table, what_is_open
-from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of
+from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of, identified_system
 from forcegp.cli.terminal import Terminal, facts, with_option_names
 from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
@@ -229,9 +229,7 @@ SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed",
 
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
     """The numbers that were found, and robot and known forces with them: for --identified, and as a URDF."""
-    estimates, known = posterior.estimates, posterior.model.known
-    unloaded = tuple(law for law in known.laws if not isinstance(law, forcegp.Payload))
-    known = replace(known, robot=known.loaded_robot, forces=unloaded)
+    estimates, known = posterior.estimates, identified_system(posterior.model)
     write_json(folder / "estimates.json", estimates.to_dict())
     write_text(folder / SYSTEM_FILE, known.to_json() + "\n")
     if estimates.by_body:  # a URDF has no place for intervals

@@ -149,6 +149,8 @@ class RobotOptions(RobotFileOptions):
         path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
         if (self.identified / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
             require_unchanged(self.identified, "fit again")
+        if path != self.identified and not path.exists() and (self.identified / "model.json").exists():
+            return identified_system(forcegp.load_posterior(self.identified).model)  # that of `save_posterior`
         if path.is_fifo():  # to open it would wait for a writer for ever
             raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp fit` wrote.")
         try:
@@ -158,6 +160,13 @@ class RobotOptions(RobotFileOptions):
                 f"{path}: cannot be read ({error}); give a folder that `forcegp fit` wrote."
             ) from None
         return forcegp.Model.from_json(text)
+
+
+def identified_system(model: forcegp.Model) -> forcegp.Model:
+    """What a fit knows of robot and laws, without what the robot carried."""
+    known = model.known
+    unloaded = tuple(law for law in known.laws if not isinstance(law, forcegp.Payload))
+    return replace(known, robot=known.loaded_robot, forces=unloaded)
 
 
 def forces_of(model: forcegp.Model) -> list[str]:

@@ -157,7 +157,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> Preparation:
         chosen = replace(given, cutoff=cutoff)
         reasons["cutoff_per_joint"] = plain(each)
     if given.lag == "auto":
-        seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0), dataset))
+        seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0, delay=0.0), dataset))
         pushing = thruster_columns(dataset.model)  # joints beside them do not follow so
         each = tuple(seconds * (column in pushing) for column in range(actuators(dataset)))
         chosen = replace(chosen, lag=seconds if all(each) else each)
