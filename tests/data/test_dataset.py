@@ -115,7 +115,7 @@ def test_length_names_and_a_short_text():
         ({"truth": {"lambda": np.zeros((39, 1))}}, r"truth\['lambda'\] has 39 rows"),
         ({"metadata": {"x": float("nan")}}, "metadata cannot be written as JSON"),
         ({"metadata": {"x": np.zeros(2)}}, "metadata cannot be written as JSON"),
-        ({"metadata": {"x": {1: 2}}}, "key 1 is not text"),
+        ({"metadata": {"x": {1: 2}}}, "a key is not text"),
     ],
 )
 def test_wrong_fields_are_named(changes, message):

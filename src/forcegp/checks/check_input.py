@@ -44,11 +44,11 @@ class CheckInput:
 
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
-    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the cut-off is that
-    of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or by more than pi
-    otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a log that is
-    otherwise as given). `compared_noise` (nv,) is the standard deviation of the noise of the acceleration in
-    `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any derivative.
+    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `wraps` and `jumps` mark where
+    (rows, nv) a position of `log` jumps by a turn, or by more than pi otherwise, `dropped` where a signal is 0 because
+    it was not measured (interpolated in `mended`, a log that is otherwise as given). `compared_noise` (nv,) is the
+    standard deviation of the noise of the acceleration in `compared`, None where it is not known. `prepared` and
+    `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset
@@ -61,7 +61,6 @@ class CheckInput:
     contacts: int = 0
     prepared: Dataset | None = None
     compared: Dataset | None = None
-    automatic: bool = False
     dropped: Mapping[str, Bool[np.ndarray, "rows nv"]] = field(default_factory=dict)
     compared_noise: Float[np.ndarray, " nv"] | None = None
     most_rows: int = MOST_ROWS
@@ -117,7 +116,6 @@ class CheckInput:
         found = _mended(dataset)
         mended, jumps = found["mended"], found["jumps"]
         found["even"] = even = _even(_unwrapped(mended, found["wraps"]), jumps)
-        found["automatic"] = preparation.cutoff == "auto"
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
             chosen = replace(preparation, every=1, delay=0.0).resolved(even)

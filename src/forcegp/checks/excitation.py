@@ -57,15 +57,13 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         return
     before, after = (numbers_of(measured[when]) for when in ("before", "after"))
     spread = np.std(inputs.prepared.a, axis=0)
-    why = "`cutoff` auto" if inputs.automatic else "as asked for"
-    if inputs.cutoff is None:
-        why = "when this dataset was prepared"
     if np.isfinite(after).any():
+        when = " when this dataset was prepared" if inputs.cutoff is None else ""
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
         unit = "rad/s²" if inputs.rotates[worst] else "m/s²"
         yield ok(
             about="noise",
-            what=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
+            what=f"a filter at {cutoff:.3g} Hz{when} takes the noise of the acceleration of "
             f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
             numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
         )
@@ -106,7 +104,6 @@ WELL = 100.0  # condition number up to which identification is commonly called w
 BADLY = 1000.0
 HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
 FEWEST_CHANGES = 2
-HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
 STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
 
 
@@ -137,36 +134,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         if joints:
             about = {"joints": tuple(joints), "numbers": {"joints": motions}}
             yield look(about="excitation", what=f"{listed(joints)} {what}", do=remedy, **about)
-    yield from _held(inputs, still)
     yield from _base_parameters(inputs)
-
-
-def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
-    """Joints that stand still in whole stretches although they move in others."""
-    assert inputs.prepared is not None
-    rows = inputs.prepared
-    if len(rows.episodes) < 2:
-        return
-    spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
-    for joint, name in enumerate(inputs.names):
-        held = np.flatnonzero(
-            (spans[:, joint] < HELD * spans[:, joint].max()) & (spans.max(axis=1) > 5.0 * spans[:, joint])
-        )
-        if name in still or not len(held) or len(held) > len(spans) // 2:
-            continue
-        first = int(held[0])
-        unit = "rad" if inputs.rotates[joint] else "m"
-        begin = float(rows.time[rows.episode == rows.episodes[first]][0])
-        yield look(
-            about="held joint",
-            what=f"{name} stays within {spans[first, joint]:.2g} {unit} in {len(held)} of {len(spans)} stretches "
-            f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
-            f"moves {spans[:, joint].max():.2g}.",
-            do="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
-            "(`locked`).",
-            joints=(name,),
-            numbers={"stretches": held.tolist(), "range": float(spans[first, joint])},
-        )
 
 
 def _base_parameters(inputs: CheckInput) -> Iterator[Doubt]:

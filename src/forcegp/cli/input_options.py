@@ -274,7 +274,7 @@ class PreparationOptions(CutoffOptions):
     """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together,
     which needs the robot."""
     lag: Annotated[str, arg(metavar="S|auto")] = "0"
-    """Time constant in s with which actuators of first order follow u: as for --delay."""
+    """Time constant in s with which actuators of first order follow u. auto: estimated, for thrusters alone."""
     every: Annotated[int | None, unless_given("N", "1", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0

@@ -29,19 +29,16 @@ from forcegp.summary import listed
 INVISIBLE = 1e-9  # |H B_c| over |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15
 ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
 EQUAL = 1e-9  # relative difference of two latents' effects and features below which they are the same
-LEFT_OUT = 0.1  # share of what the known forces do that may lie where no latent acts, without a word
-SPAN = 1e-9  # singular values of unit effects relative to the largest below which they are one effect fewer
 ROWS_LOOKED_AT = 500
 
 
-def check_forces(likelihood: MarginalLikelihood, known: Model | None = None) -> None:
+def check_forces(likelihood: MarginalLikelihood) -> None:
     """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
 
     Raises InvalidInput if the prior gives other shapes or types than it should, if no latent changes the acceleration
     at any training point, if all of one term do nothing at all, if all features of a latent are constant (a tool or
     joint that never moves), and if latents of two terms do the same in every row. Warns (DataWarning) of single
-    features that are constant, of latents that move nothing or that the constraint hides while others show, and, where
-    the model leaves out forces that are `known`, of those that no latent can take over.
+    features that are constant, and of latents that move nothing or that the constraint hides while others show.
     """
     dynamics, robot, unknown = likelihood.dynamics, likelihood.model.robot, likelihood.model.unknown
     B, features = checked_values(unknown, dynamics)
@@ -54,11 +51,6 @@ def check_forces(likelihood: MarginalLikelihood, known: Model | None = None) -> 
     shows, unseen = _of_effects(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
     _refuse_equal(names, terms, shows, effect, likelihood.standardization(features))
     doubts += unseen
-    if known is not None and likelihood.model.carries_known_forces and not known.carries_known_forces:
-        rows = likelihood.training
-        with torch.no_grad():
-            Q_K = known.to(rows.q.device).dynamics(rows.q, rows.v, rows.u).Q_K
-        doubts += _of_known_forces(effect, (dynamics.H @ Q_K[..., None])[..., 0])
     Doubts(doubts).warn(stacklevel=5)
 
 
@@ -142,23 +134,6 @@ def _refuse_equal(
                 f"no data can separate {names[first]!r} and {names[second]!r}: both act in the same direction and "
                 "depend on the same inputs; leave one of them out"
             )
-
-
-def _of_known_forces(effect: Tensor, known: Tensor) -> Iterator[Doubt]:
-    """Whether the latents act where the known forces do: the part of `known` (N, nv) outside the span of `effect`."""
-    step = -(-len(known) // ROWS_LOOKED_AT)
-    effect, known = effect[::step], known[::step]
-    columns = effect / torch.linalg.vector_norm(effect, dim=-2, keepdim=True).clamp_min(torch.finfo(effect.dtype).tiny)
-    carried = (columns @ (torch.linalg.pinv(columns, rtol=SPAN) @ known[..., None]))[..., 0]
-    size = float(known.square().sum().sqrt())
-    share = float((known - carried).square().sum().sqrt()) / size if size > 0.0 else 0.0
-    if share > LEFT_OUT:
-        yield look(
-            about="laws",
-            what=f"without laws the unknown forces carry gravity, actuation and all else, but {share:.0%} of the "
-            "acceleration that these cause lies where none of them acts;",
-            do="give the model its laws, or add a force on every joint, JointForces()",
-        )
 
 
 def _few(names: Sequence[str]) -> str:

@@ -369,7 +369,7 @@ class _Functions:
         likelihood = MarginalLikelihood(model, training)
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)
-        check_forces(likelihood, dataset.model)
+        check_forces(likelihood)
         require_memory_to_learn(likelihood)
         described = described_rows(rows, dataset) | {"noise": noise.to_dict()}
         # before the search: a force of one's own may fail there
