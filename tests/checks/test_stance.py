@@ -5,11 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forcegp import Dataset, Model, Robot, check
+from forcegp import check
 from forcegp.checks import quick_check
-from forcegp.data import estimate_stance
-from forcegp.errors import DatasetError
-from forcegp.mechanics import fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -83,30 +80,3 @@ def test_a_base_that_nobody_measured_is_named(log):
     assert "not measured" in doubts[0].what
     assert "motion capture" in doubts[0].advice
     assert "base='fixed'" in doubts[0].advice
-
-
-@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
-def test_a_robot_in_a_vertical_plane_without_gravity_is_named(turn):
-    """A body that is thrown up and caught again; with the gravity that the doubt states, nothing is found."""
-    body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
-    text = f'<robot name="r"><link name="foot">{body}</link></robot>'
-    time = np.arange(1600) / 200
-    flies = time % 0.8 < 0.5
-    down = np.array([np.sin(turn), -np.cos(turn)])
-    q, v, a = np.zeros((1600, 4)), np.zeros((1600, 3)), np.zeros((1600, 3))
-    q[:, 2] = 1.0
-    a[:, :2] = np.where(flies, 9.81, -9.81 * 5.0 / 3.0)[:, None] * down
-    v[:, :2] = np.cumsum(a[:, :2], axis=0) / 200
-
-    def rows(**gravity):
-        model = Model(Robot.from_urdf_text(text, base="planar", **gravity), fixed_point("foot", switch="s"))
-        return Dataset(q=q, v=v, u=1.0 - flies[:, None], a=a, time=time, model=model)
-
-    (doubt,) = of(rows(), "gravity")
-    assert doubt.level == "wrong"
-    with pytest.raises(DatasetError, match="falls at"):
-        estimate_stance(rows())
-    stated = tuple(float(x) for x in doubt.advice.split("--gravity=")[1].split(" ")[0].split(","))
-    np.testing.assert_allclose(stated, (*(9.81 * down), 0.0), atol=0.06 * 9.81)
-    assert not of(rows(gravity=stated), "gravity")
-    assert not of(replace(rows(), a=0.5 * a), "gravity")  # a robot that drives, however fast

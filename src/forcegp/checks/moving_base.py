@@ -16,7 +16,6 @@ from torch import Tensor
 
 from forcegp.data import Dataset, estimate_stance, thruster_columns
 from forcegp.data.configurations import in_base
-from forcegp.data.stance import missing_gravity
 from forcegp.data.views import consecutive, whole_windows
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import ContactError
@@ -326,8 +325,6 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     names = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
     if not names:
         return
-    if missing_gravity(dataset, model) is not None:  # another doubt, without which forces show nothing
-        return
     found = estimate_stance(dataset, model)
     for k, name in enumerate(found.names):
         logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
@@ -363,13 +360,6 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
             seen = f"{name!r} is 0 in rows of which {rests:.0%} show {frame!r} at rest, row {row} for example."
         if kind is not ok or not odd:
             yield kind(about="contact flag", what=seen, do=remedy, numbers=numbers)
-
-
-def gravity_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
-    """A robot in a vertical plane that was read without gravity in it."""
-    found = missing_gravity(dataset, model)
-    if found is not None:
-        yield wrong(about="gravity", what=f"{found[0]}.", do=found[1])
 
 
 def unmeasured_base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:

@@ -12,7 +12,6 @@ from forcegp.checks.excitation import excitation_doubts, noise_doubts, stated_no
 from forcegp.checks.moving_base import (
     base_doubts,
     carried_doubts,
-    gravity_doubts,
     stance_doubts,
     unmeasured_base_doubts,
 )
@@ -159,7 +158,7 @@ def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = N
     if not unmeasured and Doubts(of_base).level != "wrong":  # forces in wrong axes show nothing
         of_base += carried_doubts(dataset, model)
     flags = stance_doubts(dataset, model) if Doubts(of_joints).level != "wrong" else ()  # wrong v contradict any flag
-    return Doubts([*of_base, *of_joints, *gravity_doubts(dataset, model), *flags])
+    return Doubts([*of_base, *of_joints, *flags])
 
 
 def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Doubt]:

@@ -291,18 +291,15 @@ def _repeated(inputs: CheckInput) -> Iterator[Doubt]:
 
 
 RPM = np.pi / 30.0
-FACTORS = {
-    1.0 / DEGREE: "deg/s where q is in rad, or q in rad where v is in deg/s",
-    DEGREE: "rad/s where q is in degrees",
-    1.0 / RPM: "rpm where q is in rad",
-    1000.0: "mrad/s",
-    0.001: "per millisecond",
-    1.0 / (2.0 * np.pi): "turns per second where q is in rad",
+FACTORS: dict[float, tuple[str, str | None]] = {
+    1.0 / DEGREE: ("deg/s where q is in rad, or q in rad where v is in deg/s", "deg/s"),
+    DEGREE: ("rad/s where q is in degrees", None),
+    1.0 / RPM: ("rpm where q is in rad", "rpm"),
+    1000.0: ("mrad/s", "mrad/s"),
+    0.001: ("per millisecond", None),
+    0.5 / np.pi: ("turns per second where q is in rad", "rev/s"),
 }
-"""Ratios of v to dq/dt, and the unit of v that explains each."""
-
-UNITS = {1.0 / DEGREE: "deg/s", 1.0 / RPM: "rpm", 1000.0: "mrad/s", 0.5 / np.pi: "rev/s"}
-"""Of them those that `forcegp import --unit v=` takes where q is in rad."""
+"""Ratios of v to dq/dt, what explains each, and the unit that `forcegp import --unit v=` takes where q is in rad."""
 
 CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
 UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
@@ -364,57 +361,49 @@ def _differences(
     """One doubt for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
     groups: dict[tuple[str, float], list[int]] = {}
-    for joint, (factor, shift, unexplained) in fits.items():
+    for joint, (factor, shift, left) in fits.items():
+        late = np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4)
+        sort = "sign" if factor < 0.0 else "factor" if abs(factor - 1.0) > CLOSE else "late" if late else ""
+        kind = "other" if left > UNEXPLAINED else sort if left < FEW else ""
         known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
-        if unexplained > UNEXPLAINED:
-            groups.setdefault(("other", 0.0), []).append(joint)
-        elif unexplained < FEW and factor < 0.0:
-            groups.setdefault(("sign", 0.0), []).append(joint)
-        elif unexplained < FEW and abs(factor - 1.0) > CLOSE:
-            groups.setdefault(("factor", known), []).append(joint)
-        elif unexplained < FEW and np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4):
-            groups.setdefault(("late", 0.0), []).append(joint)
+        if kind:
+            groups.setdefault((kind, known if kind == "factor" else 0.0), []).append(joint)
     what = "velocity" if name == "v" else "acceleration"
     for (kind, known), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
         named, every = inputs.named(joints), len(joints) == count > 2
         one = f"the {what} of {'all joints' if every else listed(named)} is"
-        severity: Level = "wrong"
-        seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
-        remedy = f"Check which column {name} was read from; or leave it out, so that it is computed from {source}."
-        if kind == "other" and name == "a":
-            severity = "look"
+        guess, unit = FACTORS.get(known, ("", None)) if name == "v" else ("", None)
+        level: Level = "wrong"
+        if kind == "other":
+            level = "look" if name == "a" else "wrong"
+            seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
+            remedy = f"Check which column {name} was read from; or leave it out, so that it is computed from {source}."
         elif kind == "sign":
             seen = f"{one} of the opposite sign of d{source}/dt (factor {factor:.3g})."
             remedy = f"Turn the sign of {name} or of {source} for this joint, whichever is wrong."
         elif kind == "factor":
-            severity = "wrong" if abs(factor - 1.0) > 4 * CLOSE else "look"
-            guess = f": {name} looks like {FACTORS[known]}" if known and name == "v" else ""
-            seen = f"{one} {factor:.4g} times d{source}/dt{guess}."
+            level = "wrong" if abs(factor - 1.0) > 4 * CLOSE else "look"
+            seen = f"{one} {factor:.4g} times d{source}/dt{guess and f': {name} looks like {guess}'}."
             remedy = f"Convert {name} or {source} to SI units, or remove the gear ratio."
-        elif kind == "late":
-            severity, late = "look", "later" if shift > 0 else "earlier"
-            seen = (
-                f"{one} logged {1e3 * abs(shift):.1f} ms {late} than d{source}/dt: {abs(shift) / step:.1f} time steps."
-            )
-            remedy = (
-                f"It was filtered by the robot: compute {name} from positions (forcegp import --cutoff auto "
-                "--differentiate q)."
-            )
+        else:
+            level, size = "look", f"{1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'}"
+            seen = f"{one} logged {size} than d{source}/dt: {abs(shift) / step:.1f} time steps."
+            remedy = f"The robot filtered it: compute {name} from positions (forcegp import --cutoff auto)."
         factors = [fits[joint][0] for joint in joints]
         if max(factors) - min(factors) >= CLOSE * abs(factor):
             seen += f" Factors: {', '.join(f'{each:.3g}' for each in factors)}."
         correction: dict[str, Any] = {}
-        if name == "v" and severity == "wrong" and kind == "sign" and abs(factor + 1.0) < CLOSE:
+        if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
-        elif name == "v" and severity == "wrong" and known in UNITS and len(joints) == count:
+        elif level == "wrong" and unit is not None and len(joints) == count:
             now = unit_of_each("v", inputs.log.units["v"], inputs.log.nv)
-            each = [UNITS[known] if joint in fits else unit for joint, unit in enumerate(now)]
-            correction = {"unit": {"v": tuple(each[:1] if len(set(each)) == 1 else each)}}
+            units = [unit if joint in fits else own for joint, own in enumerate(now)]
+            correction = {"unit": {"v": tuple(units[:1] if len(set(units)) == 1 else units)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)
         ]
         numbers = each[0] if len(each) == 1 else {"each": each}
-        yield Doubt(level=severity, about=what, what=seen, do=remedy, joints=named, numbers=numbers,
-                      correction=correction)  # fmt: skip
+        told = {"about": what, "what": seen, "do": remedy, "joints": named, "numbers": numbers}
+        yield Doubt(level=level, **told, correction=correction)

@@ -113,8 +113,7 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
     the median at rest, of rows weighted by their force. Forces decide nothing where moving feet show more than these
-    40 %. Raises ContactError without contacts that have a switch, DatasetError for a robot in a plane
-    that falls and has no gravity there.
+    40 %. Raises ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
     names = () if model is None else tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))
@@ -123,8 +122,6 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
             "no contact of the model has a switch, so there is no stance to find; give one, for example "
             "fixed_point('foot', switch='foot_stands')."
         )
-    if (fall := missing_gravity(dataset, model)) is not None:
-        raise DatasetError(f"{fall[0]}, so forces show no stance: {fall[1]}")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked = _motion_and_force(dataset, model, names)
@@ -229,34 +226,3 @@ def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
             near = np.searchsorted(at, time).clip(1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), int)
             out[np.minimum(np.abs(time - at[near - 1]), np.abs(time - at[near])) <= EDGE] = np.nan
     return filled
-
-
-EARTH, NEAR, OFTEN = 9.81, 0.5, 0.1  # m/s^2: of free fall, and about it; share of the rows in which a robot falls so
-ALONG = 0.05  # Of a unit vector: parts below this are none
-
-
-def missing_gravity(dataset: Dataset, model: forcegp.Model) -> tuple[str, str] | None:
-    """What shows that a robot in a plane falls in it although its gravity has no part there, and the remedy."""
-    robot = model.robot
-    if robot.base != "planar" or robot.gravity[:2].any():
-        return None
-    q, v, a = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.a))
-    force = robot.kinematics(q, v).inverse_dynamics(a)[:, :2].cpu().numpy() / robot.mass  # in the axes of the base
-    c, s = dataset.q[:, 2], dataset.q[:, 3]
-    motion = np.stack([c * force[:, 0] - s * force[:, 1], s * force[:, 0] + c * force[:, 1]], 1)
-    near = abs(np.linalg.norm(motion, axis=1) - EARTH) < NEAR
-    if not near.any():
-        return None
-    fall = np.median(motion[near], axis=0)
-    often, size = (np.linalg.norm(motion - fall, axis=1) < NEAR).mean(), np.linalg.norm(fall)
-    if often < OFTEN or abs(size - EARTH) > NEAR:
-        return None
-    direction = fall / size
-    direction = np.where(abs(direction) < ALONG, 0.0, direction)
-    x, y = EARTH * direction / np.linalg.norm(direction)
-    return (
-        f"in {often:.0%} of the rows the robot falls at ({fall[0]:.3g}, {fall[1]:.3g}) m/s^2 in its plane, in which it "
-        "has no gravity",
-        f"forcegp import --robot FILE --base planar --gravity={x + 0.0:.4g},{y + 0.0:.4g},0 reads it with gravity, as "
-        f"Robot.from_urdf(..., gravity=({x + 0.0:.4g}, {y + 0.0:.4g}, 0)) does.",
-    )
