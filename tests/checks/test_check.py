@@ -39,7 +39,6 @@ ALL = ("pan", "lift", "bend")
 DEFECTS: dict[str, tuple[Callable[[Dataset], Dataset], str, str, tuple[str, ...]]] = {
     "velocities late": (lambda d: replace(d, v=np.roll(d.v, 4, axis=0)), "look", "velocity", ALL),
     "dead position": (lambda d: column(d, "q", 1, lambda x: 0 * x + 0.3), "wrong", "constant channel", ("lift",)),
-    "beyond a limit": (lambda d: column(d, "q", 2, lambda x: x + 4.0), "look", "limits", ("bend",)),
     "a joint that stays": (lambda d: all_motion(d, [1e-3, 1, 1]), "look", "excitation", ("pan",)),
 }
 

@@ -24,16 +24,14 @@ FROZEN_ROWS = 10
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
 CLIPPED_ROWS = 10
-TOLERANCE = 0.01  # of the range between limits, by which a position may exceed them: calibration
 
 
 def signal_doubts(inputs: CheckInput) -> list[Doubt]:
-    """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump."""
+    """Constant, frozen and clipped channels, angles that wrap or jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
     clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
-    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
-    return [*found, *_limits(inputs)]
+    return [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
 
 
 def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
@@ -174,40 +172,6 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
                 joints=(inputs.names[joint],),
                 numbers={"value": sign * extreme, "rows": at, "row": start},
             )
-
-
-def _limits(inputs: CheckInput) -> Iterator[Doubt]:
-    """Positions, velocities and torques beyond the limits of the URDF, the worst joint of each first."""
-    if inputs.robot is None:
-        return
-    log, joints = inputs.log, inputs.robot.joints
-    lower = np.array([-np.inf if joint.type == "continuous" else joint.lower for joint in joints])
-    upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
-    bounds = {"q": (lower, upper)}
-    for name, limit in (("v", "velocity_limit"), ("u", "effort_limit")):
-        size = np.array([getattr(joint, limit) for joint in joints], dtype=float)
-        size[~(size > 0.0)] = np.inf  # a limit of 0 is a placeholder
-        bounds[name] = (-size, size)
-    for name, (low, high) in bounds.items():
-        values = getattr(log, name)
-        span = np.where(np.isfinite(high - low), high - low, 1.0)
-        excess = np.maximum(values - high, low - values) / span - TOLERANCE
-        if not (excess > 0.0).any():
-            continue
-        row, joint = (int(index) for index in np.unravel_index(np.argmax(excess), excess.shape))
-        beyond = inputs.named(np.flatnonzero((excess > 0.0).any(axis=0)))
-        others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
-        unit = unit_of_each(name, log.units[name], log.nv)[joint]
-        yield look(
-            about="limits",
-            what=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
-            f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
-            f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
-            do="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
-            "is not that of your robot, which does no harm here.",
-            joints=beyond,
-            numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
-        )
 
 
 LOST = 1.8  # median steps at which at least one sample is missing

@@ -79,10 +79,9 @@ class Preparation:
         whole_number("every", self.every, 1)
         if not _finite(self.trim) or self.trim < 0:
             raise InvalidInput(f"trim is {self.trim!r}; it must be at least 0 s.")
-        if self.differentiate not in ("q", "v"):
-            raise InvalidInput(f"differentiate is {self.differentiate!r}; allowed: 'q' or 'v'.")
-        if self.stance not in ("log", "auto"):
-            raise InvalidInput(f"stance is {self.stance!r}; allowed: 'log' or 'auto'.")
+        for name, allowed in (("differentiate", ("q", "v")), ("stance", ("log", "auto"))):
+            if getattr(self, name) not in allowed:
+                raise InvalidInput(f"{name} is {getattr(self, name)!r}; allowed: {' or '.join(map(repr, allowed))}.")
 
     def thinning(self, dataset: Dataset) -> int:
         """N, so that every N-th row of the log holds what the filter leaves: `PASSED` rows per period, `FEW` in all."""
@@ -144,7 +143,7 @@ def _resolve(given: Preparation, dataset: Dataset) -> Preparation:
     chosen = given
     if given.cutoff == "auto":
         spectrum = motion_spectrum(dataset, given.differentiate)
-        each, decisive = spectrum.cutoff, _decisive(spectrum.cutoff, dataset)
+        decisive = _decisive(spectrum.cutoff, dataset)
         cutoff = float(f"{np.nanmax(decisive):.3g}") if np.isfinite(decisive).any() else None
         reasons["cutoff"] = _why(cutoff, decisive, spectrum, dataset)
         model = dataset.model
@@ -155,7 +154,6 @@ def _resolve(given: Preparation, dataset: Dataset) -> Preparation:
                 reasons["cutoff"] += f"; of held-out torques stay unexplained {shares}"
                 cutoff = best
         chosen = replace(given, cutoff=cutoff)
-        reasons["cutoff_per_joint"] = plain(each)
     if given.lag == "auto":
         seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0, delay=0.0), dataset))
         pushing = thruster_columns(dataset.model)  # joints beside them do not follow so
