@@ -62,7 +62,8 @@ class CheckReport(Summary):
         if self.comparison is not None:
             fit = self.comparison.fit
             columns["unexplained"] = plain(fit.unexplained)
-            columns["residual"] = plain(np.std(self.comparison.rows.u - fit.predicted, axis=0))
+            predicted = fit.at(self.comparison.robot, self.comparison.tau, self.comparison.rows)
+            columns["residual"] = plain(np.std(self.comparison.rows.u - predicted, axis=0))
             columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
         report = {} if self.inputs.prepared is None else self.inputs.price
         noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
@@ -72,7 +73,7 @@ class CheckReport(Summary):
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON: severity, counts, numbers of every joint, doubts."""
+        """Plain JSON: level, counts, numbers of every joint, doubts."""
         counts = {level: len(self.doubts.at(level)) for level in LEVELS}
         return {
             "level": self.doubts.level,

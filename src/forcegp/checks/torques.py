@@ -34,7 +34,7 @@ class TorqueFit:
     """What the robot explains of the torque of each joint.
 
     `unexplained` (nv,) is the share of the torque's variance that is left, NaN for a torque that never changes;
-    `coefficients` (nv, 5) are s, I, d, c, o; `predicted` (rows, nv) is the fitted torque.
+    `coefficients` (nv, 5) are s, I, d, c, o.
     `friction` (nv,) is the share that is left without inverse dynamics and armature, `plain` (nv,) that without
     armature, whose s is `factor` (nv,): where tau is nearly proportional to a, s and I cannot be separated.
     """
@@ -44,7 +44,6 @@ class TorqueFit:
     plain: Float[np.ndarray, " nv"]
     factor: Float[np.ndarray, " nv"]
     coefficients: Float[np.ndarray, "nv 5"]
-    predicted: Float[np.ndarray, "rows nv"]
 
     @property
     def rests_on_robot(self) -> Bool[np.ndarray, " nv"]:
@@ -84,56 +83,45 @@ def fit_torques(
     """Fit the torques of these rows, or others, to inverse dynamics tau of their motion."""
     u = rows.u if u is None else u
     parts = np.stack([tau, *columns_of(robot, rows)[:-1]], axis=-1)
-    fits = [_JointFit(parts[:, joint], u[:, joint]) for joint in range(rows.nv)]
-    every, plain, friction = ([fit.solved(columns) for fit in fits] for columns in ((0, 1, 2, 3), (0, 2, 3), (2, 3)))
+    fits = [_fitted(parts[:, joint], u[:, joint], (0, 1, 2, 3), (0, 2, 3), (2, 3)) for joint in range(rows.nv)]
     return TorqueFit(
-        unexplained=np.array([share for _, share in every]),
-        friction=np.array([share for _, share in friction]),
-        plain=np.array([share for _, share in plain]),
-        factor=np.array([solution[0] for solution, _ in plain]),
-        coefficients=np.stack([solution for solution, _ in every]),
-        predicted=np.stack([fit.predicted(solution) for fit, (solution, _) in zip(fits, every, strict=True)], axis=1),
+        unexplained=np.array([every[1] for every, _, _ in fits]),
+        friction=np.array([friction[1] for _, _, friction in fits]),
+        plain=np.array([plain[1] for _, plain, _ in fits]),
+        factor=np.array([plain[0][0] for _, plain, _ in fits]),
+        coefficients=np.stack([every[0] for every, _, _ in fits]),
     )
 
 
 def unexplained_shares(robot: Robot, tau: np.ndarray, rows: Dataset) -> Float[np.ndarray, "nv nv"]:
     """Share of the variance of each torque (column) that tau, v and a of each joint (row) leave; NaN if constant."""
     parts, joints = np.stack([tau, *columns_of(robot, rows)[:-1]], axis=-1), range(rows.nv)
-    return np.array([[_JointFit(parts[:, j], rows.u[:, k]).solved((0, 1, 2, 3))[1] for k in joints] for j in joints])
+    return np.array([[_fitted(parts[:, j], rows.u[:, k], (0, 1, 2, 3))[0][1] for k in joints] for j in joints])
 
 
-class _JointFit:
-    """One joint's torque and what may explain it; a free constant takes the means out of both sides."""
+def _fitted(
+    columns: Float[np.ndarray, "rows 4"], u: Float[np.ndarray, " rows"], *choices: tuple[int, ...]
+) -> list[tuple[np.ndarray, float]]:
+    """For each choice of columns: coefficients (5,), the constant last, and the unexplained share.
 
-    def __init__(self, columns: Float[np.ndarray, "rows 4"], u: Float[np.ndarray, " rows"]) -> None:
-        self.columns = columns
-        self.centered = self.columns - self.columns.mean(axis=0)
-        self.size = np.linalg.norm(self.centered, axis=0)
-        self.mean = float(u.mean())
-        self.target = u - self.mean
-        self.spread = float(np.square(self.target).sum())
-        self.constant = not self.spread > CONSTANT * max(float(np.square(u).sum()), 1e-300)
-
-    def solved(self, chosen: tuple[int, ...]) -> tuple[np.ndarray, float]:
-        """Coefficients (5,), the constant last, and the unexplained share with some of the columns."""
-        solution = np.zeros(5)
-        solution[4] = self.mean
-        if self.constant:
-            return solution, np.nan
-        used = [column for column in chosen if self.size[column] > 1e-9 * max(float(self.size.max()), 1e-300)]
-        if not used:
-            return solution, 1.0
-        basis, triangle = np.linalg.qr(self.centered[:, used] / self.size[used])
-        right = basis.T @ self.target
-        factors, left = nnls(triangle, right)
-        outside = float(np.square(self.target - basis @ right).sum())
-        solution[used] = factors / self.size[used]
-        solution[4] = self.mean - float(self.columns.mean(axis=0) @ solution[:4])
-        return solution, float((left**2 + outside) / self.spread)
-
-    def predicted(self, solution: np.ndarray) -> np.ndarray:
-        """The torque (rows,) with these coefficients."""
-        return self.columns @ solution[:4] + solution[4]
+    The free constant takes the means out of both sides.
+    """
+    centered, target = columns - columns.mean(axis=0), u - u.mean()
+    size, spread, found = np.linalg.norm(centered, axis=0), float(np.square(target).sum()), []
+    for chosen in choices:
+        solution, share = np.append(np.zeros(4), u.mean()), 1.0
+        used = [column for column in chosen if size[column] > 1e-9 * max(float(size.max()), 1e-300)]
+        if not spread > CONSTANT * max(float(np.square(u).sum()), 1e-300):
+            share = np.nan
+        elif used:
+            basis, triangle = np.linalg.qr(centered[:, used] / size[used])
+            right = basis.T @ target
+            factors, left = nnls(triangle, right)
+            solution[used] = factors / size[used]
+            solution[4] -= float(columns.mean(axis=0) @ solution[:4])
+            share = float((left**2 + np.square(target - basis @ right).sum()) / spread)
+        found.append((solution, share))
+    return found
 
 
 UNSEEN = 1e-3  # singular values below this fraction of the largest belong to directions that no torque shows

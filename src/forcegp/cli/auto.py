@@ -33,7 +33,7 @@ from forcegp.cli.import_log import LogOptions
 from forcegp.cli.input_options import CandidateOptions, forces_of
 from forcegp.cli.payload import payload_dict, with_payload
 from forcegp.cli.terminal import Terminal, doubts_table, facts
-from forcegp.doubts import Doubt, wrong
+from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 
 MOST_CORRECTIONS = 8
@@ -96,7 +96,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
         corrected = self._command(mapping)
         if mistakes and not self.correct:
-            terminal.show(doubts_table(mistakes, terminal.worded), "Run:")
+            terminal.show(doubts_table(Doubts(mistakes), terminal.worded), "Run:")
             terminal.command(corrected)
             raise DatasetError(
                 f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
@@ -264,7 +264,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
                 recording,
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
-                doubts=[forcegp.report.Finding(*line) for line in answer],
+                findings=[forcegp.report.Finding(*line) for line in answer],
                 pictures=forcegp.report.scores_pictures(scores),
                 tables=[forcegp.report.scores_table(scores, names)],
                 next_steps=following if command.startswith("forcegp") else [],

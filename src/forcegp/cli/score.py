@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.data
 import forcegp.posterior
 import forcegp.report
 import forcegp.scores
@@ -191,7 +191,7 @@ class Score(CandidateOptions, Resuming, PreparationOptions, RobotOptions, Overwr
         recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw)
         if preparation.cutoff is not None and (self.split or "auto").startswith(("blocks", "auto")):
             # a filter mixes what lies on both sides of a border
-            memory = 1.0 / (math.pi * float(preparation.cutoff) * math.sin(0.5 * math.pi / preparation.order))
+            memory = 2.0 * forcegp.data.LowPass(float(preparation.cutoff)).time_constant
             if self.guard < memory:
                 terminal.warn(
                     f"--guard {self.guard:g} s is shorter than two time constants of the filter ({memory:.2g} s), so "

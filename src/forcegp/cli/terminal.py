@@ -199,7 +199,7 @@ NONE = "–"
 
 
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
-"""Of doubts by their severity."""
+"""Of doubts by their level."""
 PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 

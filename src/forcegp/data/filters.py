@@ -107,6 +107,11 @@ class LowPass(Filter):
             return 1.0 / (1.0 + np.abs(warped) ** (2 * self.order)) + 0j
 
     @property
+    def time_constant(self) -> float:
+        """Of its slowest pole [s]."""
+        return 1.0 / (2.0 * np.pi * self.cutoff * np.sin(0.5 * np.pi / self.order))
+
+    @property
     def memory(self) -> float:
         """A third of the period of the cut-off."""
         return 1.0 / (PASSED * self.cutoff)
@@ -171,7 +176,7 @@ class Mean(Filter):
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
         """Dirichlet's kernel."""
         angles = 2.0 * np.pi * frequency / rate
-        return sum(np.cos(k * angles) for k in range(-(self.rows // 2), self.rows // 2 + 1)) / self.rows + 0j
+        return np.cos(np.outer(np.arange(self.rows) - self.rows // 2, angles)).mean(axis=0) + 0j
 
 
 def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q", "v", "u", "a")) -> Dataset:

@@ -112,7 +112,8 @@ class _Reader:
         values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
         truth = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
         self.require("truth" not in file or isinstance(truth, h5py.Group), ": 'truth' must be a group in this file.")
-        values["truth"] = {name: self.array(f"truth/{name}") for name in truth or ()}
+        names = list(truth) if isinstance(truth, h5py.Group) else []
+        values["truth"] = {name: self.array(f"truth/{name}") for name in names}
         values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
         values["model"] = None
         if "model" in file:
@@ -150,6 +151,6 @@ class _Reader:
         return texts[0]
 
     def units(self, name: str) -> str | tuple[str, ...]:
-        units = self.file[name].attrs.get("units")
+        units: Any = self.file[name].attrs.get("units")
         self.require(units is not None, f": {name!r} has no attribute 'units'.")
         return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))

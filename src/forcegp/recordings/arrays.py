@@ -39,11 +39,14 @@ class ArrayFile(Source):
     Subclasses list the `shapes` of all arrays of numbers by full name, and give each `array`.
     """
 
-    shapes: dict[str, tuple[int, ...]]
-
     def __init__(self, path: Path, *, within: str | None = None) -> None:
         super().__init__(path)
         self.within = within
+
+    @property
+    @abstractmethod
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of every array of numbers."""
 
     @abstractmethod
     def array(self, name: str) -> np.ndarray:
@@ -112,6 +115,7 @@ class NumpyArchive(ArrayFile):
     """The arrays of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     @cached_property
+    @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """By the headers of its members."""
         found = {}
@@ -158,6 +162,7 @@ class HDF5Arrays(ArrayFile):
     transposed: ClassVar[bool] = False
 
     @cached_property
+    @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Of all groups."""
         found: dict[str, tuple[int, ...]] = {}
@@ -202,6 +207,7 @@ class MatlabHDF5(HDF5Arrays):
     transposed = True
 
     @cached_property
+    @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Vectors stand upright."""
         arrays = super().shapes
@@ -251,6 +257,7 @@ class MatlabFile(ArrayFile):
             found[name] = value.reshape(-1, 1) if _is_row(value.shape) else value
 
     @property
+    @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Of what was read."""
         return {name: values.shape for name, values in self._arrays.items()}

@@ -238,8 +238,8 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
         if item.signal == "q" and item.unit.si == "rad":  # half a turn, in the units of the log
             half = np.pi / item.unit.in_si(np.ones(1)).item()
             most |= {name: half / abs(weight) for name, weight in item.expression.weights.items()}
-        if item.signal == "u" and (own := {x for x in item.expression.weights if source.topic_of(x) != clock}):
-            most |= dict.fromkeys(own - measured, 0.0)
+        if item.signal == "u" and (far := {x for x in item.expression.weights if source.topic_of(x) != clock}):
+            most |= dict.fromkeys(far - measured, 0.0)
             held.add(inputs.index(item))
     own: dict[str, list[str]] = {clock: [time]}
     for name in plan.columns:

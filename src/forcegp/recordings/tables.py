@@ -78,6 +78,7 @@ class DelimitedText(Source):
             require_plausible_size(path, "what is compressed", declared, size)
         raw: Any = gzip.GzipFile(path, "rb") if compressed else io.FileIO(path)
         stream = io.BufferedReader(raw, 2**20)
+        first = b""
         try:
             first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
             if not first.strip():
