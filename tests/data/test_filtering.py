@@ -181,15 +181,6 @@ def test_derivatives_of_a_dataset():
     np.testing.assert_array_equal(from_v.v, exact.v)
 
 
-def test_what_cannot_be_differentiated_is_named():
-    with pytest.raises(DatasetError, match="episode 1: 2 rows are too few to differentiate"):
-        differentiated(dataset(40).rows(slice(0, 22)))
-    with pytest.raises(InvalidInput, match="allowed: 'q'"):
-        inspect.unwrap(differentiated)(dataset(), "u")
-    with pytest.raises(DatasetError, match="increase strictly"):
-        differentiate(np.zeros((4, 1)), np.zeros(4))
-
-
 # ---------------------------------------------------------------- sampling
 
 
@@ -225,9 +216,3 @@ def test_resampling_keeps_the_rows_where_the_step_fits():
     np.testing.assert_array_equal(again.episode, data.episode)
     assert again.truth == {}
     assert again.noise_std is None
-
-
-@pytest.mark.parametrize(("step", "message"), [(0.0, "must be > 0"), (np.inf, "must be > 0"), (1.0, "longer than ep")])
-def test_wrong_steps(step, message):
-    with pytest.raises(InvalidInput, match=message):
-        resample(dataset(), step)

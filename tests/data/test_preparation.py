@@ -68,12 +68,6 @@ def test_noise_floor_and_acceleration_noise_are_those_of_white_noise(seed):
     np.testing.assert_allclose(spectrum.acceleration_noise(), np.sqrt(6) / 4 * SIGMA * RATE**2, rtol=0.05)
 
 
-def test_acceleration_noise_from_velocities():
-    data, _ = noisy()
-    spectrum = motion_spectrum(replace(data, v=data.q), "v")  # (v[k+1] - v[k-1]) / (2 h)
-    np.testing.assert_allclose(spectrum.acceleration_noise(), SIGMA * RATE / np.sqrt(2), rtol=0.05)
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
     data, exact = noisy(seed=seed, sigma=1e-3)
@@ -88,15 +82,6 @@ def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
     assert error(chosen) < 1e-4 * error(data)
 
 
-def test_no_noise_no_filter():
-    data, _ = noisy(sigma=0.0)
-    assert np.isnan(motion_spectrum(data).cutoff).all()
-    prepared = Preparation(cutoff="auto").apply(data)
-    assert prepared.metadata["preparation"]["cutoff"] is None
-    assert "no noise worth a filter" in prepared.metadata["preparation"]["why"]["cutoff"]
-    np.testing.assert_array_equal(prepared.a, data.a)
-
-
 def test_a_joint_at_rest_has_no_cutoff_and_hinders_nobody():
     data, _ = noisy()
     still = replace(data, q=np.stack([data.q[:, 0], np.zeros(len(data))], 1))
@@ -108,11 +93,6 @@ def test_a_peak_above_the_motion_is_no_motion():
     data, _ = noisy()
     hum = replace(data, q=data.q + 3e-5 * np.sin(2 * np.pi * 100 * data.time[:, None]))
     np.testing.assert_allclose(motion_spectrum(hum).cutoff, motion_spectrum(data).cutoff, rtol=0.3)
-
-
-def test_too_short_a_log_is_refused():
-    with pytest.raises(DatasetError, match="the longest episode has 40 rows; a spectrum needs 64"):
-        motion_spectrum(noisy()[0].rows(slice(0, 40)))
 
 
 # ---------------------------------------------------------------- delay
@@ -195,14 +175,6 @@ def test_a_lag_is_undone(lag):
     assert prepared.time[0] == pytest.approx(5.0 * lag, abs=0.006)
     shown = np.abs(prepared.u - _at(prepared, given).u)
     assert float(np.median(shown)) < 0.15 * float(np.median(np.abs(data.u - given.u)))
-
-
-def test_joints_are_late_each_for_itself():
-    data = arm_log(0.0)
-    late = replace(
-        data, u=np.stack([data.u[:, 0], np.interp(data.time - 0.06, data.time, data.u[:, 1]), data.u[:, 2]], 1)
-    )
-    np.testing.assert_allclose(estimate_delay(late).seconds, [0.0, 0.06, 0.0], atol=2e-3)
 
 
 # ---------------------------------------------------------------- preparation
