@@ -40,9 +40,10 @@ class Doubt:
     @property
     def command(self) -> str:
         """The `forcegp import` that states the correction; empty where options cannot."""
-        flags = [f"--orientation {own[0]}" for own in self.correction.get("orientation", {}).values()]
+        correction, name = self.correction, "orientation"
+        flags = [f"--{name} {own[0]}" for own in correction.get(name, {}).values()]
         for name in ("axes", "unit", "sign"):
-            stated = self.correction.get(name, {})
+            stated = correction.get(name, {})
             each = (f"{k}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for k, own in stated.items())
             flags += [f"--{name} {','.join(each)}"] if stated else []
         return " ".join(["forcegp import", *flags]) if flags else ""

@@ -150,7 +150,9 @@ class RobotOptions(RobotFileOptions):
         if (self.identified / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
             require_unchanged(self.identified, "fit again")
         if path != self.identified and not path.exists() and (self.identified / "model.json").exists():
-            return identified_system(forcegp.load_posterior(self.identified).model)  # that of `save_posterior`
+            from forcegp.posterior import load_posterior  # that of `save_posterior`
+
+            return identified_system(load_posterior(self.identified).model)
         if path.is_fifo():  # to open it would wait for a writer for ever
             raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp fit` wrote.")
         try:
