@@ -30,11 +30,11 @@ SURE = 20.0
 TINY = 1e-24
 MOST_ROWS = 2000
 MOST_WINDOW_ROWS, MOST_FORCES = 20_000, 4_000
-WINDOW, MOST_TURN = 0.1, 0.5  # Seconds over which motion is averaged, and rad, since rates are averaged as vectors
-CARRIED = 0.5  # Of the weight: a larger force in half of the rows carries the robot
-LEAST = 0.01  # Of the speed: a smaller error is that of rounding
-THOUSANDS = 10.0  # Times the weight: a larger force is one of lengths in mm
-GAP = 1.5  # Times the usual time of so many rows: a longer one has a gap
+WINDOW, MOST_TURN = 0.1, 0.5  # seconds over which motion is averaged, and rad, since rates are averaged as vectors
+CARRIED = 0.5  # of the weight: a larger force in half of the rows carries the robot
+LEAST = 0.01  # of the speed: a smaller error is that of rounding
+THOUSANDS = 10.0  # times the weight: a larger force is one of lengths in mm
+GAP = 1.5  # times the usual time of so many rows: a longer one has a gap
 RPM = 2.0 * np.pi / 60.0
 IMU = {"axes": {"a": ("imu",)}}
 

@@ -159,7 +159,7 @@ MOST_ROWS = 240
 FEWEST_ROWS = 10
 
 FAR = 0.01  # m
-HARDLY_ANY = 0.2  # Share of rows that move along a surface, below which it is another one
+HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is another one
 BROKEN, NOISE = 0.2, 3.0
 """|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
 
@@ -169,10 +169,10 @@ MOVED_GAIN = 0.7
 NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
-MANY_ROWS = 40  # From which on friction may also turn a link about the normal of a contact
-BLOCKS = 6  # Stretches that are left out in turn, for standard deviations
+MANY_ROWS = 40  # from which on friction may also turn a link about the normal of a contact
+BLOCKS = 6  # stretches that are left out in turn, for standard deviations
 STEP = 1e-3  # m
-SLOW = 0.1  # Of the root mean square velocity: where dry friction turns over
+SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
 FLOOR = 1e-14
 
 

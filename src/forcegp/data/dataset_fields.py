@@ -96,9 +96,9 @@ def _read_only(values: np.ndarray) -> np.ndarray:
     return values
 
 
-ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # Units of a revolute or continuous joint
-TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # Units of a prismatic joint
-REVOLUTE_UNITS = FrozenDict({**ROTATION, "time": "s"})  # Units of a robot whose joints all rotate
+ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a revolute or continuous joint
+TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # units of a prismatic joint
+REVOLUTE_UNITS = FrozenDict({**ROTATION, "time": "s"})  # units of a robot whose joints all rotate
 
 
 def units_for(robot: forcegp.robots.Robot) -> FrozenDict:

@@ -22,12 +22,12 @@ from forcegp.forces.columns import law_columns, usual_columns
 from forcegp.robots.manifold import Group
 
 LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s
-STEPS = 100  # Shifts that are tried to either side
+STEPS = 100  # shifts that are tried to either side
 BLOCKS = 8
 TINY = 1e-12
 MOST_ROWS = 5_000
-SIGNIFICANT = 3.0  # Standard deviations by which a delay must differ from zero to be used
-FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0  # Of dry friction, relative to the root mean square velocity
+SIGNIFICANT = 3.0  # standard deviations by which a delay must differ from zero to be used
+FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0  # of dry friction, relative to the root mean square velocity
 ROWS_PER_PARAMETER = 3
 
 WORTH = 0.98

@@ -22,8 +22,8 @@ from forcegp.robots.manifold import ConfigurationSpace
 Signal = Literal["q", "v", "u", "a"]
 Values = Float[np.ndarray, "rows columns"]
 
-TRANSIENT = 1e-3  # What is left of a filter's transient at the ends of a recording; sets the length of the padding
-PASSED = 3.0  # Rows in a period of a cut-off, of which more repeat their neighbours
+TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours
 
 
 class Filter(ABC):

@@ -35,10 +35,10 @@ from forcegp.errors import DatasetError
 SEGMENT = 4.0  # s
 FEWEST_ROWS = 64
 BANDS_PER_OCTAVE = 6
-FLOOR_BAND = (1.2, 5.0)  # Where the floor is read, in multiples of the knee
-CUTOFF_BAND = 3.0  # The cut-off is at most so many times the knee
-HIGHEST = 0.8  # Of half the sample rate: above it a filter is not worth its name
-MOTION_SHARE = 0.99  # Of the power of the signal: the knee is sought above the frequency below which so much of it lies
+FLOOR_BAND = (1.2, 5.0)  # where the floor is read, in multiples of the knee
+CUTOFF_BAND = 3.0  # the cut-off is at most so many times the knee
+HIGHEST = 0.8  # of half the sample rate: above it a filter is not worth its name
+MOTION_SHARE = 0.99  # of the power of the signal: the knee is sought above the frequency below which so much of it lies
 LEAST_RISE = 10.0
 """Noise that deserves a filter rises above the knee, in the differentiated signal, by this factor at least."""
 

@@ -36,7 +36,7 @@ FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
 to which its absence decides."""
 FEW = 10
-MANY_OPEN = 0.25  # Share of open rows that more than changes of stance leave
+MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
 CHUNK = 4000
 
 

@@ -15,7 +15,7 @@ from forcegp.robots.arguments import whole_number
 Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 """Which rows: numbers of at most so many of a log, such as `evenly` and `farthest` give."""
 
-EVEN_STEPS = 1e-3  # Time steps of a recording count as equal within this fraction
+EVEN_STEPS = 1e-3  # time steps of a recording count as equal within this fraction
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
 
 
@@ -251,7 +251,7 @@ def require_disjoint(train: Dataset, test: Dataset) -> None:
         )
 
 
-ROUNDING = 1e-13  # Standard deviation, relative to the largest entry, below which a column is constant but for rounding
+ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below which a column is constant but for rounding
 
 
 def farthest_point_sampling(

@@ -28,7 +28,7 @@ from forcegp.recordings.source import (
 from forcegp.summary import listed
 
 SEPARATOR = "/"
-MOST_NAMES = 12  # Of arrays in a message
+MOST_NAMES = 12  # of arrays in a message
 
 
 class ArrayFile(Source):
@@ -43,7 +43,7 @@ class ArrayFile(Source):
         super().__init__(path)
         self.within = within
 
-    @property
+    @cached_property
     @abstractmethod
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Of every array of numbers."""
@@ -256,7 +256,7 @@ class MatlabFile(ArrayFile):
         elif value.dtype.kind in "fiu":
             found[name] = value.reshape(-1, 1) if _is_row(value.shape) else value
 
-    @property
+    @cached_property
     @override
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Of what was read."""

@@ -32,8 +32,8 @@ def _units(si: str, per_si: Mapping[str, float]) -> dict[str, LogUnit]:
     return {name: LogUnit(name, si, float(number)) for name, number in per_si.items()}
 
 
-_DEGREES, _TURNS = 180.0 / math.pi, 0.5 / math.pi  # In a radian
-ONE = LogUnit("1", "1")  # Of parts of a quaternion, of shares of a thrust and of switches
+_DEGREES, _TURNS = 180.0 / math.pi, 0.5 / math.pi  # in a radian
+ONE = LogUnit("1", "1")  # of parts of a quaternion, of shares of a thrust and of switches
 UNITS: dict[str, dict[str, LogUnit]] = {
     "time": _units("s", {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60}),
     "q": _units("rad", {"rad": 1, "mrad": 1e3, "deg": _DEGREES, "rev": _TURNS})

@@ -220,7 +220,7 @@ GAP = 10.0
 frequency f (Hall & Meyer 1976): across 10 steps at 1 kHz 0.013 % at 5 Hz and 3 % at 20 Hz. Longer pauses end an
 episode."""
 
-FEWEST_ROWS = 5  # Of an episode: two derivatives by central differences need so many
+FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
 SLOWEST, FASTEST = 2.0, 2e5
 """Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
 

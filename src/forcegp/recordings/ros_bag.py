@@ -22,9 +22,9 @@ from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, reading, 
 from forcegp.robots.manifold import QUATERNION
 
 LOG_TIME = "log_time"
-ROWS_AT_A_TIME = 2**16  # Numbers of Python take ten times the memory of those in an array
+ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those in an array
 STAMP = "header.stamp"
-LOOKED_AT = 100  # Messages of each topic that decide which columns there are: publishers may share a topic
+LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 OF_JOINTS = ("position", "velocity", "effort")

@@ -28,8 +28,8 @@ from forcegp.summary import listed
 LACKING = LinearExpression({}, 0.0)
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
-EPISODE = "episode_index"  # Numbers the episodes where nothing else is stated, as in datasets of LeRobot
-MOST_NAMES = 40  # Of columns in a message
+EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
+MOST_NAMES = 40  # of columns in a message
 
 
 @dataclass(frozen=True)

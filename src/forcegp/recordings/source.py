@@ -15,7 +15,7 @@ from forcegp.errors import FileFormatError, ForceGPError, require_known
 Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
 
-LONGEST_VECTOR = 4096  # Columns of a table in one array; wider ones are pictures and the like, not signals of joints
+LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 
 

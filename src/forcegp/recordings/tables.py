@@ -28,8 +28,8 @@ from forcegp.recordings.source import (
     require_plausible_size,
 )
 
-FIRST_BYTES = 2**16  # What is looked at to detect the header, the delimiter and whether there are comments
-BLOCK = 2**22  # Bytes that pyarrow parses at a time; no line may be longer
+FIRST_BYTES = 2**16  # what is looked at to detect the header, the delimiter and whether there are comments
+BLOCK = 2**22  # bytes that pyarrow parses at a time; no line may be longer
 BLANKS = "blanks"
 DELIMITERS = {"comma": ",", "tab": "\t", "semicolon": ";", "blanks": BLANKS}
 """By the names that people may use for them."""

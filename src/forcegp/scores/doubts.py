@@ -12,11 +12,11 @@ from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import ACCELERATION, TRUE_ACCELERATION, Table
 from forcegp.summary import listed
 
-WORSE = 1.01  # Error of the model over that of its known forces alone, from which it is pointed out
+WORSE = 1.01  # error of the model over that of its known forces alone, from which it is pointed out
 WORSE_JOINT, LEAST_WORSE = 1.2, 0.1
 """The same of one joint, and by how much its error must be larger, in standard deviations of the noise."""
 
-FEWEST_INSIDE = 0.9  # Least coverage of 95 % intervals, over all joints, about which nothing is said
+FEWEST_INSIDE = 0.9  # least coverage of 95 % intervals, over all joints, about which nothing is said
 MISSED, CHANCE = 0.15, 4.0
 """How much less than 95 % the intervals of one joint may hold: this share, or so many deviations of a count by chance
 if that is more."""
@@ -26,7 +26,7 @@ MARGIN, POSTURE = 0.25, 0.1
 all joints (a joint that is held in its posture moves little, and a little more of it is nothing new).
 """
 
-MOST_OUTSIDE = 0.01  # Share of the rows that may lie further outside
+MOST_OUTSIDE = 0.01  # share of the rows that may lie further outside
 
 
 def unfinished_search(posterior: Posterior) -> Iterator[Doubt]:
@@ -106,7 +106,7 @@ def doubts(posterior: Posterior, dataset: Dataset, table: Table) -> Doubts:
     return Doubts([*unfinished_search(posterior), *rows_outside(posterior, dataset), *poor])
 
 
-STATES = 20  # Training states that are looked at; each alone decides
+STATES = 20  # training states that are looked at; each alone decides
 INVISIBLE = 1e-7
 """Singular values of H B below this, relative to the largest one, are zero: accelerations show nothing there."""
 
