@@ -204,7 +204,7 @@ WRONG = {
     "Baumgarte ": {"omega": 1e308},
     "Payload": {"mass": np.ones(3)},
     "parse_forces": {"expression": 5},
-    "Preparation": {"order": 2, "trim": 10**30, "delay": 10**30},
+    "Preparation": {"trim": 10**30, "delay": 10**30},
     "Preparation ": {"cutoff": np.ones(3)},
     "check": {"preparation": np.ones(3)},
     "split_named": {"text": 5},
