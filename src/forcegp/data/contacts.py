@@ -18,7 +18,7 @@ from torch import Tensor
 
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.views import evenly, move_on, white_noise
+from forcegp.data.views import evenly, move_on, tensors, white_noise
 from forcegp.doubts import Doubts, look, wrong
 from forcegp.errors import ContactError, ForceGPError
 
@@ -30,11 +30,6 @@ ALONG_NORMAL, CREEP = 0.02, 2e-3
 LEAST_ACCELERATION = 0.05  # m/s^2
 DEVIATIONS = 4.5
 DISTANCE_DEVIATIONS = 20.0
-
-
-def tensors(rows: Dataset) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """q, v, u and a of the rows."""
-    return tuple(torch.tensor(getattr(rows, name)) for name in "qvua")  # type: ignore[return-value]
 
 
 def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:

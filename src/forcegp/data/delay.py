@@ -12,11 +12,13 @@ import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 import forcegp.forces
 import forcegp.robots
 from forcegp.data.dataset import Dataset, require_rows
 from forcegp.data.filters import Lag, episodes_in_order
+from forcegp.data.views import in_blocks
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.columns import law_columns, usual_columns
 from forcegp.robots.manifold import Group
@@ -249,7 +251,6 @@ def torques_of_joints(dataset: Dataset) -> bool:
 
 FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
 TRIED = np.linspace(0.0, 0.3, 31)  # s
-BLOCK = 4096  # rows
 THRUST_SETTLED = 0.5  # s, of an episode, after which nothing depends on how it began
 
 
@@ -328,17 +329,17 @@ def _causes(
 def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:
     """Forces (rows, 6) that accelerate the base, and for each of the first three k columns of bodies beside it."""
     assert part.model is not None
-    robot, found = part.model.robot, []
-    for start in range(0, len(part), BLOCK):
-        q, v, a = (torch.tensor(x[start : start + BLOCK], device=robot.device) for x in (part.q, part.v, part.a))
-        with torch.no_grad():
-            at = robot.kinematics(q, v)
-            base = at.mass_matrix()[:, group.rows, group.rows] @ a[:, group.rows, None]
-            a[:, group.rows] = 0.0  # what is fitted explains nothing
-            regressor = at.torque_regressor(a)[:, group.rows, group.bodies.stop :][:, :3]
-            found.append((base[..., 0].cpu().numpy(), regressor.flatten(1).cpu().numpy()))
-    forces, moved = zip(*found, strict=True)
-    return np.concatenate(forces), np.concatenate(moved)
+    robot = part.model.robot
+
+    def found(q: Tensor, v: Tensor, _: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        at = robot.kinematics(q, v)
+        base = at.mass_matrix()[:, group.rows, group.rows] @ a[:, group.rows, None]
+        a[:, group.rows] = 0.0  # what is fitted explains nothing
+        regressor = at.torque_regressor(a)[:, group.rows, group.bodies.stop :][:, :3]
+        return base[..., 0], regressor.flatten(1)
+
+    forces, moved = in_blocks(part, found, robot.device)
+    return forces, moved
 
 
 def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 from warnings import warn
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 import forcegp.mechanics
-from forcegp.data.contacts import tensors
 from forcegp.data.dataset import Dataset
 from forcegp.data.filters import Mean
+from forcegp.data.views import in_blocks
 from forcegp.errors import ContactError, DatasetError, DataWarning
 
 WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
@@ -37,7 +37,6 @@ FALLS, SURE = 0.2, 0.1
 to which its absence decides."""
 FEW = 10
 MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
-CHUNK = 4000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -162,20 +161,17 @@ def _motion_and_force(
     """A v of the contacts of every switch, and the force that the rows ask of them."""
     of = [[k for k, contact in enumerate(model.contacts) if contact.switch == name] for name in names]
     places = [model.inputs.index(name) for name in names]
-    motion: list[list[np.ndarray]] = [[] for _ in names]
-    asked: list[list[np.ndarray]] = [[] for _ in names]
-    for first in range(0, len(dataset), CHUNK):
-        q, v, u, a = (x.to(model.robot.device) for x in tensors(dataset.rows(slice(first, first + CHUNK))))
+
+    def found(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         u[:, places] = 1.0
-        with torch.no_grad():
-            found = model.dynamics(q, v, u)
-            white = found.inverse_lower @ (found.M @ a[..., None] - found.Q_K[..., None])
-            forces = found.normals * (found.pseudo_inverse.mT @ white)
-            rates = (found.A @ v[..., None])[..., 0]
-        for k, rows in enumerate(of):
-            motion[k].append(rates[:, rows].cpu().numpy())
-            asked[k].append(forces[:, rows].sum(1).cpu().numpy())
-    return [np.concatenate(own) for own in motion], [np.concatenate(own) for own in asked]
+        dynamics = model.dynamics(q, v, u)
+        white = dynamics.inverse_lower @ (dynamics.M @ a[..., None] - dynamics.Q_K[..., None])
+        forces = dynamics.normals * (dynamics.pseudo_inverse.mT @ white)
+        rates = (dynamics.A @ v[..., None])[..., 0]
+        return *(rates[:, rows] for rows in of), *(forces[:, rows].sum(1) for rows in of)
+
+    both = in_blocks(dataset, found, model.robot.device)
+    return both[: len(names)], both[len(names) :]
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
@@ -15,8 +16,25 @@ from forcegp.robots.arguments import whole_number
 Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 """Which rows: numbers of at most so many of a log, such as `evenly` and `farthest` give."""
 
+BLOCK = 4096  # rows
 EVEN_STEPS = 1e-3  # time steps of a recording count as equal within this fraction
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
+
+
+def tensors(rows: Dataset, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """q, v, u and a of the rows."""
+    return tuple(torch.tensor(getattr(rows, name), device=device) for name in "qvua")  # type: ignore[return-value]
+
+
+def in_blocks(
+    rows: Dataset, of: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]], device: torch.device | str
+) -> list[np.ndarray]:
+    """What `of(q, v, u, a)` gives for blocks of rows, joined; without gradients, and with little memory."""
+    states, parts = tensors(rows, device), []
+    with torch.no_grad():
+        for start in range(0, len(rows), BLOCK):
+            parts.append(of(*(x[start : start + BLOCK] for x in states)))
+    return [torch.cat(own).cpu().numpy() for own in zip(*parts, strict=True)]
 
 
 def evenly(dataset: Dataset, count: int) -> Int[np.ndarray, " chosen"]:
