@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks.performance_page import PAGE, performance_page
 from benchmarks.questions import TITLES
 from forcegp.atomic_files import write_text
-from forcegp.jobs.job import machine
+from forcegp.jobs import machine
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results.json"

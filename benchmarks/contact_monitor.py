@@ -17,11 +17,11 @@ import time
 import numpy as np
 import torch
 
+from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import CONFIG, FINE, GAINS, RATE, Reference, excitation, fits, followed, robot_of, rows_of
 from forcegp import ContactMonitor, Model, PDGravity, Robot, Viscous
 from forcegp.control.monitor import ContactState
 from forcegp.forces import Stribeck
-from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SEEDS = (1, 2, 3, 4, 5)
 ELBOW, PUSHES, EVERY, LASTING = "lbr_iiwa_link_4", 100, 2.0, 0.5

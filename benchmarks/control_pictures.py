@@ -18,6 +18,7 @@ from PIL import Image
 import forcegp
 from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
 from benchmarks.excitation import LIMITS, Learner
+from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -32,24 +33,27 @@ from benchmarks.tracking import (
     rows_of,
     task_of,
 )
-from forcegp import Model, PDGravity, Robot
+from forcegp import Excitation, Model, PDGravity, Robot
 from forcegp.posterior import Posterior
-from forcegp.scores import contacts_figure, excitation_figure
+from forcegp.scores import contacts_figure, curve_panels
 from forcegp.scores.figures.style import (
     IDENTIFIED,
     KNOWN_PHYSICS,
     MEASUREMENT,
     PREDICTION,
     QUANTILE,
+    QUIET,
     SMALL,
     TRUTH,
     draw_band,
+    draw_line,
+    heading,
     legend_below,
     new_figure,
     quiet,
     save_figure,
+    short_joint_names,
 )
-from forcegp.simulation.joint_friction import JointFrictionLaw
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
 SEED, SECONDS, FRAMES_PER_SECOND = 1, 10.0, 12
@@ -61,6 +65,34 @@ COLORS = {
     "learned": PREDICTION,
     "true model": TRUTH,
 }
+
+
+def excitation_figure(chosen: Excitation) -> Figure:
+    """Velocity over position of every joint; below, where each has one friction curve, this before and after."""
+    robot, model, fastest = chosen.robot, chosen.model, chosen.limits["velocity"][1]
+    panels = [] if model is None else curve_panels(model)
+    rows = 2 if len(panels) == robot.nv else 1
+    figure = new_figure(max(2.2 * robot.nv, 6.0), 1.2 + 2.2 * rows)
+    grid = figure.subplots(rows, robot.nv, squeeze=False)
+    for j, name in enumerate(short_joint_names(robot.joint_names)):
+        axes, (length, force) = grid[0, j], ("m", "N") if robot.joints[j].type == "prismatic" else ("rad", "Nm")
+        if model is not None:
+            log = model.training.q[:, j], model.training.v[:, j]
+            axes.plot(*log, ".", markersize=3, color=QUIET, label="log so far", zorder=3)
+        draw_line(axes, chosen.motion.q[:, j], chosen.motion.v[:, j], PREDICTION, 1.0, "chosen motion")
+        axes.locator_params(nbins=4)
+        quiet(axes, title=name, x=f"position [{length}]", y="" if j else f"velocity [{length}/s]")
+        if model is None or chosen.expected is None or rows == 1:
+            continue
+        axes, v = grid[1, j], np.linspace(-fastest[j], fastest[j], 301)
+        for posterior, color, when in ((model, QUIET, "so far"), (chosen.expected, PREDICTION, "after")):
+            std = posterior.curve(panels[j].latent, v).std
+            draw_line(axes, v, std, color, 1.2, f"standard deviation {when}")
+        axes.set_yscale("log")
+        quiet(axes, x=f"velocity [{length}/s]", y="" if j else f"standard deviation\nof friction [{force}]")
+    legend_below(figure, *grid[:, 0])
+    heading(figure, f"The next {chosen.seconds:g} s")
+    return figure
 
 
 def motions() -> tuple[Robot, Posterior, dict[str, dict[str, np.ndarray]]]:

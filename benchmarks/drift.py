@@ -30,6 +30,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import torch
 
+from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     FINE,
@@ -46,7 +47,6 @@ from benchmarks.tracking import (
 from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, Model, PDGravity, fit
 from forcegp.data import farthest_rows
 from forcegp.posterior import Posterior
-from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SECONDS, LOST = 600, 0.3
 HORIZON = 2.0 * SECONDS / LOST**2

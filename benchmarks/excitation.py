@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
+from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -41,7 +42,6 @@ from benchmarks.tracking import (
 from forcegp import ComputedTorque, Dataset, JointFriction, Model, PDGravity, excitation, fit
 from forcegp.control.informative_motions import Excitation, LearnedForces, Motion
 from forcegp.errors import ContactWarning
-from forcegp.simulation.joint_friction import JointFrictionLaw
 
 SECONDS, SERIES, SPLINES = 10.0, 9, 5
 LIMITS = {"position": 1.0, "velocity": 1.5, "acceleration": 6.0}

@@ -33,7 +33,7 @@ from forcegp.evidence import MarginalLikelihood, TrainingData
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizationResult
 from forcegp.inference.memory import free_memory, gib
-from forcegp.jobs.job import machine
+from forcegp.jobs import machine
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior
 from forcegp.robots.arguments import usable_device

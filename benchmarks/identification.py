@@ -20,7 +20,7 @@ from forcegp import KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.errors import NumericalWarning
 from forcegp.forces import Body, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
-from forcegp.simulation.kuka_motion import TOOL_LINK
+from forcegp.simulation.kuka_surface import TOOL_LINK
 
 F64 = torch.float64
 TOO_HEAVY = 0.5

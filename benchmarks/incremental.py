@@ -34,6 +34,7 @@ from forcegp.inference import ExactPosterior, OptimizationResult, OptimizerOptio
 from forcegp.inference.cholesky_update import rows_to_keep, with_only
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior
+from forcegp.posterior.update import learn_more_rows
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 SEEDS = (1, 2, 3)
@@ -157,7 +158,7 @@ def streams() -> dict[str, float]:
             posterior = first
             start = time.perf_counter()
             for row in range(FIRST, STREAM, BATCH):
-                posterior = posterior.update(stream.rows(slice(row, row + BATCH)), BUDGET, keep=rule)
+                posterior = learn_more_rows(posterior, stream.rows(slice(row, row + BATCH)), BUDGET, rule)
             seconds = (time.perf_counter() - start) / ((STREAM - FIRST) / BATCH)
             scores[name] = error(posterior, test), seconds
         for name, (score, seconds) in scores.items():

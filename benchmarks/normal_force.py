@@ -25,7 +25,7 @@ from forcegp.forces import parse_forces
 from forcegp.posterior.predictor import Predictor
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import IdealContact
-from forcegp.simulation.kuka_motion import kuka_urdf, tool_friction_of
+from forcegp.simulation.kuka_surface import kuka_urdf, tool_friction_of
 from forcegp.simulation.trajectory import table_of
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -98,7 +98,7 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
             state = ArmState.of(arm)
             q, v = (x + noise * std * rng.standard_normal(7) for x, std in ((state.q, NOISE_Q), (state.v, NOISE_V)))
             u = control(q, v, q_d, v_d, a_d, WANTED).numpy()
-            forces.append(surface.step(arm, state, u).normal_force - WANTED)
+            forces.append(surface.step(arm, state, u).multiplier - WANTED)
             places.append(state.position)
     wanted = contact.position(task.model.robot.kinematics(torch.tensor(task.q))).numpy()
     off = np.linalg.norm(np.array(places) - wanted, axis=1)

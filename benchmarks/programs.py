@@ -92,7 +92,7 @@ def motions(posterior: Posterior, apart: Dataset) -> dict[str, float]:
         warnings.simplefilter("ignore")  # of drawn functions some motions diverge
         drawn = seconds(lambda: predictor.rollouts(q0, v0, u, DT, functions=FUNCTIONS), 10)
     two = seconds(lambda: predictor.rollouts(q0, v0, u, DT, threads=2), 20)
-    acceleration = posterior.accelerations(posterior.model.baumgarte).mean()
+    acceleration = posterior.accelerations(posterior.model.baumgarte)
     euler = INTEGRATORS["symplectic-euler"](posterior.model)
 
     def loop(q: torch.Tensor, v: torch.Tensor, forces: torch.Tensor) -> None:

@@ -36,7 +36,7 @@ from forcegp.errors import ForceGPError, RobotFileWarning, UnstatedBase
 from forcegp.robots import Robot
 from forcegp.robots.layout import BASE
 from forcegp.robots.mjcf import is_mjcf
-from forcegp.robots.robot_file import read_robot_file
+from forcegp.robots.urdf_file import read_robot_file
 
 mujoco: Any = untyped
 CLOSE = 1e-9

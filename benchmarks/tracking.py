@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from benchmarks.plants import JointFrictionLaw
 from forcegp import (
     ComputedTorque,
     Coulomb,
@@ -39,8 +40,7 @@ from forcegp.evidence import Accelerations
 from forcegp.forces import RigidBodies, Rotor
 from forcegp.forces.registry import usual_friction
 from forcegp.posterior import Posterior
-from forcegp.simulation.joint_friction import JointFrictionLaw
-from forcegp.simulation.kuka_motion import kuka_urdf
+from forcegp.simulation.kuka_surface import kuka_urdf
 
 SEEDS = (1, 2, 3, 4, 5)
 RATE, FINE, NOISE, ROWS = 240, 4, 0.1, 100

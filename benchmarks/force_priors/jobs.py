@@ -9,6 +9,7 @@ import torch
 
 from benchmarks.paper.data import farthest, simulated
 from benchmarks.paper.fits import MODEL, search_report
+from benchmarks.plants import JointFrictionLaw, PlantConfig
 from benchmarks.scores import scores_of
 from forcegp.data import Dataset, rows_in_contact
 from forcegp.errors import InvalidInput
@@ -18,12 +19,11 @@ from forcegp.forces import ContactFriction, Coulomb, JointFriction, Viscous, par
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.posterior import save_posterior
-from forcegp.posterior.components import Curve
+from forcegp.posterior.prediction import Curve
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
-from forcegp.simulation.joint_friction import JointFrictionLaw
-from forcegp.simulation.kuka_motion import tool_friction_of
+from forcegp.simulation.kuka_surface import tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]
 TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first, test rows above the second [m]
@@ -45,7 +45,7 @@ def true_curves(posterior: Any) -> dict[str, Law]:
     model = posterior.model
     given: Mapping[str, Any] = posterior.settings["data"]["metadata"]["config"]
     values: Any = {name: tuple(x) if isinstance(x, list | tuple) else x for name, x in given.items()}
-    config = KukaSurfaceConfig(**values)
+    config = PlantConfig(**values)
     out: dict[str, Law] = {}
     names = posterior.latent_names
     for _, term, which in model.unknown.named(model.robot):

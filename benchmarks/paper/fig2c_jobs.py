@@ -15,7 +15,7 @@ from forcegp.forces import Body, JointForces, RigidBodies, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.model import Model
-from forcegp.simulation.kuka_motion import TOOL_LINK
+from forcegp.simulation.kuka_surface import TOOL_LINK
 
 MODELS = {"s-gp": "S-GP + analytical mean", "s-gp-tool": "the same, tool friction"}
 MASS_BOUND, CENTER_BOUND = 0.02, 1e-3  # errors that count as found [kg, m]

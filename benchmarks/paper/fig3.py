@@ -16,7 +16,7 @@ from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job, JobStore
 from forcegp.posterior import load_posterior
-from forcegp.scores.metrics import interval_coverage
+from forcegp.scores.predicted_rows import interval_coverage
 from forcegp.scores.tables import markdown_table, number
 
 ARRAYS = "prediction.npz"

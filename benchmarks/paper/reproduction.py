@@ -58,7 +58,7 @@ def experiments_of(
     preset: str,
     figure: str,
     presets: Mapping[str, tuple[Experiment, ...]] = PRESETS,
-    program: str = "forcegp reproduce",
+    program: str = "python -m benchmarks.paper",
 ) -> tuple[Experiment, ...]:
     """One experiment of a preset by name, or all. Raises InvalidInput, with the program's name, for unknown names."""
     require_known("preset", preset, program, presets)
@@ -96,7 +96,7 @@ class Page:
         return f"{experiments[0].name}.md" if len(experiments) == 1 else f"{self.name}.md"
 
 
-PAPER_PAGE = Page("forcegp reproduce", "reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
+PAPER_PAGE = Page("python -m benchmarks.paper", "reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
 TRIAL = "smoke"  # the preset that tests the machinery; its numbers mean nothing for the models
 
 

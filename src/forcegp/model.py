@@ -19,15 +19,13 @@ from forcegp.forces.of_file import forces_of_file, forces_of_mjcf
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
 from forcegp.forces.thrusters import FADES, OBSERVED, ObservedWrench
+from forcegp.mechanics import LoopClosure, RollingContact
+from forcegp.mechanics.constraints import closing, contact_from_dict, contact_to_dict, described
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
-from forcegp.mechanics.loops import LoopClosure, closing, described
-from forcegp.mechanics.stored_contacts import contact_from_dict, contact_to_dict
 from forcegp.mechanics.surfaces import Held
-from forcegp.mechanics.wheels import RollingContact
 from forcegp.noise import Noise
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import JointValues, Positions, is_sequence
-from forcegp.robots.joint_dynamics import with_joint_dynamics
 from forcegp.robots.mjcf import is_mjcf
 from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
@@ -189,7 +187,7 @@ class Model(Summary):
         viscous = [values["damping"] for kind, values in found.items() if kind is Viscous]
         dry = [values["level"] for values in found.values() if "level" in values]
         damping, friction = (torch.stack(each).sum(0) if each else None for each in (viscous, dry))
-        return with_joint_dynamics(robot, damping, friction)
+        return robot.with_joint_dynamics(damping, friction)
 
     @cached_property
     def loaded_robot(self) -> Robot:

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.paper.fig2c_jobs import CENTER_OFFSET, MASS_OFFSET, wrong_model
 from tests.benchmarks.oracle import Tool
 
-from forcegp.simulation.kuka_motion import TOOL_LINK
+from forcegp.simulation.kuka_surface import TOOL_LINK
 
 
 def bodies(model) -> dict[str, pin.Inertia]:

@@ -10,7 +10,7 @@ import torch
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointFriction, ToolForces
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior.components import Curve
+from forcegp.posterior.prediction import Curve
 from forcegp.simulation import KukaSurfaceConfig
 
 V = np.linspace(-1.5, 1.5, 40)  # rad/s, without 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.auto_answer import best_sentence
+from forcegp.cli.auto import best_sentence, far_worse
 from forcegp.cli.main import parse_arguments
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
@@ -34,7 +34,7 @@ COLUMNS = (
 def folder(tmp_path_factory):
     """A log of a double pendulum in ms, degrees and degrees per second, with one torque turned, and its URDF."""
     place = tmp_path_factory.mktemp("auto")
-    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=12.0, seed=1, noise=0.0))
+    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=8.0, seed=1, noise=0.0))
     (place / "arm.urdf").write_text(data.model.robot.urdf_text)
     rng = np.random.default_rng(0)
     q = data.q + 1e-5 * rng.standard_normal(data.q.shape)
@@ -72,7 +72,7 @@ def test_the_corrected_command_gives_a_model_that_works(folder, answered):
     model = load_posterior(folder / "answer" / "model")
     error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()
     assert error < 0.1 * np.abs(motion_residuals(test, test.model)[1]).mean()  # of the URDF
-    assert len(Dataset.load(folder / "answer" / "log.h5")) == 2880
+    assert len(Dataset.load(folder / "answer" / "log.h5")) == 1920
     identified = Robot.from_urdf(folder / "answer" / "identified.urdf")
     assert identified.joint_names == test.joint_names
     assert (folder / "answer" / "validation" / "report.md").is_file()
@@ -111,7 +111,7 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     assert "reached" in done.stderr
     rows = Dataset.load(folder / "other" / "log.h5")
     assert np.abs(rows.q).max() < 4.0
-    assert rows.time[-1] == pytest.approx(12.0, abs=0.01)
+    assert rows.time[-1] == pytest.approx(8.0, abs=0.01)
 
 
 def test_the_printed_command_keeps_every_option():
@@ -120,7 +120,7 @@ def test_the_printed_command_keeps_every_option():
     others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
-    mapping = command._flags()
+    mapping = command.columns._flags()
     again = parse_arguments(shlex.split(command._command(mapping))[1:])
     assert again == command
 
@@ -166,6 +166,8 @@ def test_a_model_that_is_worse_than_none_is_not_trusted():
         about = {"given": {"kind": "given", "summary": ""}}
         return Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
 
+    assert far_worse(scores([0.1, 0.1, 0.5], 0.01, 1e-4), "given").startswith("; wrist is predicted far worse")
+    assert far_worse(scores([0.1, 0.1, 0.3], 0.01, 1e-4), "given") == ""
     lost = scores([328.2] * 3, None, 1.0)  # motions are there, and none of them lasted
     assert best_sentence(lost, dataset).startswith("Trust none of these models: on unseen time, accelerations")
     told = best_sentence(scores([0.1, 0.16, 2.8], 0.01, 1e-4), dataset)  # noise of a alone

@@ -40,7 +40,7 @@ def test_a_clean_log_is_told_so(forcegp, folder):
 
 
 def test_defects_are_told_and_drawn_but_are_no_error(forcegp, folder):
-    done = forcegp("check", "defects.h5", "--plots", "look", "--json", folder=folder)
+    done = forcegp("check", "defects.h5", "--out", "look", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["level"] == "wrong"
@@ -101,7 +101,7 @@ REFUSALS = {
     ("import", "noisy.h5", "--every", "0", "--out", "x.h5"): "--every 0 must be an integer of at least 1",
     ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("import", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 does not exist",
-    ("check", "clean.h5", "--plots", "mine"): "was not written by `forcegp check`, so it is not overwritten",
+    ("check", "clean.h5", "--out", "mine"): "was not written by `forcegp check`, so it is not overwritten",
     ("check", "clean.h5", "--cutoff", "-3"): "cutoff is -3.0",
     ("check", "bare.h5", "--gravity", "0,0,9"): "--gravity needs --robot",  # not left out without a word
     ("import", "bare.h5", "--cutoff", "9", "--lock", "pan=0", "--out", "x.h5"): "--lock needs --robot",

@@ -8,7 +8,6 @@ import pty
 import re
 import signal
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -72,10 +71,9 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     lines = re.findall(r"^\s*lbr_iiwa_joint_\d\s.*$", done.stdout, re.M)
     assert len(lines) == 7
     assert len({len(line.split()) for line in lines}) == 1
-    told = " ".join(done.stdout.split())
-    assert re.search(r"contact force \S+ \S+ \S+ % \S+ %.* Contact force: forces along the", told)
-    assert "contact normal rest on the prior alone" in told
-    for name in ("prediction.png", "normal_force.png", "errors.png", "calibration.png"):
+    assert re.search(r"contact force +\S+ +\S+ +\S+ +\S+ %", done.stdout)
+    assert "contact normal rest on the prior alone" in " ".join(done.stderr.split())
+    for name in ("prediction.png", "normal_force.png", "errors.png"):
         assert (tmp_path / "out" / name).read_bytes().startswith(PNG)
     assert json.loads((tmp_path / "out" / "results.json").read_text())["rows"] == 60
     assert "95 % intervals contain" in (tmp_path / "report.html").read_text()
@@ -86,12 +84,13 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
 
 def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch, capfd):
     pytest.importorskip("pybullet")
-    small = ("demo", "--seconds", "1", "--points", "12", "--iterations", "3")
+    small = ("demo", "--seconds", "1", "--points", "12", "--iterations", "3", "--overwrite")
+    monkeypatch.setattr("forcegp.scores.model_pictures", lambda *_: ([], []))  # as drawn for a score
     done = forcegp(*small, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     for row in ("S-GP ", "S-GP + analytical mean"):
         assert re.search(rf"^\s*{re.escape(row)}.*\d\.\d{{4}}", done.stdout, re.M), done.stdout
-    assert "rest on the prior alone" in " ".join(done.stdout.split())
+    assert "rest on the prior alone" in " ".join(done.stderr.split())
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert results["seeds"] == {"train": 21, "test": 22}
     models = results["models"]
@@ -139,25 +138,3 @@ def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path)
     assert b"forcegp: interrupted; no partial output was kept." in seen.splitlines()[-1]
     assert b"Traceback" not in seen
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.nightly
-def test_ctrl_c_during_reproduce_keeps_the_finished_jobs_and_says_so(executable, tmp_path):
-    pytest.importorskip("pybullet")
-    command = [executable, "reproduce", "fig2b", "--preset", "smoke", "--jobs", "1", "--out", "out"]
-    group = {
-        "start_new_session": True,
-        "preexec_fn": interruptible,
-    }  # as in a terminal, which interrupts the workers, too
-    finished = "[!.]*/[!.]*/job.json"  # a job at work has a hidden folder
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **group) as process:
-        while not list((tmp_path / "out" / "jobs").glob(finished)):
-            assert process.poll() is None
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=600)  # a guard against a hang
-    assert process.returncode == 130
-    last = told.decode().splitlines()[-1]
-    assert last == "forcegp: interrupted; finished pieces are kept, and the same command resumes."
-    assert b"Traceback" not in told
-    assert list((tmp_path / "out" / "jobs").glob(finished))

@@ -1,10 +1,8 @@
 """`FRAME@x,y,z:SURFACE:numbers` reads as the contact that it looks like."""
 
-import json
-
 import pytest
 
-from forcegp.cli.contact_syntax import EXAMPLE, parse_contact, parse_contacts, parse_feet, parse_wheels
+from forcegp.cli.robot_options import EXAMPLE, parse_contact, parse_contacts, parse_feet, parse_wheels
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_frame, fixed_point, rolling
 
@@ -67,17 +65,3 @@ def test_other_feet_and_wheels_are_refused(parse, text):
         parse((text,))
     with pytest.raises(InvalidInput, match="twice"):
         parse_feet(("FL", "FL@0,0,1"))
-
-
-def test_a_model_is_scored_under_other_contacts(forcegp, workshop):
-    """Without its plane the tool falls, so the recorded motion on the plane is predicted worse."""
-    held, free = (
-        forcegp("score", "run", "test.h5", "--every", 20, "--json", *more, folder=workshop)
-        for more in ((), ("--contact", "none"))
-    )
-    assert (held.returncode, free.returncode) == (0, 0), free.stderr
-    each = [json.loads(done.stdout)["models"]["run"]["scores"]["acceleration"]["mae"] for done in (free, held)]
-    assert each[0]["all"]["median"] > each[1]["all"]["median"]
-    wrong = forcegp("score", "run", "test.h5", "--contact", "tool:plane", folder=workshop)
-    assert wrong.returncode == 2
-    assert len(wrong.stderr.strip().splitlines()) == 1

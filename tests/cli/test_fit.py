@@ -177,6 +177,8 @@ WRONG = [
     ("--measured-torque", "--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA."),
     ("--forces gp:joint --baseline arm.h5", "a baseline is for payloads"),
     ("--forces gp:joint --learning-points 1", "learning_points is 1"),
+    ("--jobs 0", "jobs is 0; give"),
+    ("--engine fast", "engine"),
 ]
 
 

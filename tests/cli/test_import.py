@@ -88,10 +88,10 @@ def test_what_was_repaired_is_said(forcegp, tmp_path):
     write_text(tmp_path / "log.csv", columns)
     done = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "1 row with a repeated time stamp dropped" in done.stderr
-    assert "1 gap of up to 0.502 s splits it" in done.stderr
+    assert "rows dropped for a repeated time stamp: 1" in done.stderr
+    assert "gaps that split it: 1, of up to 0.502 s" in done.stderr
     assert "resampled to 512 Hz: steps deviate by up to" in done.stderr
-    assert "in 2 episodes" in done.stdout
+    assert "episodes: 2" in done.stdout
 
 
 def test_preparation_while_importing_is_that_of_the_raw_dataset(forcegp, tmp_path):

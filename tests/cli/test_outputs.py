@@ -14,7 +14,7 @@ from tests.posterior.arm import URDF, arm_data
 import forcegp
 import forcegp.scores
 from forcegp import Dataset, load_posterior
-from forcegp.atomic_files import atomic_folder, write_digests
+from forcegp.atomic_files import write_digests
 from forcegp.cli.main import main
 
 QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
@@ -30,13 +30,11 @@ FOLDERS = {
     "fit": "fit arm.h5 --overwrite --out OUT",
     "payload": "payload arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
-    "check": "check arm.h5 --overwrite --plots OUT",
-    "demo": "demo --out OUT",
+    "check": "check arm.h5 --overwrite --out OUT",
+    "demo": "demo --overwrite --out OUT",
 }
 STORES = {
     "score": "score arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
-    "reproduce": "reproduce fig2b --out OUT",
-    "docs": "reproduce fig2b --out runs --docs OUT",
 }
 COMMANDS = FILES | FOLDERS | STORES
 
@@ -60,7 +58,7 @@ def no_work(monkeypatch) -> None:
     def begun(*_, **__):
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr("forcegp.jobs.running._Run", begun)
+    monkeypatch.setattr("forcegp.jobs._compute_all", begun)
     monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
     monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
     monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)
@@ -183,7 +181,7 @@ OVER_INPUTS = [
     "payload arm.h5 --baseline run/inner.h5 --out run",
     "score run arm.h5 --out run",
     "score run arm.h5 --report arm.h5",
-    "check arm.h5 --plots arm.h5",
+    "check arm.h5 --out arm.h5",
     "score arm.h5 --out arm.h5",
 ]
 
@@ -207,7 +205,6 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     [
         f"{IMPORT} --out x.h5 --write-mapping x.h5",
         f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
-        "reproduce fig2b --out x --docs x",
     ],
 )
 def test_two_outputs_are_two_places(folder, capfd, words):
@@ -226,21 +223,6 @@ def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
     assert Path(name).read_bytes() == before
 
 
-def test_links_stay_and_what_they_point_to_is_written(folder):
-    Path("elsewhere").mkdir()
-    for link, target in (("data", "elsewhere/data.h5"), ("model", "elsewhere/model")):
-        Path(link).symlink_to(target)
-    for again in ([], ["--overwrite"]):
-        assert main([*IMPORT.split(), "--out", "data", *again]) == 0
-        assert main(["fit", "arm.h5", *QUICK.split(), "--out", "model", *again]) == 0
-    assert Path("data").is_symlink()
-    assert Path("model").is_symlink()
-    assert sorted(entry.name for entry in Path("elsewhere").iterdir()) == ["data.h5", "model"]
-    assert len(Dataset.load("elsewhere/data.h5")) == 300
-    load_posterior("elsewhere/model")
-    assert not hidden(folder)
-
-
 @pytest.mark.parametrize("name", ["import", "fit"])
 @pytest.mark.nightly
 def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, limited_file_size, name):
@@ -255,18 +237,6 @@ def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, 
     assert {file: file.read_bytes() for file in [Path("out"), *Path("out").rglob("*")] if file.is_file()} == old
     assert not hidden(folder)
     assert main(words) == 0
-
-
-def test_the_next_run_removes_what_a_killed_one_left(folder):
-    for name in (".out.0123456789ab.tmp", ".data.h5.0123456789ab.tmp"):
-        Path(name).mkdir()
-        (Path(name) / "half").write_text("half")
-    with atomic_folder("out") as living:
-        assert main([*IMPORT.split(), "--out", "data.h5"]) == 0
-        assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
-        assert hidden(folder) == [living.parent, living.parent / ".lock"] or hidden(folder) == [living.parent]
-        living.mkdir()
-    assert not hidden(folder)
 
 
 def test_a_changed_model_of_an_identification_is_refused(folder, capfd):

@@ -10,8 +10,8 @@ import pytest
 from tests.posterior.arm import URDF, arm_data, arm_model
 from tests.robots.test_nearest_inertia import BROKEN
 
-from forcegp.cli.input_options import SYSTEM_FILE
 from forcegp.cli.main import parse_arguments
+from forcegp.cli.robot_options import SYSTEM_FILE
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, ForceGPError, NonPhysicalInertia
 from forcegp.forces import Coulomb
@@ -20,7 +20,7 @@ from forcegp.robots import Robot
 
 
 def options(*words: str):
-    return parse_arguments(["fit", "log.h5", "--out", "run", *words])
+    return parse_arguments(["fit", "log.h5", "--out", "run", *words]).robot
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
         ("--armature pan=0.5", "--armature needs --robot"),
         ("--lock pan=0", "--lock needs --robot"),
         ("--robot arm.urdf --gravity 0,0", "holds 2 numbers"),
-        ("--robot arm.urdf --gravity 0,0,down", "'down' is not a finite number"),
+        ("--robot arm.urdf --gravity 0,0,down", "is no list of numbers"),
         ("--robot arm.urdf --lock pan", "is not JOINT=RAD"),
         ("--robot arm.urdf --lock pan=nan", "'nan' is not a finite number"),
         ("--robot arm.urdf --armature pan=1,pan=2", "names pan twice"),

@@ -131,13 +131,6 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
 
 
-def test_left_out_stretches_compare_models_to_fit(forcegp, folder):
-    words = ("--split", "leave-out", "--forces", "given", "--forces", "gp:joint-friction", *QUICK, "--out", "left")
-    done = forcegp("score", "train.h5", *words, folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert "By the negative log predictive density take gp:joint-friction" in " ".join(done.stdout.split())
-
-
 OUT = "--out never"
 WRONG = [
     ("score missing.h5", "missing.h5 does not exist"),

@@ -52,12 +52,11 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ("--friction-coefficient 2.5", {"friction": "viscous", "viscous_coefficient": 2.5}),
+        ("--tool-friction viscous:2.5", {"friction": "viscous", "viscous_coefficient": 2.5}),
         (
-            "--tool-friction stribeck --friction-coefficient 0.2 --surface sphere --joint-friction stribeck --patch 2",
-            {"friction": "stribeck", "coulomb_coefficient": 0.2, "surface": "sphere", "patch_factor": 2.0},
+            "--tool-friction stribeck:0.2 --surface sphere --joint-friction stribeck",
+            {"friction": "stribeck", "coulomb_coefficient": 0.2, "surface": "sphere"},
         ),
-        ("--contact-model bullet --friction-coefficient 0.2", {"friction": "coulomb", "coulomb_coefficient": 0.2}),
     ],
 )
 def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
@@ -69,7 +68,6 @@ def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
     assert expected.items() <= summary["config"].items()
     assert expected.items() <= data.metadata["config"].items()
     assert ("Q_U.joint-friction" in data.truth) == ("--joint-friction" in options)
-    assert ("in_contact" in data.truth) == ("bullet" in options)
     assert isinstance(data.model.contacts[0].surface, Sphere) == ("sphere" in options)
 
 
@@ -77,8 +75,7 @@ def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--contact-model bullet --tool-friction viscous", "contact 'bullet' has Coulomb friction"),
-        ("--surface none --patch 4", "a patch needs a surface"),
+        ("--tool-friction coulomb:much", "'much' is no number"),
         ("--tool-friction wet", "wet"),
     ],
 )

@@ -15,20 +15,17 @@ from forcegp.codegen.library import (
     NOT_POSITIVE,
     OPTIONS,
     RESULT_NOT_FINITE,
-    Purpose,
     RowFunction,
-    VectorUnit,
     compile_library,
+    vector_unit,
 )
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 
-PURPOSE = Purpose("a test", "MOVE", "give up")
-
 
 @pytest.fixture(params=[1, "here"], ids=["C99", "vectors"])
 def lanes(request) -> int:
-    return VectorUnit.of_this_processor().lanes if request.param == "here" else request.param
+    return vector_unit()[0] if request.param == "here" else request.param
 
 
 @pytest.fixture
@@ -37,9 +34,9 @@ def compiled(tmp_path, lanes):
 
     def build(program: Program) -> RowFunction:
         strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1", "-fPIC", "-shared")
-        options = strict if lanes == 1 else (*OPTIONS, *VectorUnit.of_this_processor().options)
-        library = compile_library(write_program(program, lanes, 60), options, tmp_path / "x.so", "evaluate", PURPOSE)
-        return RowFunction(library, list(program.inputs.values()), [len(x) for x in program.outputs.values()])
+        options = strict if lanes == 1 else (*OPTIONS, *vector_unit()[1])
+        library = compile_library(write_program(program, lanes, 60), options, tmp_path / "x.so", "evaluate")
+        return RowFunction(library, len(program.inputs), [len(x) for x in program.outputs.values()])
 
     return build
 

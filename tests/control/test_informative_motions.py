@@ -13,7 +13,6 @@ from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
 from forcegp.forces import ContactFriction, JointFriction, UnknownForces
 from forcegp.inference import OptimizerOptions
-from forcegp.scores import excitation_figure
 
 FREE = arm_model(0)
 START = [0.3, 0.8, -0.6]
@@ -159,14 +158,6 @@ def test_the_file_has_the_motion(chosen, tmp_path):
     assert table.shape == (201, 13)
     np.testing.assert_allclose(table[:, 1:10], np.hstack(chosen.trajectory(table[:, 0])), atol=1e-7)
     assert "condition" in repr(chosen)
-
-
-def test_the_picture_has_a_panel_per_joint_and_per_curve(chosen):
-    panels = excitation_figure(chosen).axes
-    assert len(panels) == 6
-    before, after = (line.get_ydata() for line in panels[3].lines)
-    assert (after <= before * (1.0 + 1e-9)).all()
-    assert len(excitation_figure(excitation(FREE, **FEW)).axes) == 3
 
 
 ENDLESS = Robot.from_urdf_text(URDF.replace('type="revolute"', 'type="continuous"').replace('lower="-3" upper="3"', ""))

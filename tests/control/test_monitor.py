@@ -222,10 +222,10 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "give either --free LOG or --free-seconds S"),
-        (("--free", "free.h5", "--free-seconds", "5"), "give either"),
-        (("--free-seconds", "5"), "too short for a threshold"),
-        (("--free-seconds", "-1"), "give seconds above 0"),
+        ((), "give either --free LOG or --free S"),
+        (("--free", "free.h5", "--free", "5"), "give either"),
+        (("--free", "5"), "too short for a threshold"),
+        (("--free", "-1"), "give seconds above 0"),
         (("--free", "log.csv"), "log.csv is not an HDF5 file"),
         (("--free", "free.h5", "--bandwidth", "500"), "below 50"),
     ],

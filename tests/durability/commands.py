@@ -50,14 +50,11 @@ COMMANDS = {
     "prepare": Writing("import train.h5 --cutoff 20 --out OUT", "file"),
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
     "identification": Writing("fit air.h5 --forces bodies,viscous --no-checks --out OUT"),
-    "check": Writing("check train.h5 --plots OUT"),
+    "check": Writing("check train.h5 --out OUT"),
     "demo": Writing("demo --seconds 2 --points 10 --iterations 2 --out OUT", again=""),
     "score": Writing(f"score train.h5 {SCORE} --out OUT", "store", again=""),
-    "reproduce": Writing(
-        "reproduce fig2b --preset smoke --points 10 --seed-list 7 --jobs 1 --out OUT", "store", again=""
-    ),
 }
-KILLED = ("simulate", "import", "fit", "identification", "score", "reproduce")
+KILLED = ("simulate", "import", "fit", "identification", "score")
 
 
 def make_inputs(folder: Path, forcegp) -> None:

@@ -11,7 +11,6 @@ from forcegp.evidence.identifiability import body_pseudo_inertias, carrying, sta
 from forcegp.forces import Body
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia_of_standard
-from forcegp.robots.joint_dynamics import with_joint_dynamics
 
 
 def bodies(robot=None):
@@ -114,10 +113,10 @@ def test_points_are_given_some_thickness():
 def test_joint_dynamics_stand_in_the_urdf():
     robot = Robot.from_urdf_text(TREE)
     damping = np.arange(robot.nv) + 0.1
-    changed = with_joint_dynamics(robot, damping, None)
+    changed = robot.with_joint_dynamics(damping, None)
     assert [joint.damping for joint in changed.joints] == damping.tolist()
     assert [joint.friction for joint in changed.joints] == [joint.friction for joint in robot.joints]
-    again = with_joint_dynamics(changed, None, damping)
+    again = changed.with_joint_dynamics(None, damping)
     assert [joint.friction for joint in again.joints] == damping.tolist()
     assert [joint.damping for joint in again.joints] == damping.tolist()
 

@@ -151,7 +151,7 @@ def _forces(kind: Any, **arguments: Any) -> None:
     made = kind(**arguments)
     model = INPUTS.data.model.with_contacts(())
     known = (*model.forces, made)
-    forcegp.Model(model.robot, (), known).dynamics(*(torch.tensor(x) for x in STATE)).acceleration_map(True)
+    forcegp.Model(model.robot, (), known).dynamics(*(torch.tensor(x) for x in STATE)).acceleration_map()
 
 
 def _with(force: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from hypothesis import strategies as st
@@ -12,6 +12,7 @@ from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import DefectError, Target, require_ended_well
 from tests.fuzz.values import WORDS, hostile_pickle
 
+from forcegp.cli.command import options_of
 from forcegp.cli.main import COMMANDS, command_class, parse_arguments
 from forcegp.errors import ForceGPError
 
@@ -73,13 +74,12 @@ VALID = {
     "check": ("check", "test.h5"),
     "fit": ("fit", "train.h5", *SMALL, "--out", "out"),
     "score": ("score", "carried", "train.h5", "--starts", "1", "--horizon", "0.02"),
-    "monitor": ("monitor", "carried", "train.h5", "--free-seconds", "0.1", "--out", "out"),
+    "monitor": ("monitor", "carried", "train.h5", "--free", "0.1", "--out", "out"),
     "export": ("export", "carried", "--to", "c", "--unchecked", "--out", "out"),
-    "view": ("view", "train.h5", "--html", "nowhere/scene.html"),
+    "view": ("view", "train.h5", "--out", "nowhere/scene.html"),
     "excite": ("excite", "carried", "--tries", "2", "--seconds", "1", "--out", "out.csv"),
     "simulate": ("simulate", "none-such", "--out", "out.h5"),
     "demo": ("demo", "--seconds", "0"),
-    "reproduce": ("reproduce", "none-such", "--out", "out"),
 }
 """Command lines that are done at once, or refused at once."""
 MOVING = {
@@ -96,13 +96,8 @@ MOVING = {
 """Other lines of the same commands, most of robots whose base moves."""
 LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
 """Nobody may ask for so many seconds of simulation, say, in a test."""
-NEVER = ("debug", "browser")
-"""Options of which one does not tell one failure from another, and one serves until someone ends it."""
-MORE = {"--help", "--no-checks", "--no-hyperprior"}
 OPTIONS = {
-    name: sorted(
-        {"--" + item.name.replace("_", "-") for item in fields(command_class(name)) if item.name not in NEVER} | MORE
-    )
+    name: sorted({"--" + each.replace("_", "-") for each in options_of(command_class(name))} - {"--debug"} | {"--help"})
     for name in COMMANDS
 }
 
@@ -166,7 +161,7 @@ def check_words(case: Line, folder: Path) -> None:
 def check(case: Line, folder: Path) -> None:
     """The whole command."""
     words = words_of(case)
-    if words[0] in ("simulate", "demo", "reproduce") and words[0] == case.command:
+    if words[0] in ("simulate", "demo") and words[0] == case.command:
         words = [word for word in words if word not in LARGE] + ["--none-such", "1"]  # a run takes seconds to hours
     for name in (*FILES, "carried", "independent"):
         source = INPUTS.folder / name

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tests.inference.problems import normal
 
-from forcegp.codegen.library import Purpose
+from forcegp.codegen.library import compiler
 from forcegp.errors import CompilerError
 from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
@@ -269,12 +269,12 @@ extern void many(long n, const double *table, const double *s, double *f, double
 }
 """
     try:
-        compiler = Purpose("the test", "", "skip it").compiler()
+        command = compiler()
     except CompilerError as error:
         pytest.skip(str(error))
     source, library = folder / "latent.c", folder / "latent.so"
     source.write_text(head + form.c_source("latent") + loop)
-    subprocess.run([*compiler, *options, "-O2", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"], check=True)
+    subprocess.run([*command, *options, "-O2", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"], check=True)
     return ctypes.CDLL(str(library))
 
 

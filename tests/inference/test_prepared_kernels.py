@@ -8,7 +8,7 @@ from tests.inference.problems import normal, problem
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.derivatives import jacobian
 from forcegp.codegen.graph import Graph
-from forcegp.codegen.library import Purpose, RowFunction, aligned, compile_library
+from forcegp.codegen.library import RowFunction, aligned, compile_library
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.prepared_kernels import kernel_groups, kernel_sums
 
@@ -44,7 +44,6 @@ def test_latents_are_grouped_by_their_centers(latent):
 @pytest.mark.parametrize("lanes", [1, 8])
 def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
     """Every group in a program of its own, whose inputs are the features."""
-    purpose = Purpose("a test", "MOVE", "give up")
     for group, part in zip(kernel_groups(latent), kernel_sums(latent), strict=True):
         graph = Graph(part.features)
         values = part.call(graph, graph.inputs, True)
@@ -59,9 +58,9 @@ def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
         ]
         options = ("-std=gnu11", "-O1", "-fno-math-errno", "-fPIC", "-shared")
         source = "\n".join([*text, write_entry(program, "program")])
-        library = compile_library(source, options, tmp_path / f"{part.name}-{lanes}.so", "evaluate", purpose)
+        library = compile_library(source, options, tmp_path / f"{part.name}-{lanes}.so", "evaluate")
         sizes = [len(x) for x in program.outputs.values()]
-        function = RowFunction(library, [part.features], sizes, [aligned(part.table())])
+        function = RowFunction(library, 1, sizes, [aligned(part.table())])
         z = points(latent, 11)
         given = z[group[0]]
         outputs = [torch.empty(11, size, dtype=torch.float64) for size in sizes]

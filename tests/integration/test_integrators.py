@@ -7,7 +7,7 @@ import torch
 from tests.integration.motions import CONTACTS, free_system, light_arm, physics, start
 from tests.posterior.arm import arm_model
 
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import NumericalError
 from forcegp.integration import (
     ConstraintManifold,
     ImplicitMidpoint,
@@ -91,7 +91,7 @@ def test_implicit_midpoint_follows_stiff_friction_where_explicit_steps_fail():
         assert (motion.diverged_at == -1).all()
         return motion.q[-1]
 
-    true = ends("rk4", 20)
+    true = ends("rk4", 12)
     error = {
         name: float((ends(name, 1) - true).abs().max()) for name in ("symplectic-euler", "rk4", "implicit-midpoint")
     }
@@ -146,21 +146,6 @@ def test_the_velocity_projection_solves_the_dense_equations():
     torch.testing.assert_close(projected[0], torch.linalg.solve(dense, right)[:3], rtol=1e-10, atol=1e-12)
 
 
-def test_the_position_projection_acts_along_the_contact_forces_and_changes_nothing_on_the_surface():
-    model = free_system("cylinder")
-    manifold = ConstraintManifold(model)
-    q0, _ = start(model)
-    torch.testing.assert_close(manifold.project_position(q0).q, q0, rtol=0, atol=1e-15)
-    off = q0 + 1e-5
-    at = manifold.project_position(off)
-    assert at.converged.all()
-    assert manifold.violation(at.q, at.q)[0].abs().max() <= 1e-12
-    push = (model.robot.mass_matrix(off) @ (at.q - off)[..., None])[..., 0]
-    normal = at.A[:, 0]
-    along = (push * normal).sum(-1, keepdim=True) / normal.square().sum(-1, keepdim=True) * normal
-    assert (push - along).abs().max() <= 1e-3 * push.abs().max()
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_the_position_tolerance_is_a_distance_whatever_the_scale_of_the_surface(scale):
     plane = Plane((0.2, 0.0, 1.0), 0.4)
@@ -180,8 +165,3 @@ def test_a_start_out_of_reach_is_refused_with_a_remedy():
     q, v = start(free_system("plane"))
     with pytest.raises(NumericalError, match=r"state 0 .*nearer"):
         ConstraintManifold(model).project(q, v)
-
-
-def test_unknown_integrators_are_named_with_those_that_exist():
-    with pytest.raises(InvalidInput, match=r"'rk5' .*'rk4'\? .* implicit-midpoint, projected, rk4, symplectic-euler"):
-        integrator_named("rk5", arm_model())

@@ -1,7 +1,5 @@
 """Motions end where they diverge, say so, and leave the others alone."""
 
-import math
-
 import pytest
 import torch
 from tests.integration.motions import free_system, physics, start
@@ -75,33 +73,6 @@ def test_a_motion_whose_implicit_step_has_no_solution_ends_with_that_reason():
         motion = integrate(ImplicitMidpoint(), lambda q, v, u: -10.0 * v.sign(), q0, v0, force, 0.04)
     assert motion.diverged_at.tolist() == [1, -1]
     torch.testing.assert_close(motion.v[:, 1, 0], 5.0 - 0.4 * torch.arange(4, dtype=torch.float64))
-
-
-def test_all_motions_diverging_still_give_a_trajectory():
-    ones = column(1.0, 2.0)
-    with pytest.warns(NumericalWarning, match="2 of 2 motions"):
-        motion = integrate(
-            SymplecticEuler(), lambda q, v, u: v * math.inf, ones, ones, torch.zeros(5, 2, 1).double(), 0.1
-        )
-    assert motion.diverged_at.tolist() == [1, 1]
-    assert torch.isnan(motion.q[1:]).all()
-    torch.testing.assert_close(motion.q[0], ones)
-
-
-def test_progress_counts_every_step():
-    seen = []
-    force = torch.zeros(4, 1, 1, dtype=torch.float64)
-    integrate(
-        SymplecticEuler(), lambda q, v, u: -q, column(1.0), column(0.0), force, 0.1, progress=lambda *x: seen.append(x)
-    )
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf, "fast"])
-def test_a_time_step_must_be_positive(dt):
-    force = torch.zeros(4, 1, 1, dtype=torch.float64)
-    with pytest.raises((InvalidInput, TypeError)):
-        integrate(SymplecticEuler(), lambda q, v, u: -q, column(1.0), column(0.0), force, dt)
 
 
 def test_a_start_in_other_units_is_refused():

@@ -45,7 +45,8 @@ def test_all_jobs_are_computed_once_and_in_order(results):
 
 def test_a_failure_stops_only_what_needs_it(results):
     bad = Job("bad", f"{TOY}:fail", {})
-    jobs = [bad, next_to(bad), next_to(next_to(bad)), square(2)]
+    after = Job("after", f"{TOY}:square", {"before": "next/bad"}, ("next/bad",))
+    jobs = [bad, next_to(bad), after, square(2)]
     with pytest.raises(FitError, match=r"bad failed.*no luck.*1 of \d jobs are kept"):
         run_jobs(results, jobs)
     assert results.result("square/2")["value"] == 4
@@ -87,7 +88,7 @@ def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence
     kept = results.load("square/4")
     changed = Job("square/3", f"{TOY}:square", {"number": 3, "more": 1})
     assert digests([changed, next_to(square(3))])["next/3"] != digests([square(3), next_to(square(3))])["next/3"]
-    with pytest.warns(OutdatedWarning, match="2 of the results in .* for example, were computed with other settings"):
+    with pytest.warns(OutdatedWarning, match="2 of the results in .* for example, were computed by other code or with"):
         assert run_jobs(results, [changed, next_to(changed), square(4)]) == 2
     assert results.load("square/3")["spec"] == {"number": 3, "more": 1}
     assert results.load("square/4") == kept
@@ -96,8 +97,8 @@ def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence
 
 def test_other_code_is_seen_and_computed_anew_with_one_sentence(results, monkeypatch):
     run_jobs(results, [square(3), next_to(square(3))])
-    monkeypatch.setattr("forcegp.jobs.job.code_digest", lambda *modules: "other")
-    with pytest.warns(OutdatedWarning, match="2 of the results in .*, were computed by other code; they are computed"):
+    monkeypatch.setattr("forcegp.jobs.code_digest", lambda *modules: "other")
+    with pytest.warns(OutdatedWarning, match="2 of the results in .*they are computed anew"):
         assert run_jobs(results, [square(3), next_to(square(3))]) == 2
     assert results.load("square/3")["code"] == "other"
 

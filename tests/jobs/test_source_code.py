@@ -34,12 +34,12 @@ def test_a_changed_line_of_the_package_changes_it(toolbox, name):
 
 
 def test_a_module_without_package_counts_by_itself(toolbox):
-    before = now("forcegp.jobs.job", "alone")
-    assert before != now("forcegp.jobs.job")
+    before = now("forcegp.jobs", "alone")
+    assert before != now("forcegp.jobs")
     (toolbox / "neighbour.py").write_text("x = 1\n")
-    assert now("forcegp.jobs.job", "alone") == before
+    assert now("forcegp.jobs", "alone") == before
     (toolbox / "alone.py").write_text("x = 1\n")
-    assert now("forcegp.jobs.job", "alone") != before
+    assert now("forcegp.jobs", "alone") != before
 
 
 def test_modules_without_source_count_by_name():
@@ -47,6 +47,6 @@ def test_modules_without_source_count_by_name():
 
 
 def test_equal_in_every_process():
-    code = "from forcegp.jobs import code_digest; print(code_digest('forcegp.jobs.job'))"
+    code = "from forcegp.jobs import code_digest; print(code_digest('forcegp.jobs'))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == code_digest("forcegp.jobs.job") + "\n"
+    assert done.stdout == code_digest("forcegp.jobs") + "\n"

@@ -7,7 +7,7 @@ import torch
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import ContactError, InvalidInput
-from forcegp.forces import Actuation, RigidBodies
+from forcegp.forces import Actuation
 from forcegp.mechanics import Contact, Plane, Sphere, fixed_frame, fixed_point
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -83,20 +83,6 @@ def test_a_frame_that_is_held_neither_moves_nor_turns(robot):
     a = model.dynamics(q, v, u).acceleration(torch.zeros_like(v))
     moved = (robot.frame_jacobian(q, "a_foot") @ a[..., None])[..., 0]
     assert moved.abs().max() < 1e-9 * a.abs().max()
-
-
-def test_switches_and_matrices_survive_files(walker, robot):
-    again = Model.from_json(walker.to_json())
-    assert (again.inputs, again.robot.base, again.contacts) == (walker.inputs, "floating", walker.contacts)
-    matrix = np.zeros((robot.nv, 2))
-    matrix[6:8, 0], matrix[8, 1] = (0.5, -0.5), 2.0
-    coupled = Model(robot, forces=(Actuation(matrix, ("differential", "spindle")), RigidBodies()))
-    again = Model.from_json(coupled.to_json())
-    q, v, u = states(robot, 2)
-    assert again.inputs == ("differential", "spindle")
-    tau = torch.cat([torch.zeros(len(u), 6), 0.5 * u[:, :1], -0.5 * u[:, :1], 2.0 * u[:, 1:]], -1).double()
-    expected = robot.forward_dynamics(q, v, tau)
-    torch.testing.assert_close(again.dynamics(q, v, u).acceleration(torch.zeros_like(v)), expected)
 
 
 def test_matrices_that_do_not_fit_are_refused(robot):

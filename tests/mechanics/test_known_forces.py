@@ -10,7 +10,7 @@ from tests.mechanics.systems import assert_close, normal, robot, states
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS
 
-from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint
+from forcegp.errors import InvalidInput, UnknownJoint
 from forcegp.forces import (
     Actuation,
     Coulomb,
@@ -136,31 +136,6 @@ def test_rotors_that_a_moving_link_carries():
 # ---------------------------------------------------------------- one number per joint
 
 
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        (0.7, [0.7] * 4),
-        (NUMBERS, NUMBERS),
-        (tuple(NUMBERS), NUMBERS),
-        (TENSOR, NUMBERS),
-        (dict(zip(reversed(JOINTS), reversed(NUMBERS), strict=True)), NUMBERS),
-        ({"skew": 3.0}, [0.0, 0.0, 3.0, 0.0]),
-        ({}, [0.0] * 4),
-    ],
-    ids=str,
-)
-def test_numbers_may_come_in_any_form(given, expected):
-    v = normal(3, 4)
-    for force in (Viscous(given), Coulomb(given), Rotor(given)):
-        name = next(iter(force.coefficients))
-        bound = force.bound_to(chain()).values[name]
-        assert bound.dtype == torch.float64
-        assert bound.tolist() == expected
-        assert getattr(force, name) is given  # binding makes another one
-    model = known(Viscous(given))
-    assert_close(model.dynamics(v, v, v).Q_K, -torch.tensor(expected, dtype=torch.float64) * v, 1e-14)
-
-
 def test_a_coefficient_may_be_learned():
     damping = TENSOR.clone().requires_grad_()
     q, v, u = states(4, 3)
@@ -225,28 +200,4 @@ def test_every_law_of_joints_is_tested_here():
     assert {kind for kind in own if issubclass(kind, JointLaw)} <= tested
 
 
-@pytest.mark.parametrize(
-    "stored",
-    [
-        {"type": "gravity"},
-        {"type": ["actuation"]},
-        {},
-        {"type": "actuation", "coefficients": 1.0},
-        "actuation",
-        None,
-    ],
-    ids=str,
-)
-def test_damaged_forces_are_refused(stored):
-    with pytest.raises(FileFormatError, match="force"):
-        force_from_dict(stored)
-
-
 # ---------------------------------------------------------------- a law of the user
-
-
-def test_numbers_are_copied():
-    numbers = np.array(NUMBERS)
-    bound = Viscous(torch.from_numpy(numbers)).bound_to(chain())
-    numbers[:] = -1.0
-    assert bound.values["damping"].tolist() == NUMBERS

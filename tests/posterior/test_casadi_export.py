@@ -1,17 +1,14 @@
 """A posterior as a CasADi function: `predict`, its derivatives, and what CasADi makes of it."""
 
-import errno
-import os
 import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp.codegen.library import Purpose, compile_library
+from forcegp.codegen.library import compile_library
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
@@ -70,19 +67,6 @@ def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
         np.testing.assert_allclose(found, jacobians[k], rtol=0, atol=1e-12 * abs(jacobians).max())
 
 
-def test_second_derivatives_are_differences_of_first_ones(posterior, states):
-    q, v, u = (x[0].numpy() for x in states)
-    function = casadi_function(posterior)
-    x = casadi.MX.sym("v", 3)
-    gradient = casadi.Function("g", [x], [casadi.gradient(casadi.sumsqr(function(q, x, u)), x)])
-    hessian = np.array(gradient.jacobian()(v, 0))
-    step = 1e-6
-    columns = [
-        (np.array(gradient(v + step * e)) - np.array(gradient(v - step * e))).ravel() / (2 * step) for e in np.eye(3)
-    ]
-    np.testing.assert_allclose(hessian, np.stack(columns, axis=1), rtol=1e-4, atol=1e-5 * abs(hessian).max())
-
-
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
 def test_steps_are_those_of_a_predictor(posterior, states, integrator):
     function = casadi_function(posterior, steps=0.01, integrator=integrator)
@@ -101,25 +85,10 @@ def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypa
     function = casadi_function(posterior, name="arm")
     function.generate("arm.c", {"with_header": False})
     source, library = (tmp_path / "arm.c").read_text(encoding="utf-8"), tmp_path / "arm.so"
-    compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm", Purpose("a test", "MOVE", "give up"))
+    compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm")
     external = casadi.external("arm", str(library))
     state = [x[2].numpy() for x in states]
     np.testing.assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
-
-
-def test_a_full_disk_is_an_error(posterior, tmp_path, monkeypatch):
-    """`casadi.Function.save` writes half of a file without a word."""
-
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
-        with pytest.raises(OSError, match="No space left"):
-            export_casadi(posterior, tmp_path)
-    assert list(tmp_path.iterdir()) == []
-    assert set(export_casadi(posterior, tmp_path)) == {"arm.casadi"}
-    casadi.Function.load(str(tmp_path / "arm.casadi"))
 
 
 def test_a_kernel_that_is_the_same_for_all_centres(states):
@@ -142,11 +111,6 @@ def test_a_step_that_newtons_method_does_not_find_is_one_line(friction, tmp_path
     with pytest.raises(NumericalError, match=message):
         export_casadi(friction, tmp_path, steps=0.05, integrator="implicit-midpoint")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("given", "made"), [("my arm", "my_arm"), ("jac", "jac1"), ("", "step"), (None, "step")])
-def test_any_name_becomes_one_of_casadi(friction, given, made):
-    assert casadi_function(friction, steps=0.1, name=given).name() == made
 
 
 def test_without_casadi(friction, monkeypatch):

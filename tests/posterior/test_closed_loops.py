@@ -6,10 +6,8 @@ import torch
 from tests.robots.mjcf_models import FOUR_BAR
 
 from forcegp import (
-    ContactFriction,
     Coulomb,
     Dataset,
-    HybridForce,
     JointFriction,
     Model,
     Noise,
@@ -19,7 +17,6 @@ from forcegp import (
     save_posterior,
 )
 from forcegp.data import contact_doubts, contact_rows
-from forcegp.errors import InvalidInput
 from forcegp.integration import ConstraintManifold
 from forcegp.mechanics import loop_frame
 from forcegp.scores import usual_forces
@@ -93,13 +90,6 @@ def test_compiled_predictions_are_the_same(posterior, dataset, kind):
         q, v, u = (x[:1] for x in states)
         slope = (predictor.mean(q + step, v, u) - predictor.mean(q - step, v, u)) / 2e-6
         torch.testing.assert_close(found.da_dq[:, column], slope[0], rtol=1e-5, atol=1e-4)
-
-
-def test_what_needs_a_surface_or_an_open_chain_refuses_loops(model, dataset, posterior):
-    with pytest.raises(InvalidInput, match="no contact with a surface"):
-        model.with_forces(ContactFriction())
-    with pytest.raises(InvalidInput, match="closed loop"):
-        HybridForce(posterior.predictor())
 
 
 def test_regression_leaves_the_forces_inside_the_loop_out(model, dataset):

@@ -11,11 +11,9 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownName
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit
-from forcegp.forces import FORCES, ContactFriction, JointForces, JointFriction, ToolForces, UnknownForces
+from forcegp.forces import ContactFriction, JointForces, JointFriction, UnknownForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane, Sphere
-from forcegp.noise import Noise
-from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots import Robot
 
 PRIOR = UnknownForces((JointFriction(), ContactFriction(), Weight()))
@@ -200,26 +198,6 @@ def test_wrong_curves_are_refused(posterior, train):
     assert joint.curve("pan", np.zeros((2, 9))).mean.shape == (2,)
 
 
-def test_the_same_contacts_change_nothing(posterior, states):
-    again = posterior.with_contacts(list(posterior.model.contacts))
-    mine, theirs = posterior.predict(*states), again.predict(*states)
-    assert torch.equal(mine.mean, theirs.mean)
-    assert torch.equal(mine.covariance, theirs.covariance)
-    assert torch.equal(mine.contact_force.covariance, theirs.contact_force.covariance)
-    back = posterior.with_contacts([]).with_contacts(posterior.model.contacts)
-    assert torch.equal(back.predict(*states).mean, mine.mean)
-    assert posterior.with_contacts([]).predict(*states).multiplier.mean.shape == (4, 0)
-    assert posterior.model.contacts  # nothing happened to the first
-    assert again.latent is posterior.latent  # and nothing was factorised again
-
-
-def test_it_moves_to_a_surface_that_has_no_normal_where_all_joints_are_zero(posterior, states):
-    rest = torch.zeros(1, 3).double()
-    center = Contact("hand", TIP, Plane((0.0, 0.0, 1.0), 0.0)).position(posterior.model.robot.kinematics(rest))[0]
-    ball = Contact("hand", TIP, Sphere(tuple(center.tolist()), 0.3))
-    assert bool(torch.isfinite(posterior.with_contacts([ball]).predict(*states).mean).all())
-
-
 def slid(model, friction, rows, seed, speed):
     """Noise-free rows on the surface of `model` under a true friction of its tool, and the force itself."""
     generator = np.random.default_rng(seed)
@@ -258,16 +236,6 @@ def test_friction_learned_on_one_plane_predicts_motions_on_another_and_on_a_ball
         assert float((part.point_force.mean - force).abs().max()) < 1e-3
 
 
-def test_forces_move_to_a_robot_with_another_tool(posterior, states):
-    heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
-    moved = posterior.with_robot(heavier)
-    assert moved.model.robot is heavier
-    mine, theirs = posterior.components(*states), moved.components(*states)
-    close(theirs["joint-friction"].joint_force.mean, mine["joint-friction"].joint_force.mean, 1e-12)
-    dynamics = posterior.model.with_robot(heavier).dynamics(*states)
-    close(moved.predict(*states).mean, dynamics.acceleration(theirs.total.mean), 1e-10)
-
-
 def test_what_cannot_move_is_refused(posterior, train):
     heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
@@ -281,31 +249,3 @@ def test_what_cannot_move_is_refused(posterior, train):
     with pytest.raises(InvalidInput, match=r"no rigid bodies.* fit a model with RigidBodies\(\)"):
         zero.with_robot(heavier)
     assert zero.with_contacts([]).predict(train.q, train.v, train.u).multiplier.mean.shape == (16, 0)
-
-
-def test_a_moved_model_comes_back_from_a_folder_as_it_was(posterior, states, tmp_path, monkeypatch):
-    """What it was trained on and what it predicts for are two models, and both are stored."""
-    monkeypatch.setitem(FORCES, "weight", Weight)
-    moved = posterior.with_contacts(OTHER_CONTACTS["sphere"])
-    save_posterior(moved, tmp_path / "moved")
-    again = load_posterior(tmp_path / "moved")
-    assert again.model.contacts == moved.model.contacts
-    assert again.trained.contacts == posterior.model.contacts
-    assert torch.equal(again.predict(*states).mean, moved.predict(*states).mean)
-    assert torch.equal(again.predict(*states).covariance, moved.predict(*states).covariance)
-    assert again.negative_log_likelihood == posterior.negative_log_likelihood
-    home = again.with_contacts(posterior.model.contacts)
-    assert torch.equal(home.predict(*states).mean, posterior.predict(*states).mean)
-
-
-def test_one_prior_alone_is_one_component(train, states):
-    for prior, name in ((JointForces(("v",)), "joint-forces"), (ToolForces(), "tool-friction")):
-        model = train.model.with_forces(prior, noise=Noise(0.1))
-        fitted = fit(model, train, restarts=1, options=OptimizerOptions(iterations=1))
-        components = fitted.components(*states)
-        assert tuple(components) == (name,)
-        close(components[name].joint_force.covariance, components.total.covariance, 1e-12)
-        dynamics = train.model.dynamics(*states)
-        curve = fitted.curve(fitted.latent_names[0], prior.features(dynamics)[0])  # standardised or only scaled
-        close(curve.mean, components[name].latents.mean[:, 0], 1e-10)
-        close(curve.std, components[name].latents.std[:, 0], 1e-8)

@@ -14,7 +14,7 @@ from forcegp.codegen import library
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointForces, JointFriction
-from forcegp.posterior import load_posterior, predictor_code, save_posterior, update
+from forcegp.posterior import load_posterior, programs, save_posterior, update
 
 FIRST, HORIZON = 14, 20.0
 
@@ -64,7 +64,7 @@ def dense(posterior, points, data, horizon, test):
         return (
             features,
             dynamics.H @ posterior.model.unknown.direction(dynamics),
-            dynamics.acceleration_map(True).offset,
+            dynamics.acceleration_map().offset,
         )
 
     (z, W, offset), (at, W_test, mean) = terms(data), terms(test)
@@ -148,7 +148,7 @@ def test_a_refreshed_predictor_predicts_what_the_posterior_does(posterior, data,
     later = in_time(posterior, data, HORIZON, [slice(FIRST, None)])
     with monkeypatch.context() as patch:
         for name in ("trace", "load_library"):
-            patch.setattr(predictor_code, name, forbidden)
+            patch.setattr(programs, name, forbidden)
         patch.setattr(library, "load_library", forbidden)
         found = predictor.refreshed(later).refreshed(later)
         after = [found.mean(*states), found.linearize(*states).da_dv, found.rollouts(*roll).v]

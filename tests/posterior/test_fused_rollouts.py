@@ -117,7 +117,7 @@ def test_rollouts_of_a_posterior_are_compiled_where_they_are_long(friction, star
     monkeypatch.setattr(rollout, "STEPS_TO_COMPILE", 1)
     called = []
     fused = rollout.fused
-    monkeypatch.setattr(rollout, "fused", lambda *given: called.append(given[0]) or fused(*given))
+    monkeypatch.setattr(rollout, "fused", lambda *given, **how: called.append(given[0]) or fused(*given, **how))
     found = rolled_out(friction, starts, samples=2)
     assert [len(loops) for loops in called] == [1, 2]
     close(found, expected)
@@ -142,15 +142,3 @@ def test_rollouts_of_a_posterior_are_compiled_where_they_are_long(friction, star
 def test_bad_arguments(predictor, starts, changed, message):
     with pytest.raises(InvalidInput, match=message):
         predictor.rollouts(*starts, **({"dt": DT} | changed))
-
-
-def test_bad_states(predictor, starts):
-    q, v, u = starts
-    with pytest.raises(InvalidInput, match=r"u has shape \(11, 12, 2\); it must be \(\.\.\., T, 3\)"):
-        predictor.rollouts(q, v, u[..., :2], DT)
-    with pytest.raises(InvalidInput, match=r"do not broadcast: q0 \(11,\), v0 \(11,\), u \(4,\)"):
-        predictor.rollouts(q, v, u[:4], DT)
-    with pytest.raises(InvalidInput, match="u has no rows"):
-        predictor.rollouts(q, v, u[:, :0], DT)
-    with pytest.raises(InvalidInput, match=r"q0 requires a gradient.*rollout\(\.\.\., grad=True\)"):
-        predictor.rollouts(q.clone().requires_grad_(), v, u, DT)

@@ -9,11 +9,9 @@ from tests.posterior.arm import arm_data, arm_model
 from tests.posterior.test_predictor import CONTACTS, SHORT
 
 from forcegp.codegen.library import default_folder
-from forcegp.errors import NumericalWarning
 from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
 from forcegp.posterior import Posterior
-from forcegp.posterior.kept_code import KeptCode
 
 
 @pytest.fixture(autouse=True)
@@ -109,16 +107,10 @@ def test_a_damaged_record_is_made_again(posterior, states):
         assert predictor.code.is_traced, damage
 
 
-def test_the_warning_of_a_small_rank_comes_each_time(posterior):
-    for _ in range(2):
-        with pytest.warns(NumericalWarning, match="rank 1 makes"):
-            posterior.predictor(tolerance=1e-9, largest_rank=1)
-
-
 def test_the_oldest_records_go(posterior, monkeypatch):
-    monkeypatch.setattr("forcegp.posterior.kept_code.LARGEST", 60_000)
+    monkeypatch.setattr("forcegp.posterior.programs.LARGEST", 60_000)
     for tolerance in (0.1, 0.2, 0.3, 0.4):
         made(posterior, tolerance=tolerance)
     sizes = [path.stat().st_size for path in default_folder().glob("*.safetensors")]
     assert 0 < sum(sizes) <= 60_000
-    assert isinstance(made(posterior, tolerance=0.1).code, KeptCode)
+    assert made(posterior, tolerance=0.1).code is not None

@@ -55,23 +55,6 @@ def test_what_shrinks_is_the_prediction_under_exact_torques():
     assert (here.covariance.diagonal(dim1=-2, dim2=-1) > 0.0).all()
 
 
-def test_contacts_hold_as_they_did():
-    posterior, rows = fitted(JointFriction(), contacts=1)
-    prediction = predicted(posterior, rows)
-    dynamics = posterior.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u)))
-    assert float(((dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b).abs().max()) < 1e-8
-    along = (dynamics.A @ prediction.covariance @ dynamics.A.mT)[..., 0, 0]
-    assert float(along.abs().max()) < 1e-8
-
-
-def test_less_noise_of_the_sensor_means_less_shrinking():
-    posterior, rows = fitted(())
-    quiet = {**posterior.hyperparameters, "noise.log_force": torch.full((3,), -16.0, dtype=torch.float64)}
-    exact = replace(posterior, trained=replace(posterior.model, noise=Noise(0.05, FORCE)))
-    near = predicted(replace(posterior, hyperparameters=quiet), rows)
-    torch.testing.assert_close(near.mean, predicted(exact, rows).mean, rtol=1e-6, atol=1e-6)
-
-
 def test_rollouts_and_files_know_it(tmp_path):
     posterior, rows = fitted(JointFriction())
     motion = posterior.rollout(rows.q[0], rows.v[0], rows.u[:3], 1e-3)

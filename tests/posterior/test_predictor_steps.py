@@ -8,7 +8,7 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, RigidBodies, ToolForces
+from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior
 
@@ -114,39 +114,6 @@ def test_wrong_arguments_of_a_step_are_named(smooth, states, changed, message):
             ask(**arguments)
 
 
-@pytest.mark.parametrize("kind", [torch.float32, torch.float16, torch.int64])
-def test_other_numbers_are_converted_exactly_as_predict_does(smooth, states, kind):
-    """The machine code reads float64: other bits would be nonsense."""
-    predictor = smooth.predictor(covariance="none")
-    for given in ([x.to(kind) for x in states], [x.to(kind).numpy() for x in states]):
-        exact = [torch.as_tensor(x).double() for x in given]
-        torch.testing.assert_close(predictor.mean(*given), smooth.predict(*given).mean, rtol=1e-10, atol=1e-10)
-        for name, more in (("mean", ()), ("linearize", ()), ("step", (DT,)), ("linearize_step", (DT,))):
-            pairs = [(x[0] for x in given), (x[0] for x in exact)]
-            for found, expected in ((given, exact), pairs):
-                torch.testing.assert_close(
-                    getattr(predictor, name)(*found, *more), getattr(predictor, name)(*expected, *more), rtol=0, atol=0
-                )
-        u = given[2][:, None]
-        assert torch.equal(predictor.rollouts(*given[:2], u, DT).q, predictor.rollouts(*exact[:2], u, DT).q)
-    with pytest.raises(InvalidInput, match=r"q must be a tensor of real numbers; given: torch\.complex128"):
-        predictor.mean(*(x.to(torch.complex128) for x in states))
-
-
-def test_forces_are_the_components_of_the_posterior(posterior, states):
-    predictor = posterior.predictor(covariance="none", compile=False)
-    found, expected = predictor.forces(*states), posterior.predict(*states)
-    pairs = [(found.total, expected.unknown_force)]
-    pairs += [(getattr(found, name), getattr(expected, name)) for name in ("multiplier", "contact_force")]
-    for force, same in pairs:
-        torch.testing.assert_close(force.mean, same.mean)
-        torch.testing.assert_close(force.covariance, same.covariance)
-    assert list(found) == list(posterior.components(*states))
-    alone = predictor.forces(*(x[1] for x in states), covariance=False)
-    assert alone.multiplier.mean.shape == (1,)
-    assert alone.total.covariance is None
-
-
 def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     q, v, u = states
     predictor = posterior.predictor(covariance="exact", compile=False)
@@ -163,22 +130,6 @@ def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     alone = predictor.inverse_dynamics(q[1], v[1], expected.mean[1], [40.0])
     assert alone.mean.shape == (3,)
     assert alone.covariance.shape == (3, 3)
-
-
-def test_the_covariance_of_u_is_that_of_the_unknown_force_where_it_does_not_depend_on_u(states):
-    posterior = fitted(JointFriction())
-    u = posterior.predictor(covariance="exact", compile=False).inverse_dynamics(*states, [5.0])  # any acceleration
-    expected = posterior.predict(*states[:2], u.mean).unknown_force.covariance
-    torch.testing.assert_close(u.covariance, expected, rtol=1e-9, atol=1e-12)
-    means = posterior.predictor(covariance="none", compile=False)
-    assert means.inverse_dynamics(*states).covariance is None
-
-
-def test_without_contacts_inverse_dynamics_is_the_recursive_one(smooth, states):
-    free = fitted(model=arm_model(0, forces=(Actuation(), RigidBodies()), baumgarte=None))
-    q, v, a = states
-    u = free.predictor(covariance="none", compile=False).inverse_dynamics(q, v, a)
-    torch.testing.assert_close(u.mean, free.model.robot.inverse_dynamics(q, v, a), rtol=1e-10, atol=1e-10)
 
 
 def test_inverse_dynamics_refuses_what_it_cannot_solve(smooth, states):

@@ -13,8 +13,6 @@ from forcegp.forces import BaseWrench, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
 from forcegp.model import Model
-from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.rollout import roll_out
 from forcegp.robots import Robot
 
 DT, STEPS = 1 / 240, 12
@@ -57,16 +55,6 @@ def test_symplectic_euler_is_a_loop_over_predict(data, start):
     assert (rollout.initial_correction == 0).all()
 
 
-@pytest.mark.parametrize("integrator", ["rk4", "projected"])
-def test_the_black_box_way_through_predict_gives_the_same_motion(data, start, integrator):
-    posterior = fit(arm_model(baumgarte=None).with_forces(JointForces()).without_mean(), data, points=15, **QUICK)
-    q, v, u = start
-    direct = posterior.rollout(q, v, u[:, :4], DT, integrator=integrator)
-    through = roll_out(Posterior.accelerations(posterior, None), q, v, u[:, :4], DT, integrator=integrator)
-    torch.testing.assert_close(direct.q, through.q, rtol=0, atol=1e-11)
-    torch.testing.assert_close(direct.a, through.a, rtol=1e-9, atol=1e-9)
-
-
 def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posterior, start):
     q, v, u = start
     q = q + 1e-3  # off the plane
@@ -76,18 +64,6 @@ def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posteri
         dynamics = arm_model(baumgarte=baumgarte).dynamics(q, v, u[:, 0])
         torch.testing.assert_close((dynamics.A @ rollout.a[:, 0, :, None])[..., 0], dynamics.b, rtol=1e-9, atol=1e-10)
         assert rollout.baumgarte == baumgarte
-
-
-def test_batches_lead_and_broadcast(posterior, start):
-    q, v, u = start
-    many = posterior.rollout(q[:, None], v[:, None], u[0].expand(3, -1, -1), DT)
-    assert many.q.shape == many.v.shape == (2, 3, STEPS + 1, 3)
-    assert many.a.shape == (2, 3, STEPS, 3)
-    assert many.constraint.shape == many.velocity_constraint.shape == (2, 3, STEPS + 1, 1)
-    assert many.diverged_at.shape == (2, 3)
-    alone = posterior.rollout(q[1].tolist(), v[1].numpy(), u[0], DT)
-    assert alone.q.shape == (STEPS + 1, 3)
-    torch.testing.assert_close(many.q[1, 2], alone.q, rtol=0, atol=1e-12)
 
 
 def test_the_constraint_is_that_of_the_contacts_and_projection_keeps_it(posterior, start):
@@ -103,13 +79,6 @@ def test_the_constraint_is_that_of_the_contacts_and_projection_keeps_it(posterio
     torch.testing.assert_close(correction[:, 0], (kept.q[:, 0] - q - 1e-3).abs().amax(-1), rtol=1e-9, atol=0)
     torch.testing.assert_close(correction[:, 1], (kept.v[:, 0] - v).abs().amax(-1), rtol=1e-9, atol=0)
     assert (correction > 1e-4).all()
-
-
-def test_a_rollout_goes_on_from_any_of_its_own_states(posterior, start):
-    q, v, u = start
-    whole = posterior.rollout(q, v, u, DT, integrator="rk4")
-    rest = posterior.rollout(whole.q[:, 5], whole.v[:, 5], u[:, 5:], DT, integrator="rk4")
-    torch.testing.assert_close(rest.q, whole.q[:, 5:], rtol=0, atol=1e-12)
 
 
 def test_samples_are_functions_that_obey_the_constraint(posterior, start):
@@ -137,22 +106,22 @@ def test_samples_are_functions_that_obey_the_constraint(posterior, start):
 
 def test_first_sampled_accelerations_have_the_predicted_distribution(posterior, start):
     q, v, u = (x[0] for x in start)
-    rollout = posterior.rollout(q, v, u[:1], DT, baumgarte=Baumgarte(5.0), samples=3000, seed=0)
+    rollout = posterior.rollout(q, v, u[:1], DT, baumgarte=Baumgarte(5.0), samples=1500, seed=0)
     first = rollout.samples.a[:, 0]
     expected = posterior.predict(q, v, u[0])
-    assert ((first.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
+    assert ((first.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(1500) + 1e-9).all()
     scale = expected.covariance.diagonal().max()
-    torch.testing.assert_close(torch.cov(first.mT), expected.covariance, rtol=0.1, atol=0.1 * float(scale))
+    torch.testing.assert_close(torch.cov(first.mT), expected.covariance, rtol=0.14, atol=0.14 * float(scale))
 
 
 def test_the_independent_model_rolls_out_its_mean_and_functions_of_its_own(data, start):
-    posterior = fit(arm_model().black_box(), data, points=20, options=OptimizerOptions(iterations=15))
+    posterior = fit(arm_model().black_box(), data, points=20, restarts=1, options=OptimizerOptions(iterations=8))
     q, v, u = start
-    drawn = posterior.rollout(q[0], v[0], u[0, :1], DT, samples=3000, seed=0).samples.a[:, 0]
+    drawn = posterior.rollout(q[0], v[0], u[0, :1], DT, samples=1500, seed=0).samples.a[:, 0]
     expected = posterior.predict(q[0], v[0], u[0, 0])
-    assert ((drawn.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(3000) + 1e-9).all()
-    torch.testing.assert_close(drawn.std(0), expected.std, rtol=0.08, atol=0)
-    assert torch.corrcoef(drawn.mT).tril(-1).abs().max() <= 5.0 / np.sqrt(3000)
+    assert ((drawn.mean(0) - expected.mean).abs() <= 5.0 * expected.std / np.sqrt(1500) + 1e-9).all()
+    torch.testing.assert_close(drawn.std(0), expected.std, rtol=0.1, atol=0)
+    assert torch.corrcoef(drawn.mT).tril(-1).abs().max() <= 5.0 / np.sqrt(1500)
     with pytest.raises(InvalidInput, match=r"the model has no contacts"):
         posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0))
 
@@ -161,13 +130,6 @@ def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):
     q, v, u = start
     rollout = fit(data.model, data, points=10, **QUICK).rollout(q, v, u, DT, samples=2)
     torch.testing.assert_close(rollout.samples.q, rollout.q.expand(2, -1, -1, -1), rtol=1e-12, atol=1e-12)
-
-
-def test_progress_counts_mean_and_samples(posterior, start):
-    q, v, u = start
-    seen = []
-    posterior.rollout(q, v, u[:, :3], DT, samples=2, progress=lambda *now: seen.append(now))
-    assert seen == [(k, 6) for k in range(1, 7)]
 
 
 @pytest.mark.parametrize(
@@ -193,20 +155,6 @@ def test_wrong_arguments_are_named(posterior, start, changed, message):
         posterior.rollout(**arguments)
 
 
-def test_helpers_need_samples_and_stabilisation_a_constraint(posterior, data, start):
-    q, v, u = start
-    rollout = posterior.rollout(q, v, u[:, :1], DT)
-    for ask in (rollout.std, rollout.quantiles):
-        with pytest.raises(InvalidInput, match="this rollout has 0 samples"):
-            ask()
-    with pytest.raises(InvalidInput, match="quantile levels"):
-        rollout.quantiles((1.5,))
-    free = fit(arm_model(0).with_forces(JointForces()), arm_data(20, 1, arm_model(0)), points=10, **QUICK)
-    with pytest.raises(InvalidInput, match="has no contacts; give baumgarte=None"):
-        free.rollout(q, v, u, DT, baumgarte=Baumgarte(1.0))
-    assert free.rollout(q, v, u, DT, integrator="projected").constraint.shape == (2, STEPS + 1, 0)
-
-
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "projected"])
 def test_feedback_is_asked_once_per_step_and_acts_until_the_next(posterior, start, integrator):
     q, v, u = start
@@ -226,21 +174,6 @@ def test_feedback_is_asked_once_per_step_and_acts_until_the_next(posterior, star
     torch.testing.assert_close(rollout.q, same.q, rtol=1e-12, atol=1e-12)
     without = posterior.rollout(q, v, u, DT, integrator=integrator)
     assert not torch.allclose(rollout.v, without.v, atol=1e-6)
-
-
-def test_feedback_sees_the_batch_dimensions_of_the_motions(posterior, start):
-    q, v, u = start
-    seen = set()
-
-    def feedback(k, q, v):
-        seen.add((tuple(q.shape), tuple(v.shape)))
-        return torch.zeros_like(q)
-
-    with_feedback = posterior.rollout(q, v, u, DT, feedback=feedback, samples=3, seed=1)
-    assert seen == {((2, 3), (2, 3)), ((3, 2, 3), (3, 2, 3))}
-    plain = posterior.rollout(q, v, u, DT, samples=3, seed=1)
-    torch.testing.assert_close(with_feedback.q, plain.q)
-    torch.testing.assert_close(with_feedback.samples.q, plain.samples.q)
 
 
 def test_feedback_of_another_shape_is_refused(posterior, start):
@@ -266,16 +199,6 @@ def test_gradients_in_initial_states_and_forces_are_those_of_finite_differences(
     plain = posterior.rollout(*(part.detach() for part in x), 0.02, integrator=integrator, samples=samples)
     torch.testing.assert_close(motion(*x)[0].detach(), plain.q[:, 1:], rtol=0, atol=1e-10)
     assert torch.autograd.gradcheck(motion, x, fast_mode=True)
-
-
-def test_gradients_flow_through_feedback(posterior, start):
-    q, v, u = start
-    gain = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-
-    def end(gain):
-        return posterior.rollout(q, v, u, DT, feedback=lambda k, q, v: -gain * v, grad=True).q[:, -1]
-
-    assert torch.autograd.gradcheck(end, gain, fast_mode=True)
 
 
 def test_a_gradient_is_never_dropped_in_silence(posterior, start):

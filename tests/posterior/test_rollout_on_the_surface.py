@@ -35,6 +35,7 @@ def a_millimetre_off(posterior, q: torch.Tensor) -> torch.Tensor:
     return q + (torch.linalg.pinv(A) @ (1e-3 - c)[:, None, None])[..., 0]
 
 
+@pytest.mark.nightly
 def test_one_second_under_recorded_torques_stays_on_the_surface_and_near_the_recording(posterior, test):
     q, v = (torch.tensor(x[list(STARTS)]) for x in (test.q, test.v))
     u = torch.tensor(np.stack([test.u[k : k + 240] for k in STARTS]))

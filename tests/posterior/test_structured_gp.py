@@ -6,7 +6,7 @@ import torch
 from tests.posterior.arm import NOISE, URDF, arm_data, arm_model
 
 from forcegp.data import Dataset
-from forcegp.errors import ContactError, DataWarning, FitError, InvalidInput
+from forcegp.errors import ContactError, DataWarning, InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
@@ -103,35 +103,13 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
     assert torch.allclose(prediction.covariance, posterior.widening**2 * covariance, atol=1e-8)
 
 
-def test_batch_shapes_blocks_and_gradients(posterior, test, monkeypatch):
-    states = [torch.tensor(x[:6]) for x in (test.q, test.v, test.u)]
-    flat = posterior.predict(*states)
-    batched = posterior.predict(*(x.reshape(2, 3, 3) for x in states))
-    torch.testing.assert_close(batched.mean.reshape(6, 3), flat.mean, rtol=1e-10, atol=1e-10)
-    assert batched.covariance.shape == (2, 3, 3, 3)
-    assert batched.multiplier.mean.shape == (2, 3, 1)
-    single = posterior.predict(*(x[0] for x in states))
-    assert single.mean.shape == (3,)
-    assert torch.allclose(single.mean, flat.mean[0], atol=1e-12)
-    assert posterior.predict(*(x[:0] for x in states)).mean.shape == (0, 3)
-    monkeypatch.setattr("forcegp.posterior.posterior.ROWS_PER_BLOCK", 4)
-    assert torch.allclose(posterior.predict(*states).covariance, flat.covariance, atol=1e-12)
-    assert posterior.predict(*states, covariance=False).covariance is None
-
-    def mean_of(q, v, u):
-        return posterior.predict(q, v, u, covariance=False).mean
-
-    point = tuple(x[0].requires_grad_() for x in states)
-    assert torch.autograd.gradcheck(mean_of, point, atol=1e-6)
-
-
 def test_zero_mean_carries_the_known_forces_in_the_processes(train, test):
     zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=QUICK)
     states = tuple(map(torch.tensor, (test.q, test.v, test.u)))
     dynamics = test.model.dynamics(*states)
     prediction = zero.predict(*states)
     total = prediction.unknown_force.mean
-    assert torch.allclose(dynamics.acceleration_map(known=False)(total), prediction.mean, atol=1e-9)
+    assert torch.allclose(dynamics.acceleration(total - dynamics.Q_K), prediction.mean, atol=1e-9)
     assert float(((dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b).abs().max()) < 1e-9
 
 
@@ -139,7 +117,8 @@ def test_the_noise_is_learned(train):
     fitted = fit(
         train.model.with_forces(JointForces(), noise=Noise(0.2, learn=True)),
         train,
-        options=OptimizerOptions(iterations=80),
+        restarts=1,
+        options=OptimizerOptions(iterations=60),
     )
     assert np.allclose(fitted.noise_std.numpy(), NOISE, rtol=0.5)
 
@@ -158,17 +137,15 @@ def test_force_level_noise_widens_along_H(train, test):
 
 
 def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
-    options = OptimizerOptions(iterations=5)
+    options = OptimizerOptions(iterations=2)
     model = train.model.with_forces(JointForces())
-    three = fit(model, train, points=15, restarts=3, seed=7, options=options)
-    again = fit(model, train, points=15, restarts=3, seed=7, jobs=2, options=options)
-    more = fit(model, train, points=15, restarts=4, seed=7, options=options)
+    three = fit(model, train, points=8, restarts=3, seed=7, options=options)
+    again = fit(model, train, points=8, restarts=3, seed=7, jobs=2, options=options)
     values = three.settings["restart_objective"]
     assert len(set(values)) == 3
     assert three.result.value == min(values)
     assert np.allclose(again.settings["restart_objective"], values, rtol=1e-9)
-    assert np.allclose(more.settings["restart_objective"][:3], values, rtol=1e-12)
-    other = fit(model, train, points=15, restarts=2, seed=8, options=options)
+    other = fit(model, train, points=8, restarts=2, seed=8, options=options)
     assert other.settings["restart_objective"][0] == pytest.approx(values[0])
     assert other.settings["restart_objective"][1] != pytest.approx(values[1])
 
@@ -176,7 +153,7 @@ def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
 def test_the_hyperprior_can_be_left_out(train):
     model = train.model.with_forces(JointForces())
     options = OptimizerOptions(iterations=100)
-    plain = fit(model, train, points=20, restarts=4, hyperprior=False, options=options)
+    plain = fit(model, train, points=20, restarts=2, hyperprior=False, options=options)
     held = fit(model, train, points=20, restarts=1, options=options)
     assert plain.result.value == pytest.approx(plain.negative_log_likelihood, abs=1e-6)
     assert plain.negative_log_likelihood < held.negative_log_likelihood < held.result.value
@@ -189,41 +166,6 @@ def test_nothing_of_the_caller_changes(train):
     fit(train.model.with_forces(JointForces()), train, points=10, options=OptimizerOptions(iterations=2))
     assert all(np.array_equal(getattr(train, name), value) for name, value in before.items())
     assert state == (torch.get_default_dtype(), torch.get_num_threads())
-
-
-def test_works_without_contacts():
-    model = arm_model(contacts=0)
-    train, test = arm_data(50, 3, model), arm_data(50, 4, model)
-    prediction = fit(model.with_forces(JointForces()), train, restarts=1, options=QUICK).predict(test.q, test.v, test.u)
-    assert prediction.multiplier.mean.shape == (50, 0)
-    assert np.abs(prediction.mean.numpy() - test.truth["a"]).mean() < 0.2
-
-
-def test_redundant_contacts_change_nothing(train, test):
-    doubled = train.model.with_contacts(train.model.contacts * 2)
-    options = OptimizerOptions(iterations=5)
-    one = fit(train.model.with_forces(JointForces()), train, points=20, restarts=1, options=options).predict(
-        test.q, test.v, test.u
-    )
-    two = fit(doubled.with_forces(JointForces()), train, points=20, restarts=1, options=options).predict(
-        test.q, test.v, test.u
-    )
-    assert torch.allclose(one.mean, two.mean, atol=1e-6)
-    assert torch.allclose(two.multiplier.mean.sum(-1), one.multiplier.mean[:, 0], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"points": 61}, "points=61` must be an integer from 2 to 60, the rows"),
-        ({"points": 1}, "points=1"),
-        ({"restarts": 0}, "restarts=0"),
-        ({"seed": -1}, "seed=-1"),
-    ],
-)
-def test_bad_numbers_are_refused(train, change, message):
-    with pytest.raises(InvalidInput, match=message):
-        fit(train.model.with_forces(JointForces()), train, **change)
 
 
 def test_a_dataset_of_another_robot_is_refused(train):
@@ -252,28 +194,6 @@ def test_a_surface_that_most_rows_miss_is_pointed_out(train):
     data = Dataset(**mixed, time=np.arange(60.0), model=train.model, noise_std=train.noise_std)
     with pytest.warns(DataWarning, match=r"half of the training points .* rows in contact only"):
         fit(train.model.with_forces(JointForces()), data, restarts=1, options=OptimizerOptions(iterations=1))
-
-
-def test_parts_of_the_wrong_kind_are_named(train):
-    with pytest.raises(InvalidInput, match="model is a Robot; give a Model"):
-        fit(train.model.robot, train)
-    with pytest.raises(InvalidInput, match="Noise acceleration is 'loud'"):
-        train.model.with_forces(JointForces(), noise="loud")
-    assert train.model.with_forces(JointForces(), noise=0.2).noise == Noise(0.2)
-    assert Noise(np.array([0.1, 0.2])).acceleration == (0.1, 0.2)
-
-
-def test_a_fit_that_cannot_start_names_the_cause(train):
-    broken = train.rows(slice(0, 10))
-    huge = Dataset(
-        **{
-            name: getattr(broken, name)
-            for name in ("q", "v", "u", "time", "joint_names", "units", "model", "noise_std")
-        },
-        a=np.full((10, 3), 1e200),
-    )
-    with pytest.raises(FitError, match="none of 2 restarts"):
-        fit(train.model.with_forces(JointForces()), huge, restarts=2)
 
 
 def test_states_that_make_no_sense_are_refused(posterior, test):

@@ -1,25 +1,19 @@
 """`posterior.update`: against conditioning on all rows at once, with the standardization of the fit."""
 
 import dataclasses
-import json
-import warnings
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data
 
-from forcegp.atomic_files import write_digests
-from forcegp.errors import ContactError, DataWarning, FileFormatError, InvalidInput, NotEnoughMemory
+from forcegp.errors import ContactError, DataWarning, InvalidInput, NotEnoughMemory
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies
+from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions, likelihood
 from forcegp.inference import memory as memory_module
-from forcegp.mechanics import Contact, Plane
 from forcegp.noise import Noise
 from forcegp.posterior import load_posterior, save_posterior
-from forcegp.robots import Robot
 
 QUICK = OptimizerOptions(iterations=8)
 
@@ -63,21 +57,6 @@ def assert_same(one, other, data, tolerance=1e-8):
 
 def uneven_noise(data):
     return dataclasses.replace(data, noise_std=0.05 * np.linspace(0.5, 2.0, data.q.size).reshape(data.q.shape))
-
-
-def on_two_planes(rows, seed):
-    """The arm with its tool in the edge between two planes."""
-    model = arm_model()
-    model = model.with_contacts([*model.contacts, Contact("hand", (0.0, 0.0, 0.2), Plane((1.0, 0.2, 0.0), 0.25))])
-    data = arm_data(rows, seed)
-    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
-    for _ in range(20):
-        dynamics, kinematics = model.dynamics(q, 0.0 * v, u), model.robot.kinematics(q)
-        distance = torch.stack([contact.distance(kinematics) for contact in model.contacts], dim=-1)
-        q = q - (torch.linalg.pinv(dynamics.A) @ distance[..., None])[..., 0]
-    a = model.dynamics(q, v, u).acceleration(-0.8 * torch.tanh(v / 0.4)).numpy()
-    noise = np.random.default_rng(seed).normal(0.0, 0.05, a.shape)
-    return dataclasses.replace(data, q=q.numpy(), a=a + noise, model=model, truth={})
 
 
 MODELS = {
@@ -129,49 +108,6 @@ def test_what_is_kept_of_the_fit_are_its_numbers_by_the_parameters_own_meaning()
     assert grown.negative_log_likelihood == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
-def test_bodies_that_were_estimated():
-    data = arm_data(26, seed=4)
-    posterior = learned(data, 20, data.model.with_forces(RigidBodies(learn=("hand",)), JointForces()))
-    grown = posterior.update(data.rows(slice(20, 26)))
-    assert_same(grown, at_once(posterior, data), data)
-    assert grown.estimates is posterior.estimates
-
-
-def test_two_contacts():
-    data = on_two_planes(16, seed=5)
-    posterior = learned(data)
-    grown = posterior.update(data.rows(slice(12, 16)))
-    assert grown.latent.system.deflation.rank == 1
-    assert_same(grown, at_once(posterior, data), data)
-
-
-def test_the_order_of_updates_does_not_matter_and_variances_never_grow():
-    data, test = arm_data(24, seed=6), arm_data(30, seed=7)
-    posterior = learned(data)
-    parts = [data.rows(slice(12, 17)), data.rows(slice(17, 24))]
-    forth, back = posterior.update(parts[0]).update(parts[1]), posterior.update(parts[1]).update(parts[0])
-    assert_same(forth, back, test)
-    before, between, after = (
-        p.predict(test.q, test.v, test.u).covariance for p in (posterior, posterior.update(parts[0]), forth)
-    )
-    assert torch.linalg.eigvalsh(before - between).min() > -1e-10
-    assert torch.linalg.eigvalsh(between - after).min() > -1e-10
-
-
-def test_the_old_posterior_predicts_as_before():
-    data, test = arm_data(20, seed=8), arm_data(5, seed=9)
-    posterior = learned(data)
-    before = posterior.predict(test.q, test.v, test.u)
-    posterior.update(data.rows(slice(12, 20)))
-    posterior.update(data.rows(slice(12, 20)), budget=6)
-    after = posterior.predict(test.q, test.v, test.u)
-    assert torch.equal(before.mean, after.mean)
-    assert torch.equal(before.covariance, after.covariance)
-    assert len(posterior.training.q) == 12
-    assert posterior.training.reference is None
-
-
 @pytest.mark.parametrize("budget", [8, 12, 15])
 def test_a_budget_is_kept_and_the_result_is_that_of_the_rows_kept(budget):
     data, test = uneven_noise(arm_data(30, seed=10)), arm_data(5, seed=11)
@@ -182,15 +118,6 @@ def test_a_budget_is_kept_and_the_result_is_that_of_the_rows_kept(budget):
     assert len(set(rows)) == budget
     torch.testing.assert_close(grown.training.a, torch.tensor(data.a[rows]))
     assert_same(grown, at_once(posterior, data.rows(rows)), test)
-
-
-def test_another_rule_for_the_rows_that_stay():
-    data = arm_data(20, seed=12)
-    posterior = learned(data)
-    newest = posterior.update(
-        data.rows(slice(12, 20)), 6, keep=lambda latent, budget: torch.arange(len(latent.system.alpha))[-budget:]
-    )
-    assert torch.equal(newest.training.q, torch.tensor(data.q[-6:]))
 
 
 def test_everything_else_works_after_an_update(tmp_path):
@@ -230,22 +157,6 @@ def test_what_comes_back_from_disk_predicts_the_same(tmp_path, prior):
     assert_same(load_posterior(tmp_path / "free"), grown.with_contacts([]), data)
 
 
-def test_only_updated_models_declare_rows_of_reference(tmp_path):
-    data = arm_data(14, seed=15)
-    posterior = learned(data)
-    for name, saved, features in (("old", posterior, []), ("new", posterior.update(data.rows([12])), ["reference"])):
-        save_posterior(saved, tmp_path / name)
-        assert json.loads((tmp_path / name / "model.json").read_text())["features"] == features
-    assert not any(key.startswith("reference.") for key in load_file(tmp_path / "old" / "tensors.safetensors"))
-    (tmp_path / "old" / "model.json").write_bytes((tmp_path / "new" / "model.json").read_bytes())
-    write_digests(tmp_path / "old")
-    with pytest.raises(FileFormatError, match=r"reference\.q"):
-        load_posterior(tmp_path / "old")
-
-
-# ---------------------------------------------------------------- errors
-
-
 @pytest.fixture(scope="module")
 def posterior():
     return learned(arm_data(12, seed=16))
@@ -255,13 +166,6 @@ def posterior():
 def test_budgets_that_mean_nothing_are_refused(posterior, budget):
     with pytest.raises(InvalidInput, match="must be an integer of at least 2"):
         posterior.update(arm_data(2, seed=17), budget)
-
-
-def test_other_joints_are_refused(posterior):
-    text = posterior.model.robot.urdf_text.replace('"pan"', '"swing"')
-    other = arm_data(3, seed=17, model=posterior.model.with_robot(Robot.from_urdf_text(text)))
-    with pytest.raises(InvalidInput, match="the joints of rows are swing, lift, bend"):
-        posterior.update(other)
 
 
 def test_rows_away_from_the_surface_are_refused(posterior):
@@ -299,17 +203,6 @@ def test_rows_that_state_another_noise_than_the_fit_are_warned_of(posterior, tmp
     save_posterior(posterior, tmp_path / "run")
     with pytest.warns(DataWarning, match="another noise"):
         load_posterior(tmp_path / "run").update(other)
-
-
-@pytest.mark.parametrize("noise", [Noise(0.05), Noise(0.05, learn=True), Noise(None, learn=True)], ids=repr)
-def test_a_level_that_was_given_or_learned_is_meant(noise):
-    data = arm_data(15, seed=16)
-    posterior = learned(data, model=data.model.with_forces(JointForces(), noise=noise))
-    rows = data.rows(slice(12, 15))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        grown = posterior.update(stating(rows, rows.noise_std * 10.0))
-    assert_same(grown, posterior.update(stating(rows, None)), data)
 
 
 def test_rows_that_state_their_own_noise_are_as_noisy_as_they_say():

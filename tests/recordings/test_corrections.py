@@ -27,6 +27,7 @@ def test_orientation_and_axes_of_a_base_replace():
     by_name = ColumnMapping().corrected_by({"orientation": {"q": ("wxyz",)}}, ("pan", "lift", "bend"), COLUMNS)
     assert by_name.q == ("q1", "q2", "q3")
     words = parse_arguments(["import", "log.csv", *found.flags(), "--out", "o.h5"])
+    words = words.columns
     assert (words.orientation, words.axes, words.ned) == ("wxyz", "v=world,a=imu", True)
 
 
@@ -53,4 +54,4 @@ def test_an_order_names_the_columns_that_were_read():
 )
 def test_flags_state_the_mapping(mapping):
     command = parse_arguments(["import", "log.csv", *mapping.flags(), "--out", "log.h5"])
-    assert command._flags() == mapping
+    assert command.columns._flags() == mapping

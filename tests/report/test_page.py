@@ -3,8 +3,6 @@
 import base64
 import io
 import re
-import urllib.request
-from threading import Event, Thread
 
 import numpy as np
 import pytest
@@ -13,16 +11,15 @@ from PIL import Image
 from forcegp import Dataset, score
 from forcegp.errors import InvalidInput
 from forcegp.report import (
-    Finding,
     Page,
     Table,
     is_page,
     model_page,
     recorded_scene,
     scores_sentence,
-    serve,
     write_page,
 )
+from forcegp.scores import model_pictures
 
 
 def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
@@ -45,7 +42,7 @@ def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
 
 def test_text_is_escaped(tmp_path):
     evil = "<script>alert(1)</script>"
-    page = Page(evil, evil, [Finding(evil, evil)], tables=[Table(evil, [evil], [[evil]])], details={"x": evil})
+    page = Page(evil, evil, [(evil, evil)], tables=[Table(evil, [evil], [[evil]])], details={"x": evil})
     write_page(tmp_path / "report.html", page)
     text = (tmp_path / "report.html").read_text()
     assert "<script>" not in text
@@ -66,53 +63,17 @@ def test_own_pages_are_recognised_and_kept(page, tmp_path):
 def test_what_cannot_be_drawn_is_named(swinging, friction):
     keep = np.sort(np.random.default_rng(0).choice(len(swinging), 300, replace=False))
     uneven = swinging.rows(keep)
-    page = model_page(friction, uneven, title="t", best="b")
+    pictures, missing = model_pictures(friction, uneven)
+    page = model_page(friction, uneven, pictures, missing=missing, title="t", best="b")
     assert len(page.pictures) == 2
     assert any(note.startswith("motions ahead: not drawn, because") for note in page.scene_notes)
 
 
 def test_the_sentence_is_true(swinging, friction):
     scores = score(friction, swinging, horizons=())
-    sentence = scores_sentence(scores, "rad/s²")
+    sentence = scores_sentence(scores)
     assert f"is {scores.value('mae'):.3g} rad/s²" in sentence
     assert f"a factor {scores.value('known_physics_mae') / scores.value('mae'):.3g} less" in sentence
-
-
-def test_the_viewer_serves_and_moves(swinging, friction):
-    recorded, ready, stop, urls = recorded_scene(swinging, friction, seconds=1.0), Event(), Event(), []
-
-    def opened(url):
-        urls.append(url)
-        ready.set()
-
-    thread = Thread(target=serve, args=(recorded,), kwargs={"ready": opened, "until": stop.is_set})
-    thread.start()
-    assert ready.wait(30)
-    try:
-        with urllib.request.urlopen(urls[0], timeout=10) as answer:
-            assert b"<html" in answer.read().lower()
-    finally:
-        stop.set()
-        thread.join(30)
-    assert not thread.is_alive()
-
-
-def test_controls_show_the_row_of_the_time(swinging, friction):
-    from forcegp.report.scene import viser_server
-    from forcegp.report.viewer import Controls
-
-    recorded = recorded_scene(swinging, friction, seconds=1.0)
-    with viser_server() as server:
-        controls = Controls(server, recorded)
-        controls.at(0.5)
-        assert recorded.time[controls.row] == pytest.approx(0.5, abs=0.04)
-        pose = recorded.poses[controls.row, -1]
-        np.testing.assert_allclose(controls.nodes.links[-1].position, pose[:3, 3], atol=1e-6)
-        controls.time.value = float(recorded.time[-1])
-        controls.tick(0.1)
-        assert controls.time.value == 0.0  # it begins again
-        controls.nodes.show_group(0, False, controls.row)
-        assert not controls.nodes.arrows[0][0].visible
 
 
 def test_a_dataset_alone_has_a_page(swinging):

@@ -3,12 +3,12 @@
 import pinocchio as pin
 import pytest
 import torch
-from tests.robots.robot_models import CHAIN, MODELS, TREE
+from tests.robots.robot_models import MODELS
 
 from forcegp.errors import InvalidInput, RobotModelError, UnstatedBase
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.robots.base import BaseChoice
+from forcegp.robots.layout import BaseChoice
 
 BODY = '<inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 
@@ -107,17 +107,3 @@ def test_a_file_that_says_so_itself_is_not_asked():
     welded = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'), base="fixed")
     q = torch.zeros(2).double()
     assert torch.equal(welded.mass_matrix(q), Robot.from_urdf_text(text).mass_matrix(q))
-
-
-def test_free_joints_elsewhere_can_be_locked_at_zero():
-    text = CHAIN.replace('name="tilt" type="revolute"', 'name="tilt" type="planar"')
-    robot = Robot.from_urdf_text(text, locked={"tilt": 0.0})
-    assert robot.joint_names == ("slide", "spin", "skew")
-    with pytest.raises(InvalidInput, match="joint 'tilt' is planar, so it can be locked at 0 alone"):
-        Robot.from_urdf_text(text, locked={"tilt": 0.1})
-
-
-@pytest.mark.parametrize("base", ["Fixed", "free", 1])
-def test_other_bases_are_refused(base):
-    with pytest.raises(InvalidInput, match="give one of fixed, floating, planar, spherical"):
-        Robot.from_urdf_text(TREE, base=base)

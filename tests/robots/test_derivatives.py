@@ -6,7 +6,7 @@ import torch
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS
 from torch.autograd import gradcheck, gradgradcheck
-from torch.func import hessian, jacfwd, jacrev, vmap
+from torch.func import jacfwd, jacrev
 
 from forcegp.robots import Robot
 
@@ -53,21 +53,3 @@ def test_frame_functions_are_differentiable(chain):
     assert gradcheck(lambda q: robot.frame_pose(q, "tool"), [q])
     assert gradcheck(lambda q, p: robot.frame_jacobian(q, "tool", p), [q, point])
     assert gradcheck(lambda q, v, p: robot.frame_bias_acceleration(q, v, "tool", p), [q, v, point])
-
-
-def test_vmap_and_nested_transforms_agree_with_the_batch(chain):
-    robot, q, v, tau = chain
-    mapped = vmap(robot.forward_dynamics)(q, v, tau)
-    torch.testing.assert_close(mapped, robot.forward_dynamics(q, v, tau))
-    for function in (robot.bias_forces, robot.gravity_forces, robot.mass_matrix):
-        arguments = (q, v) if function == robot.bias_forces else (q,)
-        torch.testing.assert_close(vmap(function)(*arguments), function(*arguments))
-    for function in (robot.frame_pose, robot.frame_jacobian):
-        torch.testing.assert_close(vmap(lambda q, f=function: f(q, "tool"))(q), function(q, "tool"))
-    per_state = vmap(jacrev(robot.forward_dynamics))(q, v, tau)
-    torch.testing.assert_close(per_state, vmap(jacfwd(robot.forward_dynamics))(q, v, tau))
-    torch.testing.assert_close(per_state[1], jacrev(robot.forward_dynamics)(q[1], v[1], tau[1]))
-    second = hessian(lambda v: robot.bias_forces(q[0], v)[0])(v[0])
-    assert second.shape == (robot.nv, robot.nv)
-    # bias forces are quadratic in v: the Hessian does not depend on it
-    torch.testing.assert_close(second, hessian(lambda v: robot.bias_forces(q[0], v)[0])(v[1]))

@@ -7,7 +7,7 @@ import torch
 from tests.robots.robot_models import CHAIN, TREE
 from tests.robots.test_urdf_errors import SMALL
 
-from forcegp import Actuation, Dataset, Model, RigidBodies, Torques, errors, fit
+from forcegp import errors
 from forcegp.robots import Robot
 from forcegp.robots.inertia import standard_of_pseudo_inertia
 
@@ -142,22 +142,6 @@ def test_a_gear_reflects_inertia_damping_and_friction():
     assert robot.link("rotor").joint == "gear"
     assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(0.1 + 400 * 0.01)
     assert (robot.joint("hinge").damping, robot.joint("hinge").friction) == pytest.approx((80.0, 10.0))
-
-
-def test_robots_with_mimics_are_stored_written_and_identified(tmp_path):
-    robot = Robot.from_urdf_text(with_mimics(CHAIN, CHAIN_MIMICS))
-    again = Model.from_json(Model(robot).to_json()).robot
-    assert again.tree.equals(robot.tree)
-    robot.to_urdf(tmp_path / "chain.urdf")
-    assert Robot.from_urdf(tmp_path / "chain.urdf").tree.equals(robot.tree)
-    assert not robot.tree.equals(Robot.from_urdf_text(with_mimics(CHAIN, {"slide": ("tilt", 0.4, 0.0)})).tree)
-    q, v, u = np.random.default_rng(8).normal(size=(3, 400, robot.nv))
-    a = robot.forward_dynamics(*map(torch.tensor, (q, v, u))).numpy()
-    data = Dataset(q=q, v=v, u=u, a=a, time=0.01 * np.arange(400), model=Model(robot))
-    found = fit(Model(robot, forces=(Actuation(), RigidBodies(learn="all"))), data, Torques())
-    states = [torch.tensor(x[:50]) for x in (q, v, u)]
-    error = found.model.robot.forward_dynamics(*states).numpy() - a[:50]
-    assert np.abs(error).max() < 1e-3 * np.abs(a).max()
 
 
 @pytest.mark.parametrize(

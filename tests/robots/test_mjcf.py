@@ -95,16 +95,6 @@ def test_limits_names_and_losses():
     assert (dog.base, dog.position_names[:3]) == ("floating", ("trunk_free.x", "trunk_free.y", "trunk_free.z"))
 
 
-def test_sites_are_frames():
-    robot, model = read(QUADRUPED), compiled(QUADRUPED)
-    oracle, (q, v, _) = MujocoOracle(model), states(robot)
-    oracle.at(q[0].numpy(), v[0].numpy())
-    for site in range(model.nsite):
-        pose = robot.frame_pose(q[0], model.site(site).name)
-        np.testing.assert_allclose(pose[:3, 3], oracle.data.site_xpos[site], atol=1e-12)
-        np.testing.assert_allclose(pose[:3, :3].flatten(), oracle.data.site_xmat[site], atol=1e-12)
-
-
 HINGE = '<mujoco><worldbody><body name="a"><joint name="j" {0}/>{1}</body></worldbody>{2}</mujoco>'
 BALL = '<geom size=".1"/>'
 LOSSES = {
@@ -209,12 +199,3 @@ def test_files_include_others_and_are_found_by_their_root_element(tmp_path):
     assert Robot.from_file(tmp_path / "arm.xml").nv == 7
     with pytest.raises(MalformedUrdf, match="from_mjcf reads"):
         Robot.from_urdf(tmp_path / "arm.mjcf")
-
-
-def test_a_warning_of_mujoco_becomes_a_note_and_no_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    text = HINGE.format("", BALL, '<compiler settotalmass="3"/>')
-    with pytest.warns(RobotFileWarning, match="MuJoCo warns"):
-        robot = Robot.from_mjcf_text(text)
-    assert robot.link("a").mass == pytest.approx(3.0)
-    assert not list(tmp_path.iterdir())

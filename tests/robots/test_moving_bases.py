@@ -1,7 +1,6 @@
 """Floating, planar and spherical joints against Pinocchio, and the manifold of their positions."""
 
 from contextlib import nullcontext
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -176,14 +175,6 @@ def test_integrate_and_difference(pair):
         close(back[k], pin.difference(pair.model, q, flipped[k])[pair.to_v], 10.0)
 
 
-def test_small_and_no_steps_come_back(pair):
-    for size in (0.0, 1e-9, 1e-4, 0.1, 0.5):  # turns below half a turn come back
-        step = size * pair.v
-        end = pair.robot.integrate(pair.q, step)
-        torch.testing.assert_close(pair.robot.difference(pair.q, end), step, rtol=1e-9, atol=1e-13)
-        torch.testing.assert_close(pair.robot.normalized(end), end, rtol=0, atol=1e-14)
-
-
 def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
     def moved(step, k):
         return pair.robot.forward_dynamics(pair.robot.integrate(pair.q[k], step), pair.v[k], pair.tau[k])
@@ -193,15 +184,6 @@ def test_derivatives_of_forward_dynamics_on_the_manifold(pair):
         pin.computeABADerivatives(pair.model, pair.data, q, v, tau)
         found = torch.func.jacrev(moved)(torch.zeros(pair.robot.nv, dtype=torch.float64), k)
         close(found, pair.data.ddq_dq[order], 100.0)
-
-
-def test_a_compiled_robot_refuses_turns_of_other_length(pair, compiled):
-    if pair.robot.space.is_vector_space:
-        return
-    q = 1.01 * pair.q
-    for given in (q, q[0].contiguous(), q[0].float()):
-        with pytest.raises(InvalidInput, match="of length 1"):
-            compiled.mass_matrix(given)
 
 
 def test_the_chart_is_that_of_the_exponential(pair):
@@ -221,31 +203,6 @@ def test_turns_of_other_length_are_refused():
     with pytest.raises(InvalidInput, match=r"base\.qx, base\.qy.*length 0\.7.*normalized"):
         robot.mass_matrix(q)
     robot.mass_matrix(robot.normalized(q))
-
-
-def test_energy_is_invariant_to_where_the_base_is():
-    """Gravity forces turn with the base; the mass matrix in body axes does not change at all."""
-    robot = Robot.from_urdf_text(LIMBS, base="floating")
-    generator = torch.Generator().manual_seed(0)
-    q = robot.random(generator, 2)
-    q[1, 7:] = q[0, 7:]
-    M = robot.mass_matrix(q)
-    torch.testing.assert_close(M[0], M[1], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["floating", "spherical"])
-def test_a_joint_of_several_degrees_on_a_post_is_stored_as_it_is(kind):
-    """Neither welded nor given a base of its own."""
-    post = '<link name="floor"/><joint name="post" type="fixed"><parent link="floor"/><child link="stand"/></joint>'
-    mount = f'<link name="stand"/><joint name="mount" type="{kind}"><parent link="stand"/><child link="trunk"/></joint>'
-    text = LIMBS.replace("<link", f"{post}{mount}<link", 1)
-    root = ElementTree.fromstring(LIMBS)
-    children = {joint.find("child").get("link") for joint in root.findall("joint")}
-    (base,) = {link.get("name") for link in root.findall("link")} - children
-    robot = Robot.from_urdf_text(text.replace('child link="trunk"', f'child link="{base}"'))
-    again = Robot.from_stored(robot.to_stored())
-    assert (again.nv, again.joint_names) == (robot.nv, robot.joint_names)
-    assert robot.joint_names[0].startswith("mount.")
 
 
 @pytest.mark.parametrize("axis", ["0 0 1", "1 0 0", "0.6 0 -0.8", None])

@@ -5,15 +5,13 @@ import datetime
 import numpy as np
 import pytest
 import torch
-from tests.data.samples import LINK, TWO_JOINTS, columns, dataset
+from tests.data.samples import LINK, TWO_JOINTS, dataset
 from tests.posterior.arm import arm_data
 
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.model import Model
-from forcegp.robots import Robot
-from forcegp.robots.arguments import whole_number
 
 TEXT = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow="revolute")
 
@@ -39,11 +37,6 @@ def test_masked_entries_of_a_dataset_are_refused(name):
     given = {"truth": {"a": masked}} if name == "truth" else {name: masked}
     with pytest.raises(DatasetError, match=r"has 1 masked values, the first at \(3, 1\); .* drop these rows"):
         dataset(**given)
-
-
-def test_a_mask_that_hides_nothing_is_no_mask():
-    given = columns()["u"]
-    np.testing.assert_array_equal(dataset(u=np.ma.masked_array(given)).u, given)
 
 
 WRONG = [
@@ -81,32 +74,6 @@ def test_a_prediction_that_is_not_finite_is_an_error(posterior, state):
         posterior.predict(q + 1e308, v, u)
 
 
-@pytest.mark.usefixtures("unchecked")  # integers are promised nowhere
-@pytest.mark.parametrize("kind", [np.float32, np.float16, np.int64])
-def test_numbers_of_any_precision_are_converted_exactly_everywhere(posterior, data, state, kind):
-    given = tuple(x.astype(kind) for x in state)
-    exact = tuple(torch.tensor(x.astype(np.float64)) for x in given)
-    tensors = tuple(torch.tensor(x) for x in given)
-    robot, predictor = data.model.robot, posterior.predictor(compile=False)
-    expected = posterior.predict(*exact, covariance=False).mean
-    for same in (given, tensors):
-        assert torch.equal(posterior.predict(*same, covariance=False).mean, expected)
-        assert torch.equal(predictor.mean(*same), predictor.mean(*exact))
-    assert torch.equal(data.model.dynamics(*tensors).H, data.model.dynamics(*exact).H)
-    assert torch.equal(robot.inverse_dynamics(*tensors), robot.inverse_dynamics(*exact))
-    assert torch.equal(robot.forward_dynamics(*tensors), robot.forward_dynamics(*exact))
-    held = dataset(q=columns()["q"].astype(kind)).q
-    assert held.dtype == np.float64
-    np.testing.assert_array_equal(held, columns()["q"].astype(kind))
-
-
-@pytest.mark.parametrize("given", [{"armature": "10"}, {"gravity": "123"}, {"gravity": [True, False, True]}])
-def test_text_and_truth_values_are_no_vector(given):
-    (name,) = given
-    with pytest.raises(InvalidInput, match=rf"{name} is .*; give \d finite numbers"):
-        Robot.from_urdf_text(TEXT, **given)
-
-
 @pytest.mark.parametrize(
     ("argument", "given"),
     [
@@ -129,12 +96,6 @@ def test_text_and_truth_values_are_no_vector(given):
 def test_numbers_of_a_fit_are_integers_in_their_range(data, kind, argument, given):
     with pytest.raises(InvalidInput, match=rf"`{argument}=.*` must be an integer"):
         fit(kind(data.model), data, **{argument: given})
-
-
-def test_integers_of_numpy_are_integers():
-    assert whole_number("points", np.int64(3), 1) == 3
-    with pytest.raises(InvalidInput, match=r"`points=(np\.)?True_?`"):
-        whole_number("points", np.True_, 1)
 
 
 def test_inside_vmap_the_remedy_is_stated(posterior, data):

@@ -10,16 +10,14 @@ from tests.robots.test_base import LOOSE
 from tests.robots.test_urdf_errors import SMALL, changed
 
 from forcegp.errors import (
-    InvalidNumber,
     MissingInertia,
     NonPhysicalInertia,
     RobotFileWarning,
     RobotModelError,
-    UnexpandedXacro,
 )
 from forcegp.robots import Robot
 from forcegp.robots.problems import LISTED, Problems
-from forcegp.robots.xml_text import without_comments
+from forcegp.robots.urdf import without_comments
 
 FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'
 FRAME = '<link name="frame"/><joint name="slip" type="prismatic"><parent link="FL_foot"/><child link="frame"/></joint>'
@@ -60,12 +58,6 @@ def test_what_must_be_corrected_in_the_file_leaves_no_remedy():
         Robot.from_urdf_text(MANY.replace('mass value="1.0"', 'mass value="two"', 1))
     assert caught.value.remedy == {}
     assert "inertias='nearest'" in str(caught.value)
-
-
-def test_a_link_that_cannot_be_read_is_not_reported_again():
-    with pytest.raises(InvalidNumber, match="'two', not a number") as caught:
-        Robot.from_urdf_text(changed('value="2"', 'value="two"'))
-    assert len(caught.value.problems) == 1
 
 
 def test_many_alike_are_counted():
@@ -115,26 +107,6 @@ def test_an_undefined_parent_is_offered_as_the_root():
         Robot.from_urdf_text(SMALL, root="base")
 
 
-@pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_a_world_that_drake_knows_and_the_file_does_not_define_is_offered_as_the_root(kind):
-    weld = f'<joint name="weld" type="{kind}"><parent link="world"/><child link="trunk"/></joint></robot>'
-    text = LOOSE["legs"].replace("</robot>", weld)
-    with pytest.raises(
-        RobotModelError, match="the link 'world' is a parent, and the file does not define it"
-    ) as caught:
-        Robot.from_urdf_text(text)
-    assert caught.value.remedy == {"root": "world"}  # whether it is bolted is not asked: the joint answers
-    robot = Robot.from_urdf_text(text, **caught.value.remedy)
-    assert robot.base == kind
-    assert robot.nv == (2 if kind == "fixed" else 8)
-
-
-def test_a_misspelt_parent_is_no_root():
-    with pytest.raises(RobotModelError, match="did you mean 'base'") as caught:
-        Robot.from_urdf_text(changed('parent link="base"', 'parent link="bsae"'))
-    assert caught.value.remedy == {}
-
-
 def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
     text = re.sub("<inertia .*/>", "", SMALL)
     with pytest.raises(NonPhysicalInertia, match="add it, or take the mass as a point") as caught:
@@ -143,15 +115,6 @@ def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
         robot = Robot.from_urdf_text(text, **caught.value.remedy)
     assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(2 * 0.1**2, rel=1e-12)
     assert robot.tree.equals(Robot.from_urdf_text(robot.to_urdf()).tree)
-
-
-def test_definitions_that_xacro_left_do_not_matter():
-    left = '<xacro:arg name="a" default="b"/><xacro:property name="m" value="${1 + 1}"/>'
-    xmlns = ' name="small" xmlns:xacro="http://www.ros.org/wiki/xacro"'
-    robot = Robot.from_urdf_text(SMALL.replace("</robot>", f"{left}</robot>").replace(' name="small"', xmlns))
-    assert robot.joint_names == ("hinge",)
-    with pytest.raises(UnexpandedXacro):
-        Robot.from_urdf_text(f'<robot name="r">{left}</robot>')
 
 
 def test_the_only_joint_is_not_offered_to_be_locked():
@@ -190,15 +153,6 @@ def test_comments_are_cut_in_linear_time_and_keep_their_lines():
     assert without_comments("a<!-- 1\n2 -->b<!--") == "a\nb<!--"
     assert without_comments("<!--->-->") == ""
     assert len(without_comments("<!--" * 200_000)) == 800_000  # each start was searched to the end of the text before
-
-
-def test_a_link_that_stands_still_needs_no_inertia():
-    text = changed('<link name="base"/>', '<link name="base"><inertial><mass value="3"/></inertial></link>')
-    robot = Robot.from_urdf_text(text)
-    assert not torch.tensor(robot.link("base").inertia).any()
-    assert "nan" not in robot.to_mjcf().lower()
-    frame = changed('<link name="base"/>', '<link name="base"><inertial><mass value="0"/></inertial></link>')
-    assert Robot.from_urdf_text(frame).nv == robot.nv
 
 
 def test_comments_need_not_have_the_encoding_of_the_file(tmp_path):

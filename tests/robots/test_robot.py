@@ -34,58 +34,6 @@ def test_joints_come_depth_first_and_branches_in_file_order(tree):
     assert tree.name == "tree"
 
 
-def test_joint_order_does_not_change_the_physics(tree):
-    # the same joints, with the branches in the other order
-    wrist = TREE.index('<joint name="right_shoulder"'), TREE.index('<joint name="left_shoulder"')
-    end = TREE.index('<joint name="left_gripper"')
-    swapped = Robot.from_urdf_text(TREE[: wrist[0]] + TREE[wrist[1] : end] + TREE[wrist[0] : wrist[1]] + TREE[end:])
-    assert swapped.joint_names[1] == "left_shoulder"
-    columns = [tree.joint_names.index(name) for name in swapped.joint_names]
-    q = torch.linspace(-1, 1, 6, dtype=torch.float64)
-    expected = tree.mass_matrix(q)[columns][:, columns]
-    torch.testing.assert_close(swapped.mass_matrix(q[columns]), expected, rtol=1e-13, atol=1e-13)
-
-
-def test_limits_damping_and_friction_are_visible(tree):
-    torso = tree.joint("torso")
-    assert (torso.type, torso.parent, torso.child) == ("revolute", "base", "body")
-    assert (torso.lower, torso.upper) == (-np.inf, np.inf)
-    assert (torso.velocity_limit, torso.effort_limit, torso.damping, torso.friction) == (2.0, 100.0, 0.7, 0.2)
-    wrist = tree.joint("right_wrist")
-    assert (wrist.lower, wrist.upper, wrist.axis) == (-1.0, 2.0, (0.0, 0.0, -1.0))
-    shoulder = tree.joint("right_shoulder")
-    assert shoulder.type == "continuous"
-    assert (shoulder.effort_limit, shoulder.damping) == (np.inf, 0.0)
-    np.testing.assert_allclose(shoulder.axis, np.array([1, 2, -0.5]) / np.sqrt(5.25))
-    assert tree.joint("left_shoulder").axis == (1.0, 0.0, 0.0)  # the format's default
-    assert tree.joint("second_finger").upper == 0.0  # the format's default where only one is given
-
-
-def test_links_show_who_moves_them_and_their_inertia(tree):
-    camera = tree.link("camera")
-    assert camera.joint == "torso"
-    assert camera.mass == 0.4
-    assert camera.center_of_mass == (0.01, 0.0, 0.0)
-    c, s = np.cos(0.5), np.sin(0.5)
-    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-    inertia = np.array([[0.0004, 0, 0], [0, 0.0003, 0.00005], [0, 0.00005, 0.0002]])
-    np.testing.assert_allclose(camera.inertia, turn @ inertia @ turn.T, atol=1e-18)
-    assert tree.link("base").joint is None
-    assert tree.link("lens").mass == 0.0
-
-
-def test_massless_frame_can_be_given_inertia_and_frames_stay(chain):
-    given = loaded(chain, "tool")
-    assert given.link("tool").mass == pytest.approx(0.9, rel=1e-14)
-    q = torch.linspace(-1, 1, 4, dtype=torch.float64)
-    more = given.gravity_forces(q) - chain.gravity_forces(q)
-    places = torch.tensor([given.link("tool").center_of_mass], dtype=torch.float64)
-    lift = chain.frame_jacobian(q, "tool", places[0])[2]
-    torch.testing.assert_close(more, 9.81 * 0.9 * lift, rtol=1e-12, atol=1e-12)
-    for frame in chain.link_names:
-        assert torch.equal(given.frame_pose(q, frame), chain.frame_pose(q, frame))
-
-
 def test_locked_joint_is_fixed_where_it_is_locked(tree):
     locked = Robot.from_urdf_text(TREE, locked={"torso": 0.4, "right_wrist": -0.3})
     assert locked.joint_names == ("right_shoulder", "left_shoulder", "left_gripper", "second_finger")
@@ -122,31 +70,6 @@ def test_robot_is_immutable_and_survives_pickling(chain):
 
 
 # ---------------------------------------------------------------------- batches
-
-
-@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (1, 1, 2), (0,), (3, 0)])
-def test_any_batch_shape(tree, batch):
-    q, v, a = torch.randn(3, *batch, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    n = tree.nv
-    shapes = {
-        (*batch, n, n): [tree.mass_matrix(q)],
-        (*batch, n): [
-            tree.bias_forces(q, v),
-            tree.gravity_forces(q),
-            tree.inverse_dynamics(q, v, a),
-            tree.forward_dynamics(q, v, a),
-        ],
-        (*batch, 4, 4): [tree.frame_pose(q, "lens"), tree.frame_pose(q, "base")],
-        (*batch, 6, n): [tree.frame_jacobian(q, "lens", (1.0, 0.0, 0.0)), tree.frame_jacobian(q, "base")],
-        (*batch, 6): [tree.frame_bias_acceleration(q, v, "lens"), tree.frame_bias_acceleration(q, v, "base")],
-    }
-    for shape, values in shapes.items():
-        for value in values:
-            assert value.shape == shape
-    # each state on its own gives the same
-    flat = tree.forward_dynamics(q, v, a).reshape(-1, n)
-    for i, state in enumerate(zip(*(x.reshape(-1, n) for x in (q, v, a)), strict=True)):
-        torch.testing.assert_close(flat[i], tree.forward_dynamics(*state), rtol=1e-11, atol=1e-11)
 
 
 def test_batches_broadcast(chain):
@@ -236,18 +159,6 @@ def test_wrong_inputs(chain, value, message):
             function(*arguments)
 
 
-def test_wrong_batches_points_and_parameters(chain):
-    two, three = torch.zeros(2, 4, dtype=torch.float64), torch.zeros(3, 4, dtype=torch.float64)
-    with pytest.raises(InvalidInput, match=r"do not broadcast: q \(2,\), v \(3,\)"):
-        chain.bias_forces(two, three)
-    with pytest.raises(InvalidInput, match=r"do not broadcast: the states \(2,\), tau \(3,\)"):
-        chain.forward_dynamics(two, two, three)
-    with pytest.raises(InvalidInput, match=r"point is .* give 3 finite numbers"):
-        chain.frame_jacobian(two, "tool", (1.0, 2.0))
-    with pytest.raises(InvalidInput, match=r"point has shape \(2,\)"):
-        chain.frame_jacobian(two, "tool", torch.zeros(2, dtype=torch.float64))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -272,15 +183,3 @@ def test_singular_mass_matrix_is_an_error():
     nowhere = nowhere * torch.nan
     with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
         Robot.from_urdf_text(body).forward_dynamics(nowhere, one, one)
-
-
-def test_constants_move_to_another_device(chain):
-    # the meta device computes shapes only; it is there on every machine
-    moved = chain.to("meta")
-    q = torch.zeros(5, 4, dtype=torch.float64, device="meta")
-    assert moved.device.type == "meta"
-    assert moved.mass_matrix(q).device.type == "meta"
-    assert moved.frame_jacobian(q, "tool", (0.0, 0.0, 0.1)).shape == (5, 6, 4)
-    assert chain.device.type == "cpu"
-    with pytest.raises(InvalidInput, match="q is on cpu but the robot on meta"):
-        moved.mass_matrix(torch.zeros(4, dtype=torch.float64))

@@ -3,28 +3,17 @@
 import numpy as np
 import pytest
 import torch
-from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import MODELS
 
-from forcegp.errors import InvalidInput
 from forcegp.robots import Robot
-from forcegp.robots.arguments import locked_positions
 from forcegp.robots.inertia import (
-    inverse,
     pseudo_inertia_of_standard,
-    rotation_about,
     rotation_from_rpy,
     rpy_from_rotation,
     standard_of_pseudo_inertia,
-    transform,
 )
 
 LINK = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-
-
-def test_a_transform_times_its_inverse_is_the_identity():
-    pose = transform(rotation_about([0.6, 0.0, 0.8], 1.1), [1.0, -2.0, 3.0])
-    np.testing.assert_allclose(inverse(pose) @ pose, np.eye(4), atol=1e-14)
 
 
 def test_pseudo_inertia_of_standard_parameters():
@@ -41,24 +30,6 @@ def test_pseudo_inertia_of_standard_parameters():
     torch.testing.assert_close(standard_of_pseudo_inertia(expected), parameters, rtol=0.0, atol=1e-14)
 
 
-def test_arms_that_end_at_different_depths():
-    """Three joints below the base, and one more below each of the first two."""
-    links = "".join(f'<link name="{name}">{LINK}</link>' for name in "abcde")
-    joints = "".join(
-        f'<joint name="{parent}{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="0.{k} 0.2 -0.1"/><axis xyz="0 {k} 1"/>'
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
-        for k, (parent, child) in enumerate([("base", "a"), ("base", "b"), ("base", "c"), ("a", "d"), ("b", "e")], 1)
-    )
-    text = f'<robot name="arms"><link name="base"/>{links}{joints}</robot>'
-    robot = Robot.from_urdf_text(text)
-    oracle = Oracle(text, robot)
-    q, v = torch.tensor(np.random.default_rng(0).normal(size=(2, 5)))
-    np.testing.assert_allclose(robot.mass_matrix(q), oracle.mass_matrix(q.numpy()), rtol=1e-10, atol=1e-12)
-    bias = robot.mass_matrix_and_bias(q, v)[1]
-    np.testing.assert_allclose(bias, oracle.bias_forces(q.numpy(), v.numpy()), rtol=1e-10, atol=1e-11)
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_the_regressor_times_any_parameters_is_the_joint_force(model):
     robot = Robot.from_urdf_text(MODELS[model]())
@@ -70,12 +41,6 @@ def test_the_regressor_times_any_parameters_is_the_joint_force(model):
     expected = (mass @ a[..., None])[..., 0] + bias
     found = torch.einsum("...ikp,kp->...i", kinematics.torque_regressor(a), parameters)
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize("position", ["far", None, float("inf")])
-def test_a_locked_position_that_is_no_number_is_named(position):
-    with pytest.raises(InvalidInput, match=r"locked\['slide'\] is .*finite position"):
-        locked_positions({"slide": position})
 
 
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 2.5])

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from tests.fit.test_motion_fit import bump, recording
@@ -12,8 +13,8 @@ from forcegp.errors import FileFormatError, InvalidInput, OutdatedWarning
 from forcegp.fit import fit as fit_model
 from forcegp.jobs import JobStore, code_digest
 from forcegp.scores import Candidate, Training
-from forcegp.scores.candidates import candidate
-from forcegp.scores.score import KIND
+from forcegp.scores.candidates import candidate, identified_model
+from forcegp.scores.score import KIND, unseen_rotors
 
 USUAL = "bodies+viscous+coulomb+rotor@accelerations"
 QUICK = {"points": 15, "horizons": (0.1, 0.2), "starts": 2, "restarts": 1, "iterations": 5, "split": "episodes:1"}
@@ -74,7 +75,7 @@ def test_a_model_that_fails_is_a_row_that_says_why_and_the_page_holds_all(found)
     assert "* broken failed in 1 of 2 runs (episodes-1, seed 1): ZeroDivisionError: nothing left" in page
     assert "trained on whole episodes (0), tested on others (1)" in page
     assert json.loads((folder / "results.json").read_text()) == json.loads(json.dumps(scores.to_dict()))
-    for name in ("errors", "calibration", "motions"):
+    for name in ("errors", "motions"):
         assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert f"({name}.png)" in page
 
@@ -127,7 +128,7 @@ def test_only_what_depends_on_changed_code_of_somebody_else_is_computed_anew(dat
     scored(models, data, tmp_path / "out")
     before, digest = changed(tmp_path / "out"), code_digest
     own = fit_broken.__module__
-    monkeypatch.setattr("forcegp.jobs.job.code_digest", lambda *modules: "new" if own in modules else digest(*modules))
+    monkeypatch.setattr("forcegp.jobs.code_digest", lambda *modules: "new" if own in modules else digest(*modules))
     with pytest.warns(OutdatedWarning, match="1 of the results in .* by other code"):
         scored(models, data, tmp_path / "out")
     after = changed(tmp_path / "out")
@@ -148,7 +149,7 @@ def test_an_identification_that_fails_leaves_the_mass_matrix_as_given(data, tmp_
     def fail(name, model, rows):
         raise InvalidInput("too still")
 
-    monkeypatch.setattr("forcegp.scores.jobs.identified_model", fail)
+    monkeypatch.setattr("forcegp.scores.experiment.identified_model", fail)
     scores = scored(["given", "identified+gp:joint-friction"], data, tmp_path / "out")
     assert scores.about["mass_matrix"] == ["the model as given, because its identification failed (too still)"]
     assert len(scores.failures) == 2
@@ -248,3 +249,12 @@ def test_what_a_name_stands_for(name, kind, identification, all_rows):
 def test_models_without_anything_to_refine_are_refused(name):
     with pytest.raises(InvalidInput, match="nothing to refine on motions"):
         candidate(name, name, given_system(), "bodies")
+
+
+def test_force_errors_name_joints_whose_rotors_no_row_shows(data):
+    still = replace(data, a=0.0 * data.a)
+    _, unseen = identified_model("rotor+viscous@torques", given_system(), still)
+    assert unseen == [f"rotor.{name}" for name in data.joint_names]
+    (told,) = unseen_rotors([{"unseen": ["rotor.lift"]}, {"unseen": ["rotor.lift", "rotor.pan"]}])
+    assert "the rotors of lift, pan;" in told
+    assert unseen_rotors([{"unseen": []}, {"error": "no"}]) == []

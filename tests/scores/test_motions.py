@@ -15,8 +15,8 @@ from forcegp.fit import fit
 from forcegp.model import Model
 from forcegp.posterior import observing
 from forcegp.robots import Robot
+from forcegp.scores.experiment import OBSERVED, scored
 from forcegp.scores.motions import held_out_motions, motion_scores
-from forcegp.scores.one_model import OBSERVED, scored
 
 SLEDGE = """<robot name="sledge"><link name="base"/><link name="sledge"><inertial><mass value="{mass}"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>

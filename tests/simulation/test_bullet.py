@@ -8,7 +8,7 @@ import torch
 from forcegp.errors import MissingExtra, SimulationError
 from forcegp.robots import Robot
 from forcegp.simulation.bullet import BulletArm
-from forcegp.simulation.kuka_motion import TOOL_LINK, kuka_urdf
+from forcegp.simulation.kuka_surface import TOOL_LINK, kuka_urdf
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 
 pytest.importorskip("pybullet")

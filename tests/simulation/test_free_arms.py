@@ -10,7 +10,7 @@ from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.errors import InvalidInput
 from forcegp.robots import Robot
-from forcegp.simulation import SCENARIOS, FreeArmConfig, KukaSurfaceConfig
+from forcegp.simulation import FreeArmConfig, simulate
 
 TEXTS = {
     "ur5-free": files("forcegp.simulation").joinpath("ur5.urdf").read_text(),
@@ -19,7 +19,7 @@ TEXTS = {
 
 
 def simulated(arm, **options):
-    return SCENARIOS[arm].simulate(FreeArmConfig(arm=arm, **({"seconds": 1.0, "noise": 0.0} | options)))
+    return simulate(arm, **({"seconds": 1.0, "noise": 0.0} | options))
 
 
 @pytest.mark.parametrize("arm", TEXTS)
@@ -95,10 +95,3 @@ def test_seeds_and_noise_have_streams_of_their_own():
 def test_configurations_that_mean_nothing_are_refused(options, message):
     with pytest.raises(InvalidInput, match=message):
         FreeArmConfig(**options)
-
-
-def test_a_scenario_takes_its_own_configuration():
-    with pytest.raises(InvalidInput, match="takes FreeArmConfig"):
-        SCENARIOS["ur5-free"].simulate(KukaSurfaceConfig())
-    with pytest.raises(InvalidInput, match="takes KukaSurfaceConfig"):
-        SCENARIOS["kuka-surface"].simulate(FreeArmConfig(arm="ur5-free"))

@@ -3,6 +3,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from benchmarks.plants import OF_PLANTS, JointFrictionLaw, PlantConfig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -15,8 +16,7 @@ from forcegp.forces.parameters import Coefficient
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.contact_forces import DryFriction, RoughPatch, ViscousFriction, multiplier_with_friction
-from forcegp.simulation.joint_friction import JointFrictionLaw, LawsOfJoints
-from forcegp.simulation.scenarios import OF_PLANTS
+from forcegp.simulation.joint_friction import LawsOfJoints
 
 STRIBECK = DryFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
 ROBOT = Robot.from_urdf_text(
@@ -70,7 +70,7 @@ def test_friction_takes_energy_and_dry_friction_is_tangential_with_its_coefficie
 
 
 def joint_law(name: str, **changes) -> JointFrictionLaw:
-    return JointFrictionLaw(KukaSurfaceConfig(joint_friction=name, **changes), ROBOT)
+    return JointFrictionLaw(PlantConfig(joint_friction=name, **changes), ROBOT)
 
 
 C, S, D = (np.array(getattr(KukaSurfaceConfig(), f"joint_{name}")) for name in ("coulomb", "static", "viscous"))

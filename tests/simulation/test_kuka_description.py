@@ -6,7 +6,7 @@ import torch
 from tests.simulation.test_bullet import numbers, urdf
 
 from forcegp.robots import Robot
-from forcegp.simulation.kuka_motion import kuka_urdf
+from forcegp.simulation.kuka_surface import kuka_urdf
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 
 pybullet_data = pytest.importorskip("pybullet_data")

@@ -9,7 +9,6 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, SimulationError
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.simulation.contact_forces import DryFriction, RoughPatch
-from forcegp.simulation.joint_friction import JointFrictionLaw
 
 pytest.importorskip("pybullet")
 
@@ -95,7 +94,7 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
 def test_joint_friction_is_its_law(scenes):
     data = scenes["none"]
     np.testing.assert_array_equal(
-        data.truth["Q_U.joint-friction"], -JointFrictionLaw(config("none"), data.model.robot).curve(data.v)
+        data.truth["Q_U.joint-friction"], config("none").joint_law(data.model.robot)(data.v, data.u, None, 0.0)
     )
 
 
@@ -150,7 +149,7 @@ def test_equal_seeds_give_equal_data(scenes):
     ("changes", "message"),
     [
         ({"friction": "wet"}, "no friction .wet. in the tool"),
-        ({"surface": "cone"}, "one of plane, tilted, sphere, none"),
+        ({"surface": "cone"}, "no surface 'cone'"),
         ({"contact": "bullet", "surface": "none"}, "needs a surface"),
         ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),
         ({"contact": "bullet", "patch_factor": 2.0}, "ideal contact"),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import statistics
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from typing_extensions import override
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.checks
@@ -19,22 +19,16 @@ import forcegp.evidence
 import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
-from forcegp.cli.auto_answer import (
-    answer_lines,
-    best_sentence,
-    default_models,
-    identification,
-    payload_text,
-    short_name,
-)
-from forcegp.cli.command import CONFIG, URDF, Resuming, unless_given
+from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
-from forcegp.cli.import_log import LogOptions
-from forcegp.cli.input_options import CandidateOptions, forces_of
-from forcegp.cli.payload import payload_dict, with_payload
+from forcegp.cli.import_log import stance_text
+from forcegp.cli.log_options import ColumnOptions, FilterOptions, with_delay_that_shows
+from forcegp.cli.payload import DRY, LAWS, payload_dict, with_payload
+from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
+from forcegp.scores.tables import number
 
 MOST_CORRECTIONS = 8
 SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "against_rival", "failures")
@@ -42,7 +36,7 @@ SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Auto(CandidateOptions, Resuming, LogOptions):
+class Auto(Command):
     """From logs and a robot to a validated model: import, check, prepare, identify, learn, score, report.
 
     Mistakes in the log (units, signs, order of joints) are reported with the command that corrects them; --correct
@@ -57,9 +51,13 @@ class Auto(CandidateOptions, Resuming, LogOptions):
       forcegp auto flight.csv --mapping columns.yaml --identified drone.json --out answer
     """
 
-    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "that of --identified", Path)] = None
-    """The robot that was recorded. Thrusters, actuators and contacts of another kind come with --identified."""
-    out: Annotated[Path, arg(metavar="FOLDER")] = field()
+    interrupted = "finished pieces are kept, and the same command resumes"
+    replaces = False
+
+    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
+    """Files, or folders of ROS 2 bags, of the robot of --robot. Thrusters, actuators and contacts of another kind come
+    with --identified."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder of results; an unfinished one resumes."""
     correct: bool = False
     """Correct mistakes in units, signs and the order of joints, and continue."""
@@ -67,29 +65,25 @@ class Auto(CandidateOptions, Resuming, LogOptions):
     """Continue although the log contains mistakes."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """Where a payload may be."""
-    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Low-pass filter. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
-    """Delay of u in the log, in s. auto: estimated where u are the torques of all joints and nothing is touched, else
-    0."""
-    lag: Annotated[str, arg(metavar="S|auto")] = "auto"
-    """Time constant in s with which actuators follow u. auto: estimated for thrusters, 0 for joints."""
-    every: Annotated[int | None, unless_given("N", "what the filter leaves", int)] = None
-    """Keep every N-th row, after the filter."""
+    robot: RobotOptions = RobotOptions()
+    columns: ColumnOptions = ColumnOptions()
+    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto", lag="auto")
+    models: CandidateOptions = CandidateOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        if self.robot is None and self.identified is None:
+        if self.robot.robot is None and self.robot.identified is None:
             raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
-        begin, preparation = time.process_time(), self._preparation()
+        begin = time.process_time()
+        preparation = (self.filter if self.filter.lag != "auto" else replace(self.filter, lag="0")).preparation()
         present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
         if self.out.is_file() or (present and "log.h5" not in present):
             raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-        model, mapping = self._model(), self._mapping(terminal)
+        model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
         assert model is not None
         for note in forces_of(model):
             terminal.note(note)
@@ -114,10 +108,11 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
         with terminal.progress("preparing"):
-            if self.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
-                timed = self.with_delay_that_shows(terminal, preparation, dataset)
+            if self.filter.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
+                timed = with_delay_that_shows(terminal, preparation, dataset)
             else:
-                timed = replace(preparation, lag="auto", delay=0.0 if self.delay == "auto" else preparation.delay)
+                delay = 0.0 if self.filter.delay == "auto" else preparation.delay
+                timed = replace(preparation, lag="auto", delay=delay)
             timed = replace(timed, stance="auto") if done["open_switches"] else timed
             rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
         named = forcegp.scores.named_model
@@ -165,7 +160,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress:
-                    how: dict[str, Any] = {"model": model, "options": self._options(), "report": progress}
+                    how: dict[str, Any] = {"model": model, "options": self.columns.options(), "report": progress}
                     dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
@@ -190,16 +185,10 @@ class Auto(CandidateOptions, Resuming, LogOptions):
 
     def _command(self, mapping: forcegp.ColumnMapping) -> str:
         """The same command with the columns, units and signs of the mapping."""
-        stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "robot", "out"}
-        others = [name for name in self.options if name not in stated]
-        robot = [] if self.robot is None else ["--robot", str(self.robot)]
-        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *robot]
-        return shlex.join([*words, *self.words(*(name for name in others if hasattr(type(self), name))),
-                           "--out", str(self.out)])  # fmt: skip
-
-    @override
-    def _preparation(self) -> forcegp.Preparation:
-        return super()._preparation() if self.lag != "auto" else replace(self, lag="0")._preparation()
+        stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "out"}
+        others = [name for name in options_of(Auto) if name not in stated]
+        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *self.words(*others)]
+        return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
@@ -209,13 +198,13 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         try:
             numbers = first.resolved(raw)
         except DatasetError as error:
-            if self.lag != "auto" or wanted.lag != "auto":
+            if self.filter.lag != "auto" or wanted.lag != "auto":
                 raise
             terminal.note(f"rotors are taken to follow at once: {error}")
             numbers = replace(first, lag=0.0).resolved(raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
-        numbers = replace(numbers, trim=max(self.trim, period), stance=wanted.stance)
-        every = numbers.thinning(raw) if self.every is None else wanted.every
+        numbers = replace(numbers, trim=max(self.filter.trim, period), stance=wanted.stance)
+        every = numbers.thinning(raw) if self.filter.every is None else wanted.every
         rows = replace(numbers, every=every).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.save(temporary)
@@ -227,7 +216,7 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         """The scores of the models, and the recommended one, learned from all rows and stored."""
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
-        models = self.candidates() or default_models(model)
+        models = self.models.names() or default_models(model)
         with terminal.progress("scoring") as report:
             scores = forcegp.score(
                 models, rows, split="auto", seeds=1, folder=self.out / "validation", overwrite=self.overwrite,
@@ -257,22 +246,23 @@ class Auto(CandidateOptions, Resuming, LogOptions):
         posterior, recording = forcegp.posterior.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
         names = {name: short_name(name) for name in scores.models}
-        following = [forcegp.report.Finding("Record the most informative motion:", command)]
+        following = [("Record the most informative motion:", command)]
         with terminal.progress("writing the report") as progress:
+            pictures, missing = forcegp.scores.model_pictures(posterior, recording, progress)
             page = forcegp.report.model_page(
                 posterior,
                 recording,
+                [*forcegp.scores.scores_pictures(scores), *pictures],
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
-                findings=[forcegp.report.Finding(*line) for line in answer],
-                pictures=forcegp.report.scores_pictures(scores),
+                findings=answer,
                 tables=[forcegp.report.scores_table(scores, names)],
                 next_steps=following if command.startswith("forcegp") else [],
                 details={
                     name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
                 },
-                shapes=self.robot,
-                progress=progress,
+                shapes=self.robot.robot,
+                missing=missing,
             )
             forcegp.report.write_page(self.out / "report.html", page)
 
@@ -285,3 +275,154 @@ class Auto(CandidateOptions, Resuming, LogOptions):
             terminal.note(f"no C program: {error}")
             return None
         return str(self.out / "c")
+
+
+INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
+FAR_WORSE = 4.0  # times the error of the joint in the middle, from which a joint is named
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+
+
+def short_name(name: str) -> str:
+    """What a model is called in the answer."""
+    laws, air = "gp:joint-friction" in name, "gp:aerodynamic" in name
+    learned = " and ".join(what for what, has in (("friction", laws), ("air forces", air)) if has)
+    return f"{learned} learned" if learned else {"given": "the URDF"}.get(name, name)
+
+
+def identification(model: forcegp.Model) -> str:
+    """What is found of the robot by itself, as `forcegp score --identification` takes it."""
+    laws = f"+{'+'.join(LAWS)}" if model.robot.single_joint_names else ""
+    return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
+
+
+def default_models(model: forcegp.Model) -> tuple[str, ...]:
+    """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given."""
+    friction = bool(model.robot.single_joint_names)
+    if forcegp.data.thruster_columns(model):
+        return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
+    return "given", "identified", *(["identified+gp:joint-friction"] if friction else [])
+
+
+def answer_lines(
+    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str, scores: forcegp.Scores
+) -> list[tuple[str, str]]:
+    """What was found, in ten lines."""
+    names, values, robot = dataset.joint_names, identified.estimates, identified.model.robot
+    import_, prepared = content["import"], content["preparation"]
+    deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
+    jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
+    seconds = content["seconds"]
+    rate = (len(dataset) - len(dataset.episodes)) / seconds
+    # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
+    flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
+    mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
+    late = prepared["delay"][0]
+    when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
+    on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
+    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
+    lag = max(prepared["lag"])
+    shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
+    filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
+
+    def each(field: str, pattern: str = "{:.3g}") -> str:
+        return ", ".join(pattern.format(values[f"{field}.{name}"].value) for name in joints)
+
+    joints, moving = robot.single_joint_names, robot.base != "fixed"
+    freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(names)} joints"
+    kinds = [robot.joint(name).type == "prismatic" for name in joints]
+    q, force = (" or ".join(dict.fromkeys(two[kind] for kind in kinds)) for two in (("rad", "m"), ("Nm", "N")))
+    of_joints = [
+        ("dry friction", f"{each(f'{DRY}.level')} {force}, near rest {each(f'{DRY}.breakaway')} more"),
+        ("viscous", f"{each('viscous')} {force} per {q}/s"),
+        ("rotors", f"{each('rotor')} {INERTIA.get(q, 'kg m² or kg')}"),
+    ]
+    mass, error = values.total_mass
+    by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
+    q = "rad or m" if moving else q
+    errors = "; ".join(
+        f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
+        for name in scores.models
+    )
+    best = scores.recommended
+    assert best is not None, "a model was scored"
+    covered = scores.value("coverage_95", model=best)
+    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
+    weak = ", ".join(list(values.by_body or {})[:3])
+    out = content["out"]
+    command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
+    command = "faster and larger motions, also of what hardly moved" if moving else command
+    return [
+        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
+        ("corrected", mistakes),
+        ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
+        *([("stance", stance_text(prepared))] if "stance" in prepared else []),
+        *(of_joints if joints else []),
+        *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
+        ("payload", held + by),
+        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {errors}"),
+        ("trust", f"{short_name(best)}{intervals}{far_worse(scores, best)}"),
+        ("record next", command + (f" (least is known of {weak})" if weak else "")),
+        ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
+    ]
+
+
+def far_worse(scores: forcegp.Scores, model: str) -> str:
+    """The joint whose acceleration is predicted far worse than that of the joint in the middle, if there is one."""
+    errors = zip(scores.joint_names, scores.columns("nrmse", model=model), strict=True)
+    known = {name: error for name, error in errors if error is not None}
+    worst = max(known, key=known.__getitem__, default="")
+    if not known or known[worst] <= FAR_WORSE * statistics.median(known.values()):
+        return ""
+    return f"; {worst} is predicted far worse than the others (nRMSE {known[worst]:.2g}): look at it"
+
+
+def best_sentence(scores: forcegp.Scores, dataset: forcegp.Dataset) -> str:
+    """Which model to trust, and how much better than the URDF it is on unseen time."""
+    best = scores.recommended
+    assert best is not None, "a model was scored"
+    name, motion, error = short_name(best), _motion(scores, best), _acceleration(scores, best)
+    wrong = "" if error is None else f"wrong by {error:.2g} of their standard deviation"
+    poor = error is not None and error >= 1.0  # no better than a = 0
+    if motion is None and poor:
+        return (
+            f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are {wrong}. "
+            "Forces, flags of stance, units or the robot's file are wrong."
+        )
+    if motion is None:
+        urdf = _acceleration(scores, "given")
+        against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
+        trust = f": on unseen time, accelerations are {wrong}{against}" if wrong else ""
+        return f"Trust the model “{name}”{trust}."
+    urdf = _motion(scores, "given")
+    against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
+    if urdf is None and "given" in scores.models:
+        against = "; with the URDF alone they diverge"
+    unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
+    ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
+    doubt = f" But its accelerations are {wrong}." if poor else ""
+    return f"Trust the model “{name}”: on unseen time, {ahead}.{doubt}"
+
+
+def _motion(scores: forcegp.Scores, model: str) -> float | None:
+    """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
+    if model not in scores.models or not scores.finished(model) or not scores.horizons:
+        return None
+    return scores.value("rmse", f"position after {scores.horizons[-1]:g} s", model)
+
+
+def _acceleration(scores: forcegp.Scores, model: str) -> float | None:
+    if model not in scores.models or not scores.finished(model):
+        return None
+    return scores.value("nrmse", model=model)
+
+
+def payload_text(found: Any) -> str:
+    """Mass with its 95 % interval and place; or that there is none."""
+    parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
+    mass, *center = parts.values()
+    error = 0.5 * (mass.interval[1] - mass.interval[0])
+    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
+        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
+    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
+    [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, if the URDF's links are right"

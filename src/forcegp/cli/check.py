@@ -12,52 +12,52 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.scores
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, Overwriting, unless_given
-from forcegp.cli.input_options import CutoffOptions, RobotOptions
+from forcegp.cli.command import DATASET, Command, unless_given
+from forcegp.cli.log_options import CutoffOptions
+from forcegp.cli.robot_options import RobotOptions
 from forcegp.cli.terminal import Terminal, columns, doubts_table, shown
 from forcegp.errors import DatasetError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(CutoffOptions, RobotOptions, Overwriting):
+class Check(Command):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
     Each doubt is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
 
     For example:
       forcegp check log.h5 --robot arm.urdf
-      forcegp check log.h5 --robot arm.urdf --plots look --strict
+      forcegp check log.h5 --robot arm.urdf --out look --strict
     """
 
-    data: Annotated[Positional[Path], DATASET, arg(metavar="DATA")]
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The dataset to check (HDF5)."""
-    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Filter for the comparison of q, v, a and u. auto: near where the spectrum shows the end of the motion."""
-    plots: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
-    """Also draw torques, spectra and time steps into this folder, with the doubts as check.json."""
+    out: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
+    """Also draw torques and spectra into this folder, with the doubts as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
+    robot: RobotOptions = RobotOptions()
+    filter: CutoffOptions = CutoffOptions(cutoff="auto")
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, draw if asked to, and show. Raises DatasetError with `strict` where something is wrong."""
-        self.require_free(self.plots)
-
-        preparation = self._preparation()
-        dataset = forcegp.Dataset.load(self.data)
-        model = self.model_if_any(dataset, self.data)
+        self.require_free(self.out)
+        preparation = self.filter.preparation()
+        dataset = forcegp.Dataset.load(self.log)
+        model = self.robot.model_if_any(dataset, self.log)
         with terminal.progress("checking"):
             report = forcegp.check(dataset, model, preparation=preparation)
-        content = {"data": str(self.data), **report.to_dict()}
-        if self.plots is not None:
-            with self.folder(self.plots, {"data": str(self.data)}) as folder:
+        content = {"data": str(self.log), **report.to_dict()}
+        if self.out is not None:
+            with self.folder(self.out, {"data": str(self.log)}) as folder:
                 forcegp.scores.save_figure(forcegp.scores.check_figure(report), folder / "check.png")
                 write_json(folder / "check.json", content)
-            terminal.note(f"plots: {self.plots}")
-        terminal.show(*_shown(terminal, self.data, report))
+            terminal.note(f"plots: {self.out}")
+        terminal.show(*_shown(terminal, self.log, report))
         wrong = report.doubts.at("wrong")
         if self.strict and wrong:
             raise DatasetError(
-                f"{self.data}: {len(wrong)} things are wrong ({wrong.subjects}); without --strict this is no error."
+                f"{self.log}: {len(wrong)} things are wrong ({wrong.subjects}); without --strict this is no error."
             )
         return content
 

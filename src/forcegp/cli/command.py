@@ -1,4 +1,4 @@
-"""What commands share: how options are declared, checks of what they read and write, where to compute, and `run`."""
+"""What commands share: how options are declared, checks of what they read and write, and `run`."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import platform
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
-from tyro.conf import UseAppendAction, arg
+import docstring_parser
+from tyro.conf import Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 import forcegp.data
-import forcegp.parallel
 from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_writable, write_digests, write_json
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
 
 def unless_given(metavar: str, default: str, constructor: type | None = None) -> Any:
-    """Annotates an option that is None unless it is given: what `--help` calls its value, and its default."""
+    """Annotates an option that is None or empty unless it is given: what `--help` calls its value, and its default."""
     return arg(metavar=metavar, constructor=constructor, help_behavior_hint=f"(default: {default})")
 
 
@@ -46,39 +46,23 @@ def split_list(text: str, goes_on: str | None = None) -> list[str]:
     return entries
 
 
-@dataclass(frozen=True)
-class Listed(PrimitiveConstructorSpec[tuple[Any, ...]]):
-    """Annotates a tuple that is written as one list with commas."""
-
-    help_behavior_hint: str | None = None
-
-
-def listed(
-    metavar: str, default: str | None = None, of: type[str | int | float] = str, goes_on: str | None = None
-) -> Listed:
-    """Annotates a tuple: what `--help` calls its entries, what it is unless given, and what continues an entry."""
+def listed(of: type[str | float] = str, goes_on: str | None = None) -> PrimitiveConstructorSpec[tuple[Any, ...]]:
+    """Annotates a tuple that is written as one list with commas; `goes_on` continues an entry."""
 
     def instance(words: Sequence[str]) -> tuple[Any, ...]:
         entries = split_list(words[0], goes_on)
         try:
             return tuple(map(of, entries))
         except ValueError:
-            kind = {int: "whole numbers", float: "numbers"}[of]
-            raise ValueError(f"{words[0]!r} is no list of {kind}, as {'1,2' if of is int else '0.1,0.2'} is.") from None
+            raise ValueError(f"{words[0]!r} is no list of numbers, as 0.1,0.2 is.") from None
 
-    return Listed(
+    return PrimitiveConstructorSpec(
         nargs=1,
-        metavar=metavar,
+        metavar="LIST",
         instance_from_str=instance,
         is_instance=lambda given: isinstance(given, tuple),
         str_from_instance=lambda given: [",".join(map(str, given))],
-        help_behavior_hint=None if default is None else f"(default: {default})",
     )
-
-
-def repeats(hint: Any) -> bool:
-    """Whether an option may be given several times, each with a value of its own."""
-    return get_args(UseAppendAction[int])[1] in get_args(hint)
 
 
 NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
@@ -107,34 +91,89 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
-OUTPUTS = ("out", "plots", "docs", "write_mapping", "report", "html")
+OUTPUTS = ("out", "write_mapping", "report")
 """Names of the fields with what a command writes: never an input, nor another output."""
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
 URDF = InputPath(": no such file; give the path of a URDF file.", Path.exists)
 IDENTIFIED = InputPath(": no such file or folder; give a folder that `forcegp fit` wrote.", Path.exists)
 LOG = InputPath(" does not exist; give the path of a log.", Path.exists)
+THERE = InputPath(" does not exist; give folders of forcegp fit, and a dataset (.h5) after them.", Path.exists)
 MAPPING = InputPath(" is not a file; give --mapping a YAML file.")
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a command: its type with annotations, and its default."""
+
+    hint: Any
+    default: Any
+
+    @property
+    def marks(self) -> tuple[Any, ...]:
+        """What annotates it."""
+        return getattr(self.hint, "__metadata__", ())
+
+    @property
+    def repeats(self) -> bool:
+        """Whether it may be given several times, each with a value of its own."""
+        return get_args(UseAppendAction[int])[1] in self.marks
+
+    def flag(self, name: str) -> str | None:
+        """--points, or --no-checks for a switch that is on; None for what has no name on the command line."""
+        if get_args(Positional[int])[1] in self.marks:
+            return None
+        return f"--{'no-' if self.default is True else ''}{name.replace('_', '-')}"
+
+
+def options_of(kind: Any, usual: Any = None) -> dict[str, Option]:
+    """The options of a command or subject by name, those of its subjects among them."""
+    found, hints = {}, get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        default = field.default if usual is None else getattr(usual, field.name)
+        if is_dataclass(hints[field.name]):
+            found |= options_of(hints[field.name], None if default is MISSING else default)
+        else:
+            found[field.name] = Option(hints[field.name], default)
+    return found
+
+
+def values_of(given: Any) -> dict[str, Any]:
+    """The value of every option of a command or subject by name."""
+    found: dict[str, Any] = {}
+    for name, value in vars(given).items():
+        found |= values_of(value) if is_dataclass(value) else {name: value}
+    return found
+
+
+def with_texts(kind: Any) -> Any:
+    """The class, with the text below each field in one paragraph: tyro breaks its lines where the source does."""
+    hints, names = get_type_hints(kind, include_extras=True), {field.name for field in fields(kind)}
+    for each in filter(is_dataclass, kind.__mro__):
+        for text in docstring_parser.parse_from_object(each).params:
+            if text.arg_name in names & each.__annotations__.keys():
+                help_ = arg(help=" ".join((text.description or "").split()))
+                each.__annotations__[text.arg_name] = Annotated[hints[text.arg_name], help_]
+    for subject in filter(is_dataclass, hints.values()):
+        with_texts(subject)
+    return kind
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command(ABC):
-    """One command: a frozen dataclass with its options as fields, and what it does as `run`."""
+    """One command: its options, of which those of a subject (robot, filter, ...) are a dataclass, and `run`."""
 
     interrupted: ClassVar[str] = "no partial output was kept"
     """What Ctrl-C has left behind."""
     replaces: ClassVar[bool] = True
     """Whether an old folder of results goes, with all that is in it; else it is gone on with."""
 
+    overwrite: bool = False
+    """Replace what is there, if forcegp wrote it."""
     json: bool = False
     """Print one JSON object on stdout, and nothing else there."""
     debug: bool = False
     """Show the traceback of an error."""
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """The names of its fields, which are those of its options."""
-        return tuple(vars(self))
 
     def check_paths(self) -> None:
         """Refuse inputs that do not exist and outputs that would destroy an input or another output.
@@ -142,14 +181,15 @@ class Command(ABC):
         At once: `run` imports torch, which takes seconds. Raises FileFormatError and InvalidInput.
         """
         inputs: list[Path] = []
-        for name, annotation in get_type_hints(type(self), include_extras=True).items():
-            for mark in getattr(annotation, "__metadata__", ()):
-                given = getattr(self, name) if isinstance(mark, InputPath) else None
+        values = values_of(self)
+        for name, option in options_of(type(self)).items():
+            for mark in option.marks:
+                given = values[name] if isinstance(mark, InputPath) else None
                 for path in given if isinstance(given, tuple) else () if given is None else (given,):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
                     inputs.append(path)
-        outputs = [path for name in OUTPUTS if (path := getattr(self, name, None)) is not None]
+        outputs = [path for name in OUTPUTS if (path := values.get(name)) is not None]
         for path in (*inputs, *outputs):
             if any("\ud800" <= letter <= "\udfff" for letter in str(path)):  # bytes that Python could not decode
                 raise InvalidInput(f"the name {str(path)!r} is not UTF-8, so it could not be reported; rename it.")
@@ -165,17 +205,15 @@ class Command(ABC):
     def words(self, *names: str) -> list[str]:
         """The options of these names that are not left at their defaults, as words of a command."""
         words: list[str] = []
-        hints = get_type_hints(type(self), include_extras=True)
+        values, options = values_of(self), options_of(type(self))
         for name in names:
-            given, flag = getattr(self, name), f"--{name.replace('_', '-')}"
-            if given is False and getattr(type(self), name):
-                words.append(f"--no-{flag[2:]}")
-            elif given is True and not getattr(type(self), name):
-                words.append(flag)
-            elif repeats(hints[name]):
-                repeated: Any = given
-                words += [word for each in repeated for word in (flag, each)]
-            elif given != getattr(type(self), name):
+            given, option = values[name], options[name]
+            flag = str(option.flag(name))
+            if option.repeats:
+                words += [word for each in given for word in (flag, each)]
+            elif isinstance(given, bool):
+                words += [flag] if given is not option.default else []
+            elif given != option.default:
                 each = given if isinstance(given, tuple) else (given,)
                 text = ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in each)
                 words += [f"{flag}={text}"] if name == "gravity" or text.startswith("-") else [flag, text]
@@ -204,7 +242,7 @@ class Command(ABC):
                     f"{path} exists and was not written by `{self.kind}`, so it is not overwritten; choose another "
                     "name."
                 )
-            if not getattr(self, "overwrite", True):
+            if not self.overwrite:
                 raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
             others = added_files(path)
             if others:
@@ -212,6 +250,27 @@ class Command(ABC):
                     f"{path} holds files that `{self.kind}` did not write ({', '.join(others[:3])}), so it is not "
                     "overwritten; move them away, or choose another name."
                 )
+        require_writable(path)
+
+    def require_free_file(
+        self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
+    ) -> None:
+        """Refuse what exists, but `own` or empty with --overwrite, or cannot be written. None is no file.
+
+        `own` is whether a file is `what` forcegp writes. Raises InvalidInput and OSError.
+        """
+        if path is None:
+            return
+        if path.is_dir():
+            raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
+        if path.exists() and not path.is_file():
+            raise InvalidInput(f"{path} is not a regular file; choose another name.")
+        if path.exists() and not self.overwrite:
+            raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
+        if not path.parent.is_dir():
+            raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
+        if path.exists() and path.stat().st_size and not (own or forcegp.data.is_dataset)(path):
+            raise InvalidInput(f"{path} is not {what}, so it is not overwritten; choose another name.")
         require_writable(path)
 
     @contextlib.contextmanager
@@ -243,43 +302,6 @@ def _same(one: Path, other: Path) -> bool:
     with contextlib.suppress(OSError):  # one of them does not exist
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Overwriting(Command):
-    """A command that may replace what an earlier one wrote."""
-
-    overwrite: bool = False
-    """Replace what is there, if forcegp wrote it."""
-
-    def require_free_file(
-        self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
-    ) -> None:
-        """Refuse what exists, but `own` or empty with --overwrite, or cannot be written. None is no file.
-
-        `own` is whether a file is `what` forcegp writes. Raises InvalidInput and OSError.
-        """
-        if path is None:
-            return
-        if path.is_dir():
-            raise InvalidInput(f"{path} is a folder; give --out the name of a file, for example {path / 'data.h5'}.")
-        if path.exists() and not path.is_file():
-            raise InvalidInput(f"{path} is not a regular file; choose another name.")
-        if path.exists() and not self.overwrite:
-            raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
-        if not path.parent.is_dir():
-            raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
-        if path.exists() and path.stat().st_size and not (own or forcegp.data.is_dataset)(path):
-            raise InvalidInput(f"{path} is not {what}, so it is not overwritten; choose another name.")
-        require_writable(path)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Resuming(Command):
-    """A command that keeps every finished piece of work in its folder."""
-
-    interrupted: ClassVar[str] = "finished pieces are kept, and the same command resumes"
-    replaces: ClassVar[bool] = False
 
 
 def begins(mark: bytes) -> Callable[[Path], bool]:

@@ -16,9 +16,10 @@ import forcegp.report
 import forcegp.scores
 import forcegp.simulation
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import Command
+from forcegp.cli.command import Command, values_of
 from forcegp.cli.fit import fit_summary
-from forcegp.cli.score import NORMAL_FORCES, comparison
+from forcegp.cli.robot_options import SearchOptions
+from forcegp.cli.score import comparison
 from forcegp.cli.simulate import simulate_with_progress
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
@@ -26,7 +27,8 @@ from forcegp.errors import InvalidInput
 NOISE = 0.1  # rad/s^2, as in the paper
 SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
 
-MODELS = {"S-GP": ("s-gp", False), "S-GP + analytical mean": ("s-gp-analytical-mean", True)}
+BEST = "S-GP + analytical mean"
+MODELS = {"S-GP": ("s-gp", False), BEST: ("s-gp-analytical-mean", True)}
 """Name in the paper -> (folder, whether known forces are the mean)."""
 
 
@@ -42,24 +44,19 @@ class Demo(Command):
     """
 
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("demo")
-    """The folder to write. That of an earlier demo is replaced, unless files were added to it."""
+    """The folder to write."""
     seed: Annotated[int, arg(metavar="K")] = SEED
     """The training trajectory has seed K, the test trajectory K + 1."""
-    points: Annotated[int, arg(metavar="N")] = 100
-    """Training points."""
     seconds: Annotated[float, arg(metavar="S")] = 100.0
     """Length of each trajectory in s."""
-    iterations: Annotated[int, arg(metavar="N")] = 200
-    """Most iterations of each fit."""
-    jobs: Annotated[int, arg(metavar="J")] = 1
-    """Processes for the starts of each fit."""
+    search: SearchOptions = SearchOptions(points=100)
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """All four steps."""
-        if self.points < 2:
-            raise InvalidInput(f"--points is {self.points}; at least 2 are needed.")
+        if not self.search.points or self.search.points < 2:
+            raise InvalidInput(f"--points is {self.search.points}; at least 2 are needed.")
         self.require_free(self.out)
-        options = {name: getattr(self, name) for name in ("seed", "points", "seconds", "iterations", "jobs")}
+        options = {name: value for name, value in values_of(self).items() if name != "out"}
         start = time.monotonic()
         with self.folder(self.out, {"options": options}) as folder:
             data, seeds = {}, {"train": self.seed, "test": self.seed + 1}
@@ -79,18 +76,17 @@ class Demo(Command):
             results: dict[str, Any] = {
                 "out": str(self.out),
                 "seeds": seeds,
-                "points": self.points,
+                "points": self.search.points,
                 "seconds": self.seconds,
                 "models": {name: {"run": str(self.out / MODELS[name][0]), "fit": fit} for name, fit in fits.items()},
                 "scores": scores.to_dict(),
                 "wall_seconds": time.monotonic() - start,
             }
             write_json(folder / "results.json", results)
-            sentence = self._write_report(terminal, folder, models["S-GP + analytical mean"], test, results)
-        title = f"{self.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
+            sentence = self._write_report(terminal, folder, models[BEST], test, scores, results)
+        title = f"{self.search.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
         terminal.show(
             *comparison(scores, title),
-            f"Contact force: {NORMAL_FORCES}.",
             f"Models, data and results.json are in {self.out}. Open the report:",
             f"  {self.out}/report.html",
             sentence,
@@ -103,34 +99,32 @@ class Demo(Command):
         folder: Path,
         posterior: forcegp.posterior.Posterior,
         test: forcegp.Dataset,
+        scores: forcegp.Scores,
         results: Mapping[str, Any],
     ) -> str:
         """The page with everything, whose best sentence is returned."""
-        scores = forcegp.score(posterior, test)
-        best = forcegp.report.scores_sentence(scores, "rad/s²")
+        best = forcegp.report.scores_sentence(scores, BEST)
         with terminal.progress("writing the report") as progress:
+            pictures, missing = forcegp.scores.model_pictures(posterior, test, progress)
             page = forcegp.report.model_page(
                 posterior,
                 test,
-                title=f"forcegp demo: a tool slides on a surface, friction learned from {self.points} points",
+                pictures,
+                title=f"forcegp demo: a tool slides on a surface, friction learned from {self.search.points} points",
                 best=best,
                 findings=[
-                    forcegp.report.Finding("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
-                    forcegp.report.Finding("model", "S-GP with analytical mean of Rath, Geist and Trimpe (CoRL 2021)"),
-                    forcegp.report.Finding("tested on", f"{len(test)} rows of a trajectory with another seed"),
+                    ("robot", "KUKA iiwa in PyBullet; it presses and slides its tool on a table"),
+                    ("model", "S-GP with analytical mean of Rath, Geist and Trimpe (CoRL 2021)"),
+                    ("tested on", f"{len(test)} rows of a trajectory with another seed"),
                 ],
                 tables=[forcegp.report.scores_table(scores)],
                 next_steps=[
-                    forcegp.report.Finding(
-                        "The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"
-                    ),
-                    forcegp.report.Finding(
-                        "The robot live:", f"forcegp view {self.out}/s-gp-analytical-mean {self.out}/test.h5"
-                    ),
+                    ("The same for your robot:", "forcegp auto log.csv --robot arm.urdf --out answer"),
+                    ("More of the motion:", f"forcegp view {self.out}/s-gp-analytical-mean {self.out}/test.h5"),
                 ],
                 details=results,
                 shapes=forcegp.simulation.kuka_file(),
-                progress=progress,
+                missing=missing,
             )
             forcegp.report.write_page(folder / "report.html", page)
         return best
@@ -143,9 +137,8 @@ class Demo(Command):
         start = time.monotonic()
         model = train.model.with_forces(forcegp.JointForces())
         model = model if mean else model.without_mean()
-        how: dict[str, Any] = {"points": self.points, "iterations": self.iterations, "jobs": self.jobs}
         with terminal.progress(f"fitting {name}") as report:
-            posterior: Any = forcegp.scores.learn(model, train, report=report, **how)[0]
+            posterior: Any = forcegp.scores.learn(model, train, report=report, **vars(self.search))[0]
         seconds = time.monotonic() - start
         forcegp.save_posterior(posterior, run)
         iterations = len(posterior.result.history) - 1

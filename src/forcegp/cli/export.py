@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
-from forcegp.cli.command import MODEL, Overwriting, unless_given
+from forcegp.cli.command import MODEL, Command, unless_given
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Overwriting):
+class Export(Command):
     """Write a fitted model as a program that needs no Python.
 
     c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
@@ -27,7 +27,7 @@ class Export(Overwriting):
       forcegp export run --to c --out mpc --jacobian --steps 0.02 --integrator implicit-midpoint
     """
 
-    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
+    model: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote."""
     to: Literal["c", "casadi"]
     """What to write."""
@@ -49,9 +49,9 @@ class Export(Overwriting):
         if self.integrator is not None and self.steps is None:
             raise InvalidInput("--integrator was given without --steps, which sets the length of a step.")
         self.require_free(self.out)
-        posterior = forcegp.load_posterior(self.run_folder)
+        posterior = forcegp.load_posterior(self.model)
         names = ("to", "covariance", "jacobian", "steps", "integrator")
-        content = {"run": str(self.run_folder), **{name: getattr(self, name) for name in names}}
+        content = {"run": str(self.model), **{name: getattr(self, name) for name in names}}
         with self.folder(self.out, content) as folder:
             found = TARGETS[self.to](self, terminal, posterior, folder)
         return {"out": str(self.out), **content, **found}
@@ -60,7 +60,7 @@ class Export(Overwriting):
 def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
     same = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
     integrator = options.integrator or "symplectic-euler"
-    made = forcegp.export_c(posterior, folder, **same, integrator=integrator, source=str(options.run_folder))
+    made = forcegp.export_c(posterior, folder, **same, integrator=integrator, source=str(options.model))
     terminal.show(
         columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import time
 import warnings
@@ -21,11 +22,27 @@ import forcegp.posterior
 import forcegp.robots
 import forcegp.scores
 from forcegp.atomic_files import file_digest, write_json, write_text
-from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Overwriting, listed, numbers_of, unless_given
-from forcegp.cli.contact_syntax import CONTACTS, parse_contacts
-from forcegp.cli.estimates import estimates_table, what_is_open
-from forcegp.cli.input_options import ROBOT_OPTIONS, SYSTEM_FILE, RobotOptions, forces_of, identified_system
-from forcegp.cli.terminal import Terminal, facts, with_option_names
+from forcegp.cli.command import (
+    DATASET,
+    FIELDS,
+    NUMBERS,
+    Command,
+    listed,
+    numbers_of,
+    options_of,
+    unless_given,
+    values_of,
+)
+from forcegp.cli.robot_options import (
+    CONTACTS,
+    SYSTEM_FILE,
+    RobotOptions,
+    SearchOptions,
+    forces_of,
+    identified_system,
+    parse_contacts,
+)
+from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
@@ -38,7 +55,7 @@ LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torqu
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(RobotOptions, Overwriting):
+class Fit(Command):
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown forces.
 
     The dataset carries its robot, contacts and forces; --robot, --contact and --forces replace or add to them. The
@@ -53,22 +70,22 @@ class Fit(RobotOptions, Overwriting):
       forcegp fit raw.h5 --forces gp:joint --evidence windows:.1 --points 100 --out run
     """
 
-    data: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
-    forces: Annotated[tuple[str, ...], listed("FORCE,...", USUAL_FORCES, goes_on=FIELDS)] = ()
+    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), unless_given("FORCE,...", USUAL_FORCES)] = ()
     """What is found, beside the forces that the model has. Laws: viscous, coulomb, rotor, offset, spring,
     payload:LINK, bodies; their numbers are estimated unless they are given, as in viscous:.1. Unknown forces: gp:joint,
     gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
     gp:independent is without physics, none the noise alone. See docs/how-to/forces.md."""
-    evidence: Annotated[tuple[str, ...], listed("EVIDENCE,...", LEARNED_FROM)] = ()
+    evidence: Annotated[tuple[str, ...], listed(), unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
     """What is learned from: accelerations, torques (torques:both where accelerations are noisy, too, torques:mean=.4
     of means), or windows:S of raw positions, where nothing is differentiated. Beside it motions:S refines the
     numbers on recorded positions, over windows of S seconds."""
     baseline: Annotated[Path | None, DATASET, unless_given("LOG", "none", Path)] = None
     """A second log, of the same robot without the payloads that are estimated."""
-    contact: Annotated[tuple[str, ...], listed(CONTACTS, "the dataset's", goes_on=NUMBERS)] = ()
+    contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME.
     SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
     none is no contact at all."""
@@ -79,24 +96,13 @@ class Fit(RobotOptions, Overwriting):
     """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
     measured_torque: bool = False
     """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""
-    points: Annotated[int | None, unless_given("N", "200; all for functions of one or two inputs", int)] = None
-    """Learn unknown forces from N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube
-    of N as far as --engine is exact. Numbers of laws are found from all rows."""
     engine: Literal["auto", "exact", "inducing"] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points. auto: by
     their number, the features and the free memory, with the reason. See docs/how-to/large-data.md."""
     learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
     """Find the hyper-parameters on N of the points; the posterior is that of all points."""
-    iterations: Annotated[int, arg(metavar="N")] = 200
-    """Most L-BFGS iterations of each start."""
-    restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1")] = None
-    """Starts of the search; the best is kept."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the starts of the search after the first."""
-    jobs: Annotated[int, arg(metavar="J")] = 1
-    """Restarts at once, each on one core."""
-    hyperprior: Annotated[bool, arg(help_behavior_hint="")] = True
-    """Plain maximum likelihood, without the priors on kernels and learned noise that keep few points calibrated."""
     rows: Literal["auto", "in-contact", "all"] = "auto"
     """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
     every row. auto: in-contact where the tool leaves the surface at times, with a note."""
@@ -104,16 +110,18 @@ class Fit(RobotOptions, Overwriting):
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
+    robot: RobotOptions = RobotOptions()
+    search: SearchOptions = SearchOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, save and show."""
         self.require_free(self.out)
-        forcegp.parallel.checked_jobs(self.jobs)  # refused now, not after the data are read
+        forcegp.parallel.checked_jobs(self.search.jobs)  # refused now, not after the data are read
         noise = self._noise()
         forcegp.robots.usable_device(self.device)
         evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
         start, notes = time.monotonic(), []
-        dataset = forcegp.Dataset.load(self.data)
+        dataset = forcegp.Dataset.load(self.log)
         given = self._known(dataset)
         windows = any(isinstance(each, forcegp.evidence.Windows) for each in evidence)
         self._check(terminal, dataset, given, not windows)
@@ -137,7 +145,8 @@ class Fit(RobotOptions, Overwriting):
                 recording=recording,
                 baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
                 report=report,
-                **{name: getattr(self, name) for name in SAME},
+                **vars(self.search),
+                **{name: getattr(self, name) for name in ("engine", "learning_points", "seed")},
             )
         summary = fit_summary(posterior, time.monotonic() - start)
         tables = fit_report(self.out, posterior, summary)
@@ -147,7 +156,7 @@ class Fit(RobotOptions, Overwriting):
         for doubt in forcegp.scores.unfinished_search(posterior):
             terminal.warn(str(doubt))
         terminal.show(*tables)
-        return {"run": str(self.out), "data": str(self.data), **summary, "settings": dict(posterior.settings)}
+        return {"run": str(self.out), "data": str(self.log), **summary, "settings": dict(posterior.settings)}
 
     def _noise(self) -> forcegp.Noise | None:
         """The noise that the options ask for; None where the dataset states it. Raises InvalidInput."""
@@ -164,7 +173,7 @@ class Fit(RobotOptions, Overwriting):
     def _known(self, dataset: forcegp.Dataset) -> forcegp.Model:
         """The dataset's own model, with the robot and contacts that the options give."""
         contacts = parse_contacts(self.contact)
-        model = self.chosen_model(dataset, self.data)
+        model = self.robot.chosen_model(dataset, self.log)
         return model.with_contacts((*contacts, *model.loops)) if self.contact else model
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model, accelerations: bool) -> None:
@@ -180,7 +189,7 @@ class Fit(RobotOptions, Overwriting):
             of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
             used = Doubts(each for each in found if each.about not in of_accelerations)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
-                see = f"See {shlex.join(['forcegp', 'check', str(self.data), *self.words(*ROBOT_OPTIONS)])}"
+                see = f"See {shlex.join(['forcegp', 'check', str(self.log), *self.words(*options_of(RobotOptions))])}"
                 see = used[0].advice.rstrip(".") if self.contact else see
                 terminal.warn(f"{used.in_one_line()}. {see} (--no-checks does not look)")
         warnings.simplefilter("ignore", ContactWarning)
@@ -212,19 +221,15 @@ class Fit(RobotOptions, Overwriting):
         """The model, how it was made and what was estimated; what is known also as a robot's file."""
         options = {
             name: str(value) if isinstance(value, Path) else value
-            for name, value in ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+            for name, value in values_of(self).items()
             if name not in ("json", "debug", "overwrite")
         }
-        data = {"path": str(self.data), "sha256": file_digest(self.data)}
+        data = {"path": str(self.log), "sha256": file_digest(self.log)}
         content = {"options": options, "data": data, "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:
             forcegp.save_posterior(posterior, folder)
             if posterior.estimates:
                 write_estimates(folder, posterior)
-
-
-SAME = ("points", "engine", "learning_points", "iterations", "restarts", "seed", "jobs", "hyperprior")
-"""Options that `forcegp.scores.learn` takes by the same names."""
 
 
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
@@ -241,72 +246,60 @@ def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> N
 
 def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> dict[str, Any]:
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
-    result, settings = posterior.result, posterior.settings
-    force_noise, unknown = posterior.hyperparameters.get("noise.log_force"), posterior.model.unknown_forces
-    air = [each for each in unknown if isinstance(each, forcegp.AerodynamicForce)]
+    result, settings, unknown = posterior.result, posterior.settings, posterior.model.unknown_forces
+    force_noise = posterior.hyperparameters.get("noise.log_force")
     looked = not {"air", "observe"} & set(settings) and not posterior.model.held_inputs  # not for wind in windows
     return {
         "model": posterior.description,
-        "objective_is": posterior.objective,
         "points": len(posterior.training),
         "learning_points": settings.get("learning_points", len(posterior.training)),
-        "objective_start": result.history[0],
+        "objective_is": posterior.objective,
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
-        **({"engine": settings["engine_reason"]} if "engine_reason" in settings else {}),
-        **({"refined": settings["refined"]} if "refined" in settings else {}),
-        "restarts": settings.get("restarts", 1),
         "iterations": len(result.history) - 1,
-        "evaluations": result.evaluations,
         "converged": result.converged,
         "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
-        "wind": settings.get("air", {}).get("wind"),
-        "wind_not_found": looked and any(each.observe != 0.0 for each in air),
-        "steady_forces": settings.get("steady_forces"),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
+        "wind": settings.get("air", {}).get("wind"),
+        "wind_not_found": looked and any(getattr(each, "observe", 0.0) != 0.0 for each in unknown),
         "estimates": posterior.estimates.to_dict()["parameters"],
         "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
     }
 
 
-def fit_report(run: Path, posterior: Any, summary: Mapping[str, Any]) -> list[Any]:
+def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]:
     """What was learned from what, and the numbers that were estimated."""
-    forces, air = summary["force_noise_std"], summary["wind"]
-    still = "learned as still air" + (", with a force in each episode" if summary["steady_forces"] else "")
-    points, learning = summary["points"], summary["learning_points"]
-    refined = " and refined on all" if "refined" in summary else ""
-    fewer = f" (parameters: from {learning} of them{refined})" if learning != points else ""
+    settings, air = posterior.settings, found["wind"]
+    refined = " and refined on all" if "refined" in settings else ""
+    fewer = "" if found["learning_points"] == found["points"] else (
+        f" (parameters: from {found['learning_points']} of them{refined})"
+    )  # fmt: skip
     # the status counts failed evaluations, too, and the starts
-    status = with_option_names(summary["status"], ("iterations",))
-    unit = summary["objective_is"].partition(" [")[2].removesuffix("]")
-    objective = f"{_short(summary['objective_start'])} → {_short(summary['objective'])} {unit}"
+    status = with_option_names(found["status"], ("iterations",))
+    wind = None if air is None else f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"
+    if found["wind_not_found"]:
+        each = ", with a force in each episode" if settings.get("steady_forces") else ""
+        wind = f"not found; learned as still air{each}"
     values = {
-        **({"engine": summary["engine"]} if "engine" in summary else {}),
-        **({"objective": objective} if posterior.model.unknown_forces else {}),
-        "negative log likelihood": f"{summary['nll']:.1f} nats",
-        "iterations": f"{summary['iterations']} ({summary['evaluations']} evaluations)",
-        "search": status if summary["converged"] else f"not converged: {status}",
-        "noise std": _per_joint(summary["noise_std"]),
-        **({} if forces is None else {"noise std of forces": _per_joint(forces)}),
-        **({} if air is None else {"wind of these rows": f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"}),
-        **({"wind of these rows": f"not found; {still}"} if summary["wind_not_found"] else {}),
-        "time": f"{summary['cpu_seconds']:.1f} s CPU for the search, {summary['wall_seconds']:.1f} s in all",
+        "engine": settings.get("engine_reason"),
+        "negative log likelihood": f"{found['nll']:.1f} nats",
+        "search": f"{found['iterations']} iterations; {'' if found['converged'] else 'not converged: '}{status}",
+        "noise std": _per_joint(found["noise_std"]),
+        "noise std of forces": found["force_noise_std"] and _per_joint(found["force_noise_std"]),
+        "wind of these rows": wind,
+        "time": f"{found['cpu_seconds']:.1f} s CPU for the search, {found['wall_seconds']:.1f} s in all",
     }
-    shown: list[Any] = [facts(f"{run}: {summary['model']}, learned from {points} points{fewer}", values)]
+    title = f"{run}: {found['model']}, learned from {found['points']} points{fewer}"
+    shown: list[Any] = [facts(title, {name: text for name, text in values.items() if text is not None})]
     if posterior.estimates:
-        shown.append(estimates_table("estimates", posterior.estimates))
-        shown += what_is_open(posterior.estimates)
-    motions = posterior.settings.get("motions")
-    if motions is not None:
+        shown += [estimates_table("estimates", posterior.estimates), *what_is_open(posterior.estimates)]
+    if motions := settings.get("motions"):
         units = ["mm" if joint.type == "prismatic" else "mrad" for joint in posterior.model.robot.joints]
-        each = zip(motions["rms"], units, strict=False)
-        error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in each)
-        shown.append(
-            f"{motions['windows']} windows of {motions['seconds']:g} s, whose initial states are estimated, too; "
-            f"rms of q by joint: {error}."
-        )
+        error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in zip(motions["rms"], units, strict=False))
+        told = f"{motions['windows']} windows of {motions['seconds']:g} s, whose initial states are estimated, too"
+        shown.append(f"{told}; rms of q by joint: {error}.")
     return [*shown, f"Next: forcegp score {run} TEST.h5"]
 
 
@@ -314,6 +307,55 @@ def _per_joint(values: list[float]) -> str:
     return f"{values[0]:.4g}" if len(set(values)) == 1 else " ".join(f"{value:.3g}" for value in values)
 
 
-def _short(value: float) -> str:
-    """One decimal for nats of a likelihood, three digits for small losses."""
-    return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+SHOWN = {"m": ("mm", 1e3), "kg m^2": ("kg m²", 1.0)}
+"""Units of files, and those that people read, with the factor between them."""
+MOST_OPEN = 5
+"""Combinations that the log does not tell apart, of which the first are named."""
+
+
+def estimates_table(title: str, estimates: Mapping[str, forcegp.Estimate]) -> Any:
+    """Start, value, 95 % interval and what decides it, below the law or body that has them."""
+    rows, owner = [], None
+    for name, each in estimates.items():
+        unit, factor = SHOWN.get(each.unit, (each.unit, 1.0))
+        low, high = (factor * end for end in each.interval)
+        # decimals that show two digits of the interval, and four of the value where there is none
+        size = factor * each.std if 0.0 < each.std < math.inf else 1e-3 * abs(factor * each.value)
+        digits = max(0, 1 - math.floor(math.log10(size))) if size > 0.0 else 4
+        show = (f"{{:.{digits}f}}" if digits < 10 else "{:.2g}").format
+        of, part = owner_and_part(name)
+        rows += [[of]] if of != owner else []
+        owner = of
+        numbers = show(factor * each.start), show(factor * each.value), f"{show(low)} … {show(high)}"
+        rows.append([f"  {part}", *numbers, "" if unit == "1" else unit, each.decided_by])
+    return columns(title, ["parameter", "start", "estimate", "95 % interval", "unit", "decided\nby the"], rows)
+
+
+def owner_and_part(name: str) -> tuple[str, str]:
+    """Law or body, and number: viscous and elbow, tool0 and center_of_mass.x."""
+    for part in ("mass", "center_of_mass", "inertia"):
+        owner, found, rest = name.partition(f".{part}")
+        if found:
+            return owner, f"{part}{rest}"
+    owner, _, part = name.partition(".")
+    return owner, part
+
+
+def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
+    """Sentences about what the prior decides, and what was changed."""
+    lines = []
+    if estimates.open_directions:
+        shown, count = estimates.open_directions[:MOST_OPEN], len(estimates.open_directions)
+        more = f"; and {count - len(shown)} more" if count > len(shown) else ""
+        lines.append(
+            f"Combinations that the prior decides, for no row tells their parts apart: {'; '.join(shown)}{more}."
+        )
+    if estimates.by_body:
+        weak = ", ".join(f"{name} ({number} of 10)" for name, number in estimates.by_body.items())
+        lines.append(f"Directions of single bodies that the prior decides: {weak}.")
+    if estimates.base is not None:
+        rank, condition = estimates.base.rank, estimates.base.condition
+        lines.append(f"{rank} base parameters, condition number {condition:.3g}.")
+    if estimates.thickened:
+        lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(estimates.thickened)}.")
+    return lines

@@ -12,15 +12,12 @@ import sys
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from itertools import takewhile
-from typing import get_type_hints
 
 import tyro
-from tyro.conf import FlagCreatePairsOff
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
 
-from forcegp.cli.command import Command, repeats
-from forcegp.cli.help_pages import command_page, flag_of, front_page, show
+from forcegp.cli.command import Command, options_of, values_of, with_texts
 from forcegp.cli.terminal import Terminal, with_option_names
 from forcegp.errors import ForceGPError, InvalidInput
 
@@ -35,7 +32,7 @@ or step by step:
   forcegp fit train.h5 --points 100 --out run
   forcegp score run test.h5 --out scores
 
-Every command has --help, --json and --debug, and writes its lists with commas, as in --forces a,b."""
+Every command has --help, --json, --overwrite and --debug, and takes lists with commas, as in --forces a,b."""
 
 COMMANDS: Mapping[str, str] = {
     "auto": "go from logs and a URDF to a validated model, in one command",
@@ -51,14 +48,13 @@ COMMANDS: Mapping[str, str] = {
     "monitor": "find contacts in a log without a force sensor: time, link and force",
     "excite": "the most informative motion to record next",
     "export": "write a fitted model as a C program",
-    "reproduce": "reproduce every figure and number of the paper",
 }
 """A new command is an entry here, and a module of that name with a subclass of Command of that name."""
 MODULES = {"import": "import_log"}
 """Names that Python does not allow for a module."""
 ARGUMENTS: Mapping[str, Mapping[str, str]] = {
-    "excite": {"start": "posture", "motions": "tries", "margin": "limit-share", "surface": "avoid"},
-    "simulate": {"contact": "contact-model", "episodes": "trajectories", "friction": "tool-friction"},
+    "excite": {"start": "posture", "motions": "tries", "surface": "avoid"},
+    "simulate": {"friction": "tool-friction"},
 }
 """Arguments in Python, whose messages begin with their name, and options that are called otherwise."""
 NOT_NUMBERS = {
@@ -74,33 +70,35 @@ def command_class(name: str) -> type[Command]:
     return getattr(module, name.capitalize())
 
 
+def front_page() -> str:
+    """The page of `forcegp --help`; that of a command is tyro's."""
+    rows = [f"  {name.ljust(10)}{summary}" for name, summary in COMMANDS.items()]
+    return "\n".join(["usage: forcegp COMMAND [OPTIONS]", "", DESCRIPTION, "", "Commands:", *rows])
+
+
 def parse_arguments(words: Sequence[str]) -> Command:
     """The command that the words ask for. --help prints and raises SystemExit(0).
 
     Raises InvalidInput, with a message of one line, for words that make no command.
     """
-    first, *others = words or [""]
-    if first in COMMANDS:
-        kind = command_class(first)
-        if {"-h", "--help"} & set(others):
-            show(command_page(first, kind))
-            raise SystemExit(0)
-        return _parse(first, kind, others)
-    if first in ("-h", "--help"):
-        show(front_page(DESCRIPTION, COMMANDS))
+    name, *others = words or [""]
+    if name in ("-h", "--help"):
+        print(front_page())
         raise SystemExit(0)
-    close = difflib.get_close_matches(first, COMMANDS, n=1)
-    hint = f" Did you mean {close[0]}?" if close else " Options follow the command." if first.startswith("-") else ""
-    what = f"there is no command {first!r}.{hint}" if first else "no command was given."
-    raise InvalidInput(f"{what} Available subcommands: {', '.join(COMMANDS)}. See forcegp --help.")
-
-
-def _parse(name: str, kind: type[Command], words: Sequence[str]) -> Command:
-    _check_options(name, kind, words)
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f" Did you mean {close[0]}?" if close else " Options follow the command." if name.startswith("-") else ""
+        what = f"there is no command {name!r}.{hint}" if name else "no command was given."
+        raise InvalidInput(f"{what} Available subcommands: {', '.join(COMMANDS)}. See forcegp --help.")
+    kind = command_class(name)
+    config = (FlagCreatePairsOff, OmitArgPrefixes)
+    if {"-h", "--help"} & set(others):
+        tyro.cli(with_texts(kind), prog=f"forcegp {name}", args=["--help"], config=config)
+    _check_options(name, kind, others)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, prog=f"forcegp {name}", args=words, config=(FlagCreatePairsOff,))
+            return tyro.cli(kind, prog=f"forcegp {name}", args=others, config=config)
     except SystemExit:
         reason = one_line(complaint.getvalue())
         for pattern, kind_of_number in NOT_NUMBERS.items():
@@ -110,8 +108,7 @@ def _parse(name: str, kind: type[Command], words: Sequence[str]) -> Command:
 
 def _check_options(name: str, kind: type[Command], words: Sequence[str]) -> None:
     """Raise InvalidInput for options that the command does not have, and for those that are given twice."""
-    hints = get_type_hints(kind, include_extras=True)
-    flags = {flag: hints[field.name] for field in fields(kind) if (flag := flag_of(field, hints[field.name]))}
+    flags = {flag: option for name, option in options_of(kind).items() if (flag := option.flag(name))}
     given: set[str] = set()
     for word in takewhile("--".__ne__, words):
         flag = word.partition("=")[0].replace("_", "-")
@@ -121,7 +118,7 @@ def _check_options(name: str, kind: type[Command], words: Sequence[str]) -> None
             close = difflib.get_close_matches(flag, flags, n=1)
             hint = f" Did you mean {close[0]}?" if close else ""
             raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
-        if flag in given and not repeats(flags[flag]):
+        if flag in given and not flags[flag].repeats:
             raise InvalidInput(f"{flag} is given twice; give it once, a list with commas.")
         given.add(flag)
 
@@ -179,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
-        with Terminal(json=command.json, options=command.options) as terminal, warnings.catch_warnings():
+        with Terminal(json=command.json, options=values_of(command)) as terminal, warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
             terminal.result(command.run(terminal))
@@ -190,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except ForceGPError as error:
-        message = with_option_names(str(error), command.options if command else ())
+        message = with_option_names(str(error), values_of(command) if command else ())
         for argument, option in ARGUMENTS.get(command.name if command else "", {}).items():
             message = re.sub(rf"^{argument} is ", f"--{option} is ", message)
         return _fail(message, USER_ERROR, debug)

@@ -14,8 +14,8 @@ import forcegp
 import forcegp.data
 import forcegp.scores
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, Overwriting, unless_given
-from forcegp.cli.input_options import require_same_joints
+from forcegp.cli.command import DATASET, MODEL, Command
+from forcegp.cli.robot_options import require_same_joints
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
 
@@ -25,27 +25,26 @@ APART = 0.25  # alarms that are less apart in s belong to one contact
 
 
 @dataclass(frozen=True, kw_only=True)
-class Monitor(Overwriting):
+class Monitor(Command):
     """Find contacts in a log without a force sensor: time, link and force of each.
 
     A residual torque counts as a contact if it exceeds what free motion of the same robot shows.
     LOG is a dataset; forcegp import makes one of any log.
 
     For example:
-      forcegp monitor run log.h5 --free-seconds 120 --out contacts
+      forcegp monitor run log.h5 --free 120 --out contacts
       forcegp monitor run shift.h5 --free morning.h5 --false-alarms 0.01 --out contacts
     """
 
-    run_folder: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
+    model: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
     """The folder that `forcegp fit --out` wrote, of a robot without contacts."""
     log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The log to search, at the rate of its sensors."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write: contacts.csv, contacts.json and contacts.png."""
-    free: Annotated[Path | None, DATASET, unless_given("LOG", "--free-seconds of LOG")] = None
-    """A log of 40 s or more without contacts, not used for training."""
-    free_seconds: Annotated[float | None, unless_given("S", "--free")] = None
-    """The first S seconds of LOG are without contacts; they replace --free and are not searched."""
+    free: Annotated[str, arg(metavar="S|FREE.h5")]
+    """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, which are not
+    searched, or another log."""
     false_alarms: Annotated[float, arg(metavar="N")] = 0.1
     """Accepted false alarms per hour."""
     bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
@@ -53,32 +52,33 @@ class Monitor(Overwriting):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Calibrate, look, draw and show."""
-        if (self.free is None) == (self.free_seconds is None):
-            raise InvalidInput("give either --free LOG or --free-seconds S: free motion shows what the model cannot.")
-        if self.free_seconds is not None and not 0.0 < self.free_seconds < float("inf"):
-            raise InvalidInput(f"--free-seconds is {self.free_seconds:g}; give seconds above 0.")
+        try:
+            seconds, other = float(self.free), None
+        except ValueError:
+            seconds, other = 1.0, Path(self.free)
+        if not (seconds > 0.0 and (other is None or other.is_file())):
+            raise InvalidInput(f"--free is {self.free}; give seconds above 0, or a dataset that is there (.h5).")
         self.require_free(self.out)
-        posterior = forcegp.load_posterior(self.run_folder)
+        posterior = forcegp.load_posterior(self.model)
         log = _dataset(self.log, posterior)
         dt = forcegp.data.filters.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
         motions = list(_motions(log, self.log, dt))
-        if self.free is not None:
-            known = [each[1:] for each in _motions(_dataset(self.free, posterior), self.free, dt)]
+        if other is not None:
+            known = [each[1:] for each in _motions(_dataset(other, posterior), other, dt)]
         else:
-            first, rows = motions[0], round((self.free_seconds or 0.0) / dt)
+            first, rows = motions[0], round(min(seconds / dt, float(len(motions[0][0]))))
             known, motions[0] = [tuple(x[:rows] for x in first[1:])], tuple(x[rows:] for x in first)
         monitor = forcegp.ContactMonitor(posterior.predictor(), dt=dt, bandwidth=self.bandwidth)
         with terminal.progress("looking"):
             monitor.calibrate(known, false_alarms_per_hour=self.false_alarms)
             parts = [(time, q, monitor.run(q, v, u)) for time, q, v, u in motions if len(time) > 1]
         if not parts:
-            raise InvalidInput(f"nothing is left of {self.log} after --free-seconds {self.free_seconds:g}.")
+            raise InvalidInput(f"nothing is left of {self.log} after --free {self.free}.")
         contacts = [found for time, q, state in parts for found in _contacts(monitor, time, q, state)]
         content = {
-            "run": str(self.run_folder),
+            "run": str(self.model),
             "log": str(self.log),
-            "options": self.words("free", "free_seconds"),
-            **{name: getattr(self, name) for name in ("false_alarms", "bandwidth")},
+            **{name: getattr(self, name) for name in ("free", "false_alarms", "bandwidth")},
             **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
         }
         title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"

@@ -13,10 +13,10 @@ import forcegp
 import forcegp.posterior
 import forcegp.scores
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, FIELDS, Overwriting, listed, unless_given
-from forcegp.cli.estimates import estimates_table
-from forcegp.cli.fit import write_estimates
-from forcegp.cli.input_options import PreparationOptions, RobotOptions, forces_of
+from forcegp.cli.command import DATASET, FIELDS, Command, listed, unless_given
+from forcegp.cli.fit import estimates_table, write_estimates
+from forcegp.cli.log_options import FilterOptions, with_delay_that_shows
+from forcegp.cli.robot_options import RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
 
 WINDOW = 0.4
@@ -26,7 +26,7 @@ LAWS = "viscous", DRY, "offset", "rotor"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Payload(PreparationOptions, RobotOptions, Overwriting):
+class Payload(Command):
     """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
 
     It is `forcegp fit --forces payload:LINK,... --evidence torques:mean=.4` on a log that is filtered first: a motion
@@ -38,36 +38,34 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
       forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
     """
 
-    data: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The log with the payload (a dataset, raw or prepared)."""
     baseline: Annotated[Path | None, DATASET, unless_given("LOG", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """The link that carries the payload; results are in its frame."""
-    forces: Annotated[tuple[str, ...], listed("FORCE,...", goes_on=FIELDS)] = LAWS
+    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), arg(metavar="FORCE,...")] = LAWS
     """What is estimated beside it, as for forcegp fit."""
-    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "auto"
-    """Low-pass filter of a raw log. auto: the one that predicts held-out torques best."""
-    delay: Annotated[str, arg(metavar="S|auto")] = "auto"
-    """Delay of u in the log, in s."""
     out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
     """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
+    robot: RobotOptions = RobotOptions()
+    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto")
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, estimate, write and show."""
         self.require_free(self.out)
         notes: list[str] = []
-        model, rows = self._rows(terminal, self.data, notes)
+        model, rows = self._rows(terminal, self.log, notes)
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
         notes += forces_of(model)
         words = [word for word in self.forces if word != "none"]
         model = forcegp.scores.named_model(model, words)
         with terminal.progress("identifying") as report:
             found = with_payload(model, rows, self.link, baseline, report)
-        content = {"data": str(self.data), **payload_dict(found, baseline is not None)}
+        content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
         if self.out is not None:
             given = {"command": self.words("baseline", "link", "forces", "cutoff", "delay")}
-            with self.folder(self.out, {"data": str(self.data), **given}) as folder:
+            with self.folder(self.out, {"data": str(self.log), **given}) as folder:
                 write_json(folder / "payload.json", content)
                 write_estimates(folder, found, "loaded")
         for note in notes:
@@ -87,12 +85,12 @@ class Payload(PreparationOptions, RobotOptions, Overwriting):
     def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
         """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
         dataset = forcegp.Dataset.load(path)
-        model = self.chosen_model(dataset, path)
+        model = self.robot.chosen_model(dataset, path)
         if forcegp.data.preparation_report(dataset.metadata):
             return model, dataset
         with terminal.progress(f"preparing {path}"):
             raw = replace(dataset, model=model)
-            prepared = self.with_delay_that_shows(terminal, self._preparation(), raw).apply(raw)
+            prepared = with_delay_that_shows(terminal, self.filter.preparation(), raw).apply(raw)
         why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
         return model, prepared

@@ -13,9 +13,8 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.report
-import forcegp.scores
-from forcegp.cli.command import URDF, Overwriting, unless_given
-from forcegp.cli.input_options import RobotFileOptions
+from forcegp.cli.command import URDF, Command, unless_given
+from forcegp.cli.robot_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
 from forcegp.errors import RobotFileWarning
 
@@ -24,7 +23,7 @@ NONE = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Robot(RobotFileOptions, Overwriting):
+class Robot(Command):
     """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
     Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, MJCF where
@@ -33,49 +32,48 @@ class Robot(RobotFileOptions, Overwriting):
     For example:
       forcegp robot arm.urdf
       forcegp robot dog.urdf --base floating
-      forcegp robot arm.urdf --inertias nearest --lock finger=0 --out arm.png
+      forcegp robot arm.urdf --inertias nearest --lock finger=0 --out arm.html
       forcegp robot identified/identified.urdf --out arm.xml
     """
 
-    file: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
+    robot: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
     """The robot file."""
-    out: Annotated[Path | None, unless_given("FILE.png|xml|urdf", "no file")] = None
-    """Draw the robot, or write it as MJCF (.xml, .mjcf) or URDF."""
+    out: Annotated[Path | None, unless_given("FILE.html|xml|urdf", "no file")] = None
+    """A page with the robot in 3D, or the robot as MJCF (.xml, .mjcf) or URDF."""
+    reading: RobotFileOptions = RobotFileOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and draw if asked to."""
 
         def own(path: Path) -> bool:
             data = path.read_bytes()
-            return data.startswith(b"\x89PNG") or b"<mujoco" in data or b"<robot" in data
+            return forcegp.report.is_page(path) or b"<mujoco" in data or b"<robot" in data
 
-        self.require_free_file(self.out, own, "a PNG or a robot file")
+        self.require_free_file(self.out, own, "a page or a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
-            model = forcegp.Model.from_file(self.file, inertias=self.inertias, **self._changes())
+            model = forcegp.Model.from_file(self.robot, inertias=self.reading.inertias, **self.reading.changes())
             robot = model.robot
         repaired = [str(warning.message) for warning in caught]
         for text in repaired:
             terminal.warn(text)
-        content = _content(robot) | {"file": str(self.file), "repaired": repaired}
+        content = _content(robot) | {"file": str(self.robot), "repaired": repaired}
         content["inputs"] = list(model.inputs)
         content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in model.loops))
         terminal.show(*_shown(robot, content))
-        drawn = self.out
         writers = {".xml": model.to_mjcf, ".mjcf": model.to_mjcf, ".urdf": robot.to_urdf}
-        if self.out is not None and self.out.suffix in writers:
-            writers[self.out.suffix](self.out)
-            content["written"], drawn = str(self.out), None
+        if self.out is not None:
+            if self.out.suffix in writers:
+                writers[self.out.suffix](self.out)
+                if model.loops and self.out.suffix == ".urdf":
+                    terminal.warn("URDF has no closed loops: the file holds the open chain.")
+            else:
+                scene = forcegp.report.still_scene(robot, self.robot)
+                drawn, title = forcegp.report.recording(scene), f"{robot.nv} joints"
+                page = forcegp.report.Page(robot.name, title, scene=drawn, scene_notes=scene.doubts)
+                forcegp.report.write_page(self.out, page)
+            content["written"] = str(self.out)
             terminal.note(f"wrote {self.out}")
-            if model.loops and self.out.suffix == ".urdf":
-                terminal.warn("URDF has no closed loops: the file holds the open chain.")
-        if drawn is not None:
-            scene = forcegp.report.still_scene(robot, self.file)
-            if scene.doubts:
-                terminal.note(f"{len(scene.doubts)} meshes are drawn as capsules, for example: {scene.doubts[0]}")
-            forcegp.scores.save_figure(forcegp.report.robot_figure(scene), drawn)
-            content["picture"] = str(drawn)
-            terminal.note(f"picture: {drawn}")
         return content
 
 

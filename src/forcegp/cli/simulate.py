@@ -15,19 +15,19 @@ from tyro.conf import Positional, arg
 import forcegp
 import forcegp.simulation
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import Overwriting, unless_given
+from forcegp.cli.command import Command, numbers_of, unless_given
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
 Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped", "quadrotor"]
-TOOL_FRICTION = arg(metavar="LAW", help_behavior_hint="(default: viscous; coulomb with --contact-model bullet)")
+TOOL_FRICTION = arg(metavar="LAW[:COEFFICIENT]", help_behavior_hint="(default: viscous)")
 JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; dry with more near rest for free arms)")
-OF_THE_TOOL = ("tool_friction", "friction_coefficient", "patch", "surface", "contact_model")
+OF_THE_TOOL = ("tool_friction", "surface")
 """Options of the scenario that has a tool."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate(Overwriting):
+class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
@@ -38,7 +38,7 @@ class Simulate(Overwriting):
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
-      forcegp simulate kuka-surface --tool-friction coulomb --patch 4 --joint-friction coulomb --out rough.h5
+      forcegp simulate kuka-surface --tool-friction coulomb:.2 --joint-friction coulomb --out rough.h5
       forcegp simulate ur5-free --seconds 60 --seed 1 --out arm.h5
       forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
       forcegp simulate quadruped --seconds 30 --seed 1 --out quadruped.h5
@@ -50,27 +50,18 @@ class Simulate(Overwriting):
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     seconds: Annotated[float, arg(metavar="S")] = 200.0
-    """Recorded time of each episode in s, 240 rows per second."""
+    """Recorded time in s, 240 rows per second."""
     seed: Annotated[int, arg(metavar="K")] = 0
     """Draws the way-points and, from a stream of its own, the noise."""
     noise: Annotated[float, arg(metavar="SIGMA")] = 0.1
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
-    trajectories: Annotated[int, arg(metavar="N")] = 1
-    """Number of independent trajectories, each from the start posture."""
     tool_friction: Annotated[str | None, TOOL_FRICTION] = None
-    """Unmodelled friction of the tool: viscous, or a law of dry friction by name, in
-    proportion to the normal force. PyBullet's contact has no other than coulomb."""
-    friction_coefficient: Annotated[float | None, unless_given("F", "1 if viscous, else 0.3", float)] = None
-    """viscous: in N/(m/s). others: friction per normal force while sliding."""
+    """Unmodelled friction of the tool: viscous, with 1 N/(m/s) unless given, or a law of dry friction by name, with 0.3
+    of the normal force while it slides."""
     joint_friction: Annotated[str | None, JOINT_FRICTION] = None
-    """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces; of kuka-surface also
-    exponential, asymmetric, load, lugre and drift, which no model has."""
-    patch: Annotated[float, arg(metavar="FACTOR")] = 1.0
-    """Multiplies friction on the strip 0 < x < 0.25 m of the surface; 1 for none."""
+    """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces."""
     surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
     """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
-    contact_model: Literal["ideal", "bullet"] = "ideal"
-    """ideal: the tool never leaves the surface. bullet: PyBullet's contact, which it leaves now and then."""
     wind: Annotated[float | None, unless_given("M/S", "4; only of quadrotor", float)] = None
     """Mean wind of a quadrotor in m/s, from a random side, with gusts."""
 
@@ -83,7 +74,7 @@ class Simulate(Overwriting):
             dataset.save(temporary)
         seconds = time.monotonic() - start
         terminal.show(
-            f"{self.out}: {len(dataset)} rows ({self.trajectories} x {self.seconds:g} s), seed {self.seed}, "
+            f"{self.out}: {len(dataset)} rows ({self.seconds:g} s), seed {self.seed}, "
             f"noise {self.noise:g} rad/s², simulated in {seconds:.1f} s"
         )
         return {
@@ -101,30 +92,26 @@ class Simulate(Overwriting):
         """The fields of the scenario's configuration that the options set."""
         names = "seconds", "seed", "noise", "joint_friction", "wind"
         fields = {name: value for name in names if (value := getattr(self, name)) is not None}
-        fields["episodes"] = self.trajectories
         own = {"kuka-surface": (*OF_THE_TOOL, "joint_friction"), "quadrotor": ("wind",)}
         others = {*OF_THE_TOOL, "joint_friction", "wind"} - {*own.get(self.scenario, ("joint_friction",))}
         for word in self.words(*sorted(others)):
             raise InvalidInput(f"{word} means nothing to {self.scenario}; leave it out.")
         if self.scenario != "kuka-surface":
-            arm = {} if self.scenario.startswith("quad") else {"arm": self.scenario}
-            return fields | arm
-        fields |= {"friction": self.tool_friction, "contact": self.contact_model, "surface": self.surface}
-        fields["patch_factor"] = self.patch
-        if self.friction_coefficient is not None:
-            dry = self.tool_friction not in (None, "viscous") or self.contact_model == "bullet"
-            fields["coulomb_coefficient" if dry else "viscous_coefficient"] = self.friction_coefficient
-        return fields
+            return fields
+        law, given, number = (self.tool_friction or "viscous").partition(":")
+        if given:
+            complaint = f"--tool-friction {self.tool_friction}: {number!r} is no number; give a law, as in coulomb:.2."
+            kind = "viscous" if law == "viscous" else "coulomb"
+            [fields[f"{kind}_coefficient"]] = numbers_of(number, complaint, one=True)
+        return fields | {"friction": law, "surface": self.surface}
 
 
 def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
-    chosen = forcegp.simulation.SCENARIOS[scenario]
-    config = chosen.config(**options)
     if scenario == "kuka-surface":
         _import_silently("pybullet")
-    with terminal.progress(f"simulating seed {config.seed}") as report:
-        return chosen.simulate(config, report)
+    with terminal.progress(f"simulating seed {options['seed']}") as report:
+        return forcegp.simulation.simulate(scenario, report, **options)
 
 
 def _import_silently(name: str) -> None:

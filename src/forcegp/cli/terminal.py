@@ -235,7 +235,11 @@ def columns(
     table = Table(title=title, box=box.SIMPLE_HEAD, collapse_padding=True, **PLAIN)
     for place, name in enumerate(header):
         folded = long_names and not place
-        table.add_column(Text(name), justify="right" if place else "left", no_wrap=not folded, overflow="fold")
+        # rich counts the longest word, where a cell must not be folded at all
+        cells = [cell for row in (header, *rows, last) for cell in row[place : place + 1]]
+        widest = max(len(line) for cell in cells for line in cell.split("\n"))
+        how: Any = {} if folded else {"no_wrap": True, "min_width": widest}
+        table.add_column(Text(name), justify="right" if place else "left", overflow="fold", **how)
     for row in rows:
         table.add_row(*map(Text, row))  # as a str, "[Nm]" would be a style
     if last:
@@ -260,23 +264,6 @@ def doubts_table(doubts: Doubts, worded: Callable[[str], str]) -> Table:
     return table
 
 
-def number(value: float | None) -> str:
-    """Four decimals for numbers of ordinary size, a power of ten for others, a dash for none."""
-    if value is None:
-        return NONE
-    return f"{value:.4f}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.0e}"
-
-
 def shown(value: float | None, pattern: str = "{:.3g}", factor: float = 1.0) -> str:
     """The number times a factor in this pattern, a dash for none."""
     return NONE if value is None else pattern.format(factor * value)
-
-
-def nats(value: float | None) -> str:
-    """Two decimals: differences below a hundredth of a nat are not significant."""
-    return shown(value, "{:.2f}")
-
-
-def percent(value: float | None) -> str:
-    """`94.6 %`."""
-    return shown(value, "{:.1f} %", 100.0)

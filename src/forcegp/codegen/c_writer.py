@@ -3,15 +3,62 @@
 GCC and Clang understand vector types on every processor (`__attribute__((vector_size))`). A long program is cut into
 parts, functions of their own: in one function, twice as much takes a compiler far more than twice as long. Values that
 later parts use wait in an array, whose places are used again.
+
+Functions of lanes are within three units of the last place. exp, sine, cosine: Cody & Waite, "Software Manual for the
+Elementary Functions" (1980); log: the series of atanh (Muller, "Elementary Functions", 2016, ch. 5). tanh and asinh
+from expm1 and log1p, so that nothing cancels near 0. What is rare takes libm, lane by lane.
 """
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from math import factorial
 
-from forcegp.codegen.c_text import c_text
 from forcegp.codegen.graph import LEAVES, Graph
-from forcegp.codegen.vector_math import lane_functions
+
+
+@cache
+def c_text(module: str, file: str) -> str:
+    """A file beside this module."""
+    return (files(module.rpartition(".")[0]) / file).read_text(encoding="ascii")
+
+
+def sections(module: str, file: str) -> dict[str, str]:
+    """The parts of a file, by the names above them: `//// NAME`."""
+    return dict(re.findall(r"^//// (\S+)\n(.*?)(?=^////|\Z)", c_text(module, file), re.MULTILINE | re.DOTALL))
+
+
+def filled(text: str, words: Mapping[str, object]) -> str:
+    """The text with what stands for every `@WORD@`."""
+    return re.sub("@([A-Z_0-9]+)@", lambda found: str(words[found[1]]), text)
+
+
+LANE_BY_LANE = ("tan", "asin", "acos", "atan", "sinh", "cosh", "erf")
+
+
+def _horner(coefficients: list[float], variable: str) -> str:
+    """A polynomial, the highest power first."""
+    text = f"R({coefficients[0].hex()})"
+    for value in coefficients[1:]:
+        text = f"({text} * {variable} + {value.hex()})"
+    return text
+
+
+_EXPM1 = _horner([1.0 / factorial(n) for n in range(14, 0, -1)], "r")
+_SIN = _horner([(-1.0) ** n / factorial(2 * n + 1) for n in range(7, -1, -1)], "z")
+_COS = _horner([(-1.0) ** n / factorial(2 * n) for n in range(8, -1, -1)], "z")
+_ATANH = _horner([2.0 / (2 * n + 1) for n in range(11, 0, -1)], "z")
+
+
+def lane_functions(lanes: int) -> str:
+    """The type `real` of that many doubles, and functions on it."""
+    words = {"LANES": lanes, "EXPM1": _EXPM1, "SIN": _SIN, "COS": _COS, "ATANH": _ATANH}
+    by_lane = (f"INLINE real r_{name}(real x) {{ return by_lane({name}, x); }}\n" for name in LANE_BY_LANE)
+    return filled(c_text(__name__, "lanes.h"), words) + "".join(by_lane)
+
 
 STATEMENTS = 500  # per part
 LONG_PART = 2500  # of dynamics, whose values are used again soon: 10-20 % faster, compiled as fast

@@ -17,7 +17,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache, reduce
 from operator import or_
 from pathlib import Path
@@ -40,71 +39,59 @@ LONGEST = 600.0
 """Seconds after which a compiler hangs: our longest program takes it a fiftieth of that."""
 
 
-@dataclass(frozen=True)
-class Purpose:
-    """What errors name: what is compiled, how another folder is chosen, and what works without a compiler."""
+WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
+ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
 
-    what: str
-    elsewhere: str
-    instead: str
 
-    def compiler(self) -> list[str]:
-        """The C compiler's command, with options from the variable CC. Raises CompilerError where there is none."""
-        try:
-            chosen = shlex.split(os.environ.get(VARIABLE, ""))
-        except ValueError as error:
-            raise CompilerError(
-                f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command "
-                f"({error}); correct it, or {self.instead}, whose results are the same."
-            ) from None
-        for command in [chosen] if chosen else [[command] for command in COMMANDS]:
-            if shutil.which(command[0]):
-                return command
-        looked_for = f"{', '.join(COMMANDS[:-1])} or {COMMANDS[-1]}"
-        if chosen:
-            looked_for = f"{chosen[0]!r}, which the environment variable {VARIABLE} names"
+def compiler() -> list[str]:
+    """The C compiler's command, with options from the variable CC. Raises CompilerError where there is none."""
+    try:
+        chosen = shlex.split(os.environ.get(VARIABLE, ""))
+    except ValueError as error:
         raise CompilerError(
-            f"{self.what} needs a C compiler, and there is none here (looked for {looked_for}); install one "
-            f"({PACKAGES}), name it by {VARIABLE}, or {self.instead}, whose results are the same."
-        )
+            f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command ({error}); correct "
+            f"it, {WITHOUT}."
+        ) from None
+    for command in [chosen] if chosen else [[command] for command in COMMANDS]:
+        if shutil.which(command[0]):
+            return command
+    looked_for = f"{chosen[0]!r}, which {VARIABLE} names" if chosen else ", ".join(COMMANDS)
+    raise CompilerError(
+        f"compiled code needs a C compiler, and there is none here (looked for {looked_for}); install one "
+        f"({PACKAGES}), name it by the environment variable {VARIABLE}, {WITHOUT}."
+    )
 
 
-def compile_library(source: str, options: Iterable[str], library: Path, function: str, purpose: Purpose) -> ctypes.CDLL:
+def compile_library(source: str, options: Iterable[str], library: Path, function: str) -> ctypes.CDLL:
     """Compile a C text to the shared library ``library``, and load it, which shows that it has ``function``.
 
     Raises :class:`~forcegp.errors.CompilerError` where there is no compiler, where it fails or does not end, and where
     nothing may be run from the folder.
     """
-    compiler = purpose.compiler()
-    command = [*compiler, *options, "-x", "c", "-", "-o", str(library), "-lm"]
+    command = compiler()
+    whole = [*command, *options, "-x", "c", "-", "-o", str(library), "-lm"]
     try:
         done = subprocess.run(
-            command, input=source, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST
+            whole, input=source, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST
         )
-        lines = done.stderr.strip().splitlines()
-        named = next(
-            (line for line in lines if "error" in line), lines[-1] if lines else f"exit code {done.returncode}"
-        )
-        why = named if done.returncode else None
+        lines = [*done.stderr.strip().splitlines(), f"exit code {done.returncode}"]
+        why = next((line for line in lines if "error" in line), lines[0]) if done.returncode else None
     except OSError as error:  # not a program
         why = str(error)
     except subprocess.TimeoutExpired:
         why = f"it did not end within {LONGEST:g} s"
-    if why is not None:
-        raise CompilerError(
-            f"the C compiler failed: {shlex.join(compiler)}: {why}; name another (GCC or Clang) by the "
-            f"environment variable {VARIABLE}, or {purpose.instead}, whose results are the same."
-        )
-    try:
-        loaded = ctypes.CDLL(str(library))
-        getattr(loaded, function)
-    except (OSError, AttributeError) as error:
-        raise CompilerError(
-            f"what the C compiler wrote cannot be loaded ({shlex.join(compiler)}: {error}): its linker "
-            f"is broken, or no program may be run from {library.parent}; choose another folder ({purpose.elsewhere}), "
-            f"name another compiler by {VARIABLE}, or {purpose.instead}, whose results are the same."
-        ) from None
-    return loaded
+    if why is None:
+        try:
+            loaded = ctypes.CDLL(str(library))
+            getattr(loaded, function)
+        except (OSError, AttributeError) as error:
+            why = f"what it wrote cannot be loaded ({error}): its linker is broken, or no program may be run there"
+        else:
+            return loaded
+    raise CompilerError(
+        f"the C compiler failed: {shlex.join(command)}: {why}; name another (GCC or Clang) by the environment variable "
+        f"{VARIABLE}, {ELSEWHERE}, {WITHOUT}."
+    )
 
 
 def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
@@ -125,17 +112,9 @@ VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")
 OPTIONS = ("-std=gnu11", "-O2", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")
 
 
-@dataclass(frozen=True)
-class VectorUnit:
-    """How many doubles are worked on at once, and the options of the compiler for it."""
-
-    lanes: int
-    options: tuple[str, ...]
-
-    @classmethod
-    def of_this_processor(cls) -> "VectorUnit":
-        """What torch found."""
-        return cls(*VECTOR_UNITS.get(torch.backends.cpu.get_cpu_capability(), (2, ())))
+def vector_unit() -> tuple[int, tuple[str, ...]]:
+    """How many doubles are worked on at once, and the options of the compiler for it: what torch found."""
+    return VECTOR_UNITS.get(torch.backends.cpu.get_cpu_capability(), (2, ()))
 
 
 def default_folder() -> Path:
@@ -147,46 +126,42 @@ def default_folder() -> Path:
 def load_library(
     name: str,
     key: str,
-    write: Callable[[VectorUnit], str],
-    folder: Path,
-    purpose: Purpose,
+    write: Callable[[int], str],
     options: Sequence[str] = (),
-) -> tuple[ctypes.CDLL, Path]:
-    """The library with the function `evaluate` that `write` gives the C text of, and its file.
+    folder: Path | None = None,
+) -> ctypes.CDLL:
+    """The library with the function `evaluate` that `write` gives the C text of, for so many lanes.
 
-    From ``folder`` if a file of that name and key is there, else compiled into it. ``key`` must hold everything that
-    decides the text beside the code of this package; ``options`` are more of the compiler's.
-    Raises :class:`~forcegp.errors.CompilerError` where there is no C compiler, where it fails, where ``folder`` cannot
+    From ``folder`` (`default_folder`) if a file of that name and key is there, else compiled into it. ``key`` must hold
+    everything that decides the text beside the code of this package; ``options`` are more of the compiler's.
+    Raises :class:`~forcegp.errors.CompilerError` where there is no C compiler, where it fails, where the folder cannot
     be written to, and where others than the user can write to it or to a folder above it.
     """
-    unit = VectorUnit.of_this_processor()
-    parts = (key, *options, repr(unit), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
+    lanes, of_unit = vector_unit()
+    parts = (key, *options, repr((lanes, of_unit)), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
-    path = own_folder(folder, purpose) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
+    path = own_folder(folder) / f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[:60]}-{digest[:32]}.so"
     if not path.exists():
-        source, compiled = write(unit), (*OPTIONS, *unit.options, *options)
+        source, compiled = write(lanes), (*OPTIONS, *of_unit, *options)
         try:
             with atomic_file(path) as library:  # whoever else compiles the same meanwhile
-                compile_library(source, compiled, library, "evaluate", purpose)  # tried before it is kept
+                compile_library(source, compiled, library, "evaluate")  # tried before it is kept
                 library.chmod(0o700)
         except OSError as error:
-            raise CompilerError(
-                f"the folder {path.parent} for {purpose.what} cannot be written to ({error.strerror}); choose another: "
-                f"{purpose.elsewhere}."
-            ) from error
-    return opened_library(path, purpose), path
+            raise CompilerError(f"{path.parent} cannot be written to ({error.strerror}); {ELSEWHERE}.") from error
+    return opened_library(path)
 
 
-def opened_library(path: Path, purpose: Purpose) -> ctypes.CDLL:
+def opened_library(path: Path) -> ctypes.CDLL:
     """The library of a file that nobody else may write to. Raises CompilerError where it cannot be loaded."""
-    own_file(path, purpose)
+    own_file(path)
     try:
         library = ctypes.CDLL(str(path))
         library.evaluate.restype = ctypes.c_int
     except (OSError, AttributeError) as error:
         raise CompilerError(
-            f"{path} cannot be loaded ({error}); delete it, and it is compiled anew. If that does not help, choose "
-            f"a folder from which programs may be run: {purpose.elsewhere}."
+            f"{path} cannot be loaded ({error}); delete it, and it is compiled anew. If that does not help, no program "
+            f"may be run from its folder: {ELSEWHERE}."
         ) from error
     return library
 
@@ -200,59 +175,61 @@ def code_digest() -> str:
     return hashlib.sha256(b"\0".join(path.read_bytes() for path in files)).hexdigest()
 
 
-def own_folder(folder: Path, purpose: Purpose) -> Path:
+def own_folder(folder: Path | None = None) -> Path:
     """``folder`` without symbolic links, made if it is missing, where nobody else can put or exchange anything."""
-    folder = Path(os.path.realpath(folder))  # what is checked is what is used, wherever a link points later
+    folder = Path(
+        os.path.realpath(folder or default_folder())
+    )  # what is checked is what is used, wherever a link points later
     try:
         for part in (*reversed(folder.parents), folder):
             if not part.is_dir():
                 part.mkdir(mode=0o700, exist_ok=True)  # another process may make it meanwhile
-            own_file(part, purpose, parent=part != folder)
+            own_file(part, parent=part != folder)
     except OSError as error:
-        raise CompilerError(
-            f"the folder {folder} for {purpose.what} cannot be made ({error.strerror}); choose another: "
-            f"{purpose.elsewhere}."
-        ) from error
+        raise CompilerError(f"the folder {folder} cannot be made ({error.strerror}); {ELSEWHERE}.") from error
     return folder
 
 
-def own_file(path: Path, purpose: Purpose, *, parent: bool = False) -> None:
+def own_file(path: Path, *, parent: bool = False) -> None:
     """Nobody but the user and root may exchange the file or what is in the folder.
 
     In a parent folder with the sticky bit, such as /tmp, everybody may make files, but exchange only their own.
     """
     if not hasattr(os, "getuid"):
         return
-    status = path.stat()
+    status, danger = path.stat(), "and code from it would run with your rights"
     if status.st_uid not in (os.getuid(), 0):
-        raise CompilerError(
-            f"{path} belongs to another user, and code from it would run with your rights; choose a folder "
-            f"that lies in folders of your own: {purpose.elsewhere}."
-        )
+        raise CompilerError(f"{path} belongs to another user, {danger}; {ELSEWHERE}, in folders of your own.")
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not (parent and status.st_mode & stat.S_ISVTX):
         raise CompilerError(
-            f"{path} can be written to by others than you, and code from it would run with your rights; take that "
-            f"away (chmod go-w {shlex.quote(str(path))}) or choose another folder: {purpose.elsewhere}."
+            f"{path} can be written to by others than you, {danger}; take that away (chmod go-w "
+            f"{shlex.quote(str(path))}), or {ELSEWHERE}."
         )
 
 
-STATES_PER_THREAD = 2048  # fewer are done before another thread has started
+MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started
 NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
 """What a program reports of its states: bits of its return value."""
 
 
 class RowFunction:
-    """`evaluate` of a library, with inputs and outputs of these lengths; `tables` are flat arrays for it."""
+    """`evaluate` of a library: rows of numbers from rows of numbers; `tables` are flat arrays for it.
+
+    It takes so many `inputs`; `outputs` are the lengths of its results at one state.
+    """
 
     def __init__(
-        self, library: ctypes.CDLL, inputs: Sequence[int], outputs: Sequence[int], tables: Sequence[Tensor] = ()
+        self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Sequence[Tensor] = ()
     ) -> None:
-        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
-        self.library, self._held = library, tuple(tables)
+        self.library, self.inputs, self.outputs, self._held = library, inputs, tuple(outputs), tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
-        vectors = len(inputs) + len(outputs)
-        self._evaluate.argtypes = [ctypes.c_long] * 2 + [ctypes.c_void_p, *[ctypes.c_void_p, ctypes.c_long] * vectors]
+        vectors = [ctypes.c_void_p, ctypes.c_long] * (inputs + len(outputs))
+        self._evaluate.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, *vectors]
+
+    def with_tables(self, tables: Sequence[Tensor]) -> "RowFunction":
+        """The same code with other numbers."""
+        return RowFunction(self.library, self.inputs, self.outputs, tables)
 
     def single(self, *inputs: Tensor) -> tuple[int, list[Tensor]]:
         """What is to be reported, and the outputs (size,) at one state (size,)."""
@@ -260,33 +237,35 @@ class RowFunction:
         given = [argument for x in (*inputs, *made) for argument in (x.data_ptr(), 1)]
         return self._evaluate(0, 1, self._tables, *given), made
 
-    def rows(self, count: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> int:
+    def rows(
+        self,
+        count: int,
+        inputs: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        threads: int | None = None,
+        least: int = STATES_PER_THREAD,
+    ) -> int:
         """Fill `outputs` for `count` states; what is to be reported.
 
-        Inputs and outputs are contiguous tensors (count, size); an input may be (1, size), for all states. Large
-        batches take as many threads as torch has.
+        Inputs and outputs are contiguous tensors (count, size); an input may be (1, size), for all states. Batches of
+        `least` states for each take as many threads as torch has, or `threads`.
         """
-        threads = max(1, min(torch.get_num_threads(), count // STATES_PER_THREAD))
-        pointers = [number for x in (*inputs, *outputs) for number in (x.data_ptr(), _stride(count, x))]
-        bounds = [count * k // threads for k in range(threads + 1)]
+        parts = max(1, min(torch.get_num_threads() if threads is None else threads, count // least))
+        given = [x for each in (*inputs, *outputs) for x in (each.data_ptr(), _stride(count, each))]
+        bounds = [MOST_LANES * (count * k // parts // MOST_LANES) for k in range(parts)] + [count]
 
-        def part(thread: int) -> int:
-            return self._evaluate(bounds[thread], bounds[thread + 1], self._tables, *pointers)
+        def part(k: int) -> int:
+            return self._evaluate(bounds[k], bounds[k + 1], self._tables, *given)
 
-        return reduce(or_, in_threads(part, threads))
+        if parts == 1:
+            return part(0)
+        others = [_pool(parts - 1, os.getpid()).submit(part, k) for k in range(1, parts)]
+        return reduce(or_, (other.result() for other in others), part(0))
 
 
 def _stride(count: int, rows: Tensor) -> int:
     """Numbers from one state to the next."""
     return rows.shape[1] if rows.shape[0] == count else 0
-
-
-def in_threads(part: Callable[[int], int], count: int) -> list[int]:
-    """part(0), part(1), ... at once, the first in this thread; ctypes lets other threads run meanwhile."""
-    if count == 1:
-        return [part(0)]
-    others = [_pool(count - 1, os.getpid()).submit(part, k) for k in range(1, count)]
-    return [part(0), *(other.result() for other in others)]
 
 
 @cache

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import override
 
-from forcegp.control.controller import per_joint
+from forcegp.control.tracking import per_joint
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.posterior import load_posterior

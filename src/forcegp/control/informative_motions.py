@@ -21,20 +21,20 @@ from scipy.interpolate import BSpline
 from typing_extensions import override
 
 from forcegp.atomic_files import atomic_file
-from forcegp.control.controller import per_joint
+from forcegp.control.tracking import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.evidence.identifiability import base_parameters, torque_regressor
-from forcegp.inference.cholesky_update import rows_to_keep, with_only
+from forcegp.inference.cholesky_update import with_only
 from forcegp.inference.posterior import exact
 from forcegp.inference.threads import blas_threads
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact
 from forcegp.model import Model
-from forcegp.posterior.components import inverse_dynamics
 from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import inverse_dynamics
 from forcegp.posterior.update import learn_more_rows
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number
@@ -84,7 +84,7 @@ class LearnedForces:
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, model = posterior.noise_std.numpy(), posterior.model
         rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model)
-        return learn_more_rows(posterior, rows, None, rows_to_keep)
+        return learn_more_rows(posterior, rows, None)
 
     def spread(self, posterior: Posterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""

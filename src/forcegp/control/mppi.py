@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.control.controller import Controller, OnFailure, per_joint
+from forcegp.control.tracking import Controller, OnFailure, per_joint
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.posterior.predictor import Predictor

@@ -12,16 +12,15 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from forcegp.codegen.c_text import c_text, filled
-from forcegp.codegen.library import Purpose, aligned, default_folder, load_library
+from forcegp.codegen.c_writer import c_text, filled
+from forcegp.codegen.library import load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
-from forcegp.posterior.components import require_actuated
+from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import Summary
 
 mujoco: Any = untyped
-PURPOSE = Purpose("a passive force for MuJoCo", "the environment variable XDG_CACHE_HOME", "use predictor.rollouts")
 STATES = 5  # random ones, at which robots are compared
 ALIKE = 1e-6  # relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF
 
@@ -57,13 +56,13 @@ class MujocoForces(Summary):
             raise InvalidInput("the predictor was made with compile=False; MuJoCo needs the C program.")
         places = _joints(model, own.robot.joint_names)
         _require_alike(predictor, model, places)
-        code, nv = predictor.code.traced, predictor.nv
+        code, nv = predictor.code, predictor.nv
         program = code.program("passive")
         if set(program.graph.inputs[2 * nv :]) & set(program.graph.needed(program.nodes)):
             raise InvalidInput(
                 "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
             )
-        codes = code.drawn(predictor.latent, draw, whole_number("seed", seed, 0))
+        codes = code.drawn(draw, whole_number("seed", seed, 0))
         if codes is None:
             raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
@@ -71,8 +70,8 @@ class MujocoForces(Summary):
         source = codes[0].c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
         include = f"-I{Path(mujoco.__file__).parent / 'include'}"
         key = json.dumps([source, mujoco.mj_versionString()])
-        self._library = load_library("mujoco", key, lambda _: source, default_folder(), PURPOSE, (include,))[0]
-        self._held = [[aligned(part.table()) for part in each.sums] for each in codes]
+        self._library = load_library("mujoco", key, lambda _: source, (include,))
+        self._held = [each.tables() for each in codes]
         self._tables = [(ctypes.c_void_p * max(1, len(held)))(*(x.data_ptr() for x in held)) for held in self._held]
         self._chosen, self._active, self._failed = self._tables[0], False, False
 

@@ -139,7 +139,7 @@ class Unknowns:
     def accelerations(self, x: Tensor) -> Accelerations:
         """The mean acceleration and its derivatives, in x as well."""
         posterior, (numbers, _) = self.posterior(x), self.split(x)
-        mean, nv = posterior.accelerations(None).mean(), posterior.model.robot.nv
+        mean, nv = posterior.accelerations(None), posterior.model.robot.nv
         space, bodies = posterior.model.robot.space, self.space.bodies
         forces, standardize = posterior.trained.unknown, posterior.likelihood.standardization
         carriers = [each.body for each in self.space.carried]

@@ -21,8 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.codegen.c_text import c_text, filled, sections
-from forcegp.codegen.c_writer import c_value
+from forcegp.codegen.c_writer import c_text, c_value, filled, sections
 from forcegp.codegen.derivatives import gradients
 from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
 from forcegp.codegen.tracing import trace

@@ -17,7 +17,7 @@ from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.codegen.c_text import c_text, filled
+from forcegp.codegen.c_writer import c_text, filled
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import PointMap
 from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms

@@ -393,4 +393,5 @@ def check_time_step(dt: Any) -> None:
 
 
 def _all(q: Tensor) -> Tensor:
-    return torch.ones(q.shape[0], dtype=torch.bool, device=q.device)
+    device = getattr(q, "device", None)  # expressions of CasADi, which take explicit steps, have none
+    return torch.ones(q.shape[0], dtype=torch.bool, device=device)

@@ -291,28 +291,20 @@ class ConstrainedDynamics:
         offset = (inverse_lower.mT @ white_offset)[..., 0]
         return cls(state, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse, contacts)
 
-    def acceleration_map(self, known: bool = True) -> AffineMap:
-        """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K.
+    def acceleration_map(self) -> AffineMap:
+        """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K."""
+        return AffineMap(self.constrained_offset + (self.H @ self.Q_K[..., None])[..., 0], self.H)
 
-        When `known` is false the offset is M^-1 Q_b alone, and Q_U must carry Q_K too.
-        """
-        offset = self.constrained_offset
-        if known:
-            offset = offset + (self.H @ self.Q_K[..., None])[..., 0]
-        return AffineMap(offset, self.H)
-
-    def multiplier_map(self, known: bool = True) -> AffineMap:
+    def multiplier_map(self) -> AffineMap:
         """lambda = offset + matrix Q_U, in N for surfaces that are signed distances."""
         projector = self.pseudo_inverse @ (self.A @ self.inverse_lower.mT)  # A~^+ A~
         matrix = -self.pseudo_inverse.mT @ projector @ self.inverse_lower
         offset = (self.pseudo_inverse.mT @ (self.pseudo_inverse @ self.b[..., None]))[..., 0]
-        if known:
-            offset = offset + (matrix @ self.Q_K[..., None])[..., 0]
-        return AffineMap(offset, matrix)
+        return AffineMap(offset + (matrix @ self.Q_K[..., None])[..., 0], matrix)
 
-    def contact_force_map(self, known: bool = True) -> AffineMap:
+    def contact_force_map(self) -> AffineMap:
         """World force on the robot at each contact in turn, s_p^T lambda, stacked to (..., 3 m), in N."""
-        multiplier = self.multiplier_map(known)
+        multiplier = self.multiplier_map()
         offset = (self.normals * multiplier.offset[..., None]).flatten(-2)
         matrix = (self.normals[..., None] * multiplier.matrix[..., None, :]).flatten(-3, -2)
         return AffineMap(offset, matrix)

@@ -1,13 +1,15 @@
 """A fitted model as C99 that needs nothing but <math.h>: `export_c`.
 
-The program is that of a compiled predictor (`predictor_code`) for one state, with its tables inside as constants; what
-is written (`c_files`) is compiled and compared with `posterior.predict` before the folder appears.
+The program is that of a compiled predictor (`programs`) for one state, with its tables inside as constants; what
+is written is compiled and compared with `posterior.predict` before the folder appears.
 """
 
 import ctypes
+import importlib.metadata
+import re
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,28 +19,207 @@ import torch
 from torch import Tensor
 
 from forcegp.atomic_files import atomic_folder, require_writable
-from forcegp.codegen.library import Purpose, compile_library
-from forcegp.codegen.tracing import trace
+from forcegp.codegen.c_writer import c_text, filled, head, sections, write_function
+from forcegp.codegen.library import compile_library, compiler
+from forcegp.data import units_for
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, require_type
+from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.inference.posterior import ExactPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.posterior.c_files import CFiles, Check, identifier
-from forcegp.posterior.fused_rollouts import require_step
 from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.predictor_code import PredictorCode
-from forcegp.posterior.predictor_preparation import rows_for, sample_states
+from forcegp.posterior.predictor import Predictor
+from forcegp.posterior.preparation import rows_for, sample_states
+from forcegp.posterior.programs import Physics, Programs, require_step
+
+STORED = 10
+"""States of the self-test."""
+ALIKE = ("CMakeLists.txt", "example.c", "self_test.c", "README.txt")
+TAKEN = ("math", "string", "stdio", "stddef", "stdarg", "features", "example", "self_test", "jac", "hess", "null")
+"""Names of other files, and those that CasADi does not take."""
+
+
+def identifier(name: str) -> str:
+    """A name for C and for files, of any text."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", name)[:60].strip("_").lower() or "robot"
+    plain = plain if plain[0].isalpha() else f"robot_{plain}"
+    return f"{plain}_model" if plain in TAKEN else plain
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a function of the program gives at states (n, nq + nv + nu), and how far it may be from that, relative."""
+
+    function: str
+    states: np.ndarray
+    wanted: list[np.ndarray]
+    tolerance: float
+    left_out: set[int]
+    """Rows that the self-test does not hold."""
+
+    @property
+    def scales(self) -> list[float]:
+        """The largest value of every output."""
+        return [float(np.abs(x).max()) or 1.0 for x in self.wanted]
+
+
+@dataclass(frozen=True, eq=False)
+class CFiles:
+    """The texts of all files of a program; `reference` computes by torch what it does."""
+
+    posterior: Posterior
+    reference: Predictor
+    code: Programs
+    name: str
+    jacobian: bool
+    dt: float | None
+    integrator: str
+
+    @property
+    def kinds(self) -> list[str]:
+        """The functions of the program."""
+        chosen = {"covariance": self.reference.kind == "compressed", "linearize": self.jacobian}
+        chosen |= {"step": self.dt is not None, "step_jacobian": self.dt is not None and self.jacobian}
+        return ["mean", *(kind for kind, wanted in chosen.items() if wanted)]
+
+    def write(self, folder: Path, source: str | None, said: str, checks: Sequence[Check]) -> None:
+        """All files; `said` is how good the program is."""
+        nq, nv, nu = self.code.sizes
+        start = [", ".join(map(repr, x.tolist())) for x in self.split(checks[0].states[0])]
+        program = sections(__name__, "exported_c/model.c")
+        space = self.code.space
+        stepped = "" if self.dt is None else self.code.step_source(self.integrator, self._stepped)
+        words: dict[str, object] = {"NAME": self.name, "NV": nv, "NQ": nq, "NU": nu, "DT": self.dt}
+        words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
+        words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
+        words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
+        words |= {"COMMENT": self._comment(said), "GIVEN": 0, "IMPLICIT": int(self.integrator == "implicit-midpoint")}
+        words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
+        moving = not space.is_vector_space
+        words |= {"ALL": nq + nv + nu, "X": nq + nv, "COLUMNS": 2 * nv + nu, "TITLE": self._title}
+        words["STATE"] = "step from q, v, u" if moving else "q, v, u"
+        words["ADVANCE"] = sections(__name__, "exported_c/advance.c")["turned" if moving else "added"]
+        if "covariance" in self.kinds:
+            words["GIVEN"] = len(self.code.program("covariance").nodes)
+        words = {word: filled(str(value), words) for word, value in words.items()}
+        kinds = (*(("integrate",) if moving else ()), *self.kinds)
+        functions = filled("".join(program[kind] for kind in kinds), words)
+        prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
+        words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
+        parts = [filled(program["head"], words), *self._program(), filled(program["calls"], words), functions]
+        files = {
+            f"{self.name}.c": "\n".join(parts),
+            f"{self.name}.h": filled(c_text(__name__, "exported_c/model.h"), words),
+        }
+        for form in ("external", "acados") if self.dt is not None else ("external",):
+            found = sections(__name__, f"exported_c/{form}.c")
+            usable = [kind for kind in self.kinds if kind != "linearize" or nq == nv == nu]  # of one size
+            chosen = "".join(found[kind] for kind in ("head", *usable) if kind in found)
+            files[f"{self.name}_{form}.c"] = filled(chosen, words)
+        files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
+        for file, content in files.items():
+            (folder / file).write_text(content, encoding="ascii")
+
+    def split(self, rows: np.ndarray) -> list[np.ndarray]:
+        """q, v and u (..., size) of rows."""
+        return np.split(rows, np.cumsum(self.code.sizes)[:2], axis=-1)
+
+    @property
+    def _stepped(self) -> str:
+        return "slopes" if self.integrator == "implicit-midpoint" else "mean"
+
+    def _program(self) -> Iterator[str]:
+        """Tables and static functions."""
+        names, code = [], self.code
+        wanted = {"covariance": "mean_and_terms"} if "covariance" in self.kinds else {}
+        slopes = self.jacobian or (self.dt is not None and self._stepped == "slopes")
+        wanted |= {"mean": "mean"} | ({"linearize": "slopes"} if slopes else {})
+        yield head(1)
+        for k, table in enumerate(code.tables("covariance" if "covariance" in wanted else "mean")):
+            names.append(f"table{k}")
+            yield f"static const double table{k}[] = {{\n{_numbers(table.tolist())}}};"
+        yield f"static const double *const tables[] = {{{', '.join(names) or '0'}}};"
+        for kind in (False, True) if slopes else (False,):
+            yield from (part.c_source(1, kind) for part in code.sums)
+        if "covariance" in wanted:
+            yield from (part.roots_source(1, code.rank) for part in code.sums)
+            yield code.covariance_source().replace("void covariance(", "void covariance_of(")
+        yield from code.motion_source(1)
+        for kind, function in wanted.items():
+            program = code.program(kind)
+            called = [part.name + ("_slopes" if kind == "linearize" else "") for part in code.sums]
+            yield write_function(function, program.graph, program.nodes, 1, called)
+
+    @property
+    def _title(self) -> str:
+        points = f"{len(self.posterior.training.q)} training points"
+        return _plain(f"(q, v, u) -> a of {self.posterior.model.robot.name}, {self.posterior.description}, {points}")
+
+    def _comment(self, said: str) -> str:
+        robot, units = self.posterior.model.robot, units_for(self.posterior.model.robot)
+        lines = [self._title, f"contacts: {len(self.posterior.model.contacts)}"]
+        if not self.code.space.is_vector_space:
+            lines += [f"q: {', '.join(robot.position_names)}; any length of a quaternion or of cos and sin serves"]
+            lines += [f"v, a: {', '.join(robot.joint_names)}; of a base in its own axes; m, rad, s"]
+            lines += [f"u: {', '.join(self.posterior.model.inputs)}, in the units of the model; switches are 1 or 0"]
+        for k, name in enumerate(robot.joint_names if self.code.space.is_vector_space else ()):
+            own = (f"{key} in {units[key] if isinstance(units[key], str) else units[key][k]}" for key in "qvua")
+            lines.append(f"joint {k}: {name}, {', '.join(own)}")
+        if self.reference.inflation is not None:
+            wider = float(self.reference.inflation.max())
+            lines.append(f"standard deviations: never below those of predict, at most {wider:.1%} above at its checks")
+        if self.table_error:
+            lines.append(f"tables of one input, relative error {self.table_error:.1e}, NaN outside their range")
+        lines += [f"a step lasts {self.dt!r} s, by {self.integrator}"] if self.dt is not None else []
+        return "\n".join(f"   {_plain(line)}" for line in [*lines, said])
+
+    @property
+    def table_error(self) -> float:
+        """The largest relative one; 0 without tables."""
+        return max((part.functions.error for part in self.code.sums if isinstance(part, OneInputCall)), default=0.0)
+
+    def _stored(self, checks: Sequence[Check]) -> tuple[str, str]:
+        """Arrays and calls of the self-test."""
+        arrays, calls = [], []
+        for check in checks:
+            rows = [k for k in range(min(len(check.states), 100)) if k not in check.left_out]
+            rows = rows[:: max(1, len(rows) // STORED)]
+            states, what = check.states[rows], check.function.removeprefix(f"{self.name}_")
+            arrays.append(_array(f"{what}_states", states))
+            places = np.cumsum(self.code.sizes)
+            given = [f"{what}_states[k]", *(f"{what}_states[k] + {place}" for place in places[:2])]
+            made = [f"r{j}" for j in range(len(check.wanted))]
+            lines = [f"double {r}[{wanted.shape[1]}];" for r, wanted in zip(made, check.wanted, strict=True)]
+            lines.append(f"if ({check.function}({', '.join(given + made)})) failures++;")
+            for j, (wanted, scale) in enumerate(zip(check.wanted, check.scales, strict=True)):
+                arrays.append(_array(f"{what}_{j}", wanted[rows]))
+                bound = 10.0 * check.tolerance * scale
+                lines.append(f'compare("{check.function}", r{j}, {what}_{j}[k], {wanted.shape[1]}, {bound!r});')
+            calls.append(f"  for (int k = 0; k < {len(states)}; k++) {{\n    " + "\n    ".join(lines) + "\n  }")
+        return "\n".join(arrays), "\n".join(calls)
+
+
+def _numbers(values: Sequence[float]) -> str:
+    lines = (values[k : k + 6] for k in range(0, len(values), 6))
+    return "".join(f"  {', '.join(value.hex() for value in line)},\n" for line in lines)
+
+
+def _array(name: str, rows: np.ndarray) -> str:
+    text = ",\n  ".join(f"{{{', '.join(value.hex() for value in row)}}}" for row in rows.tolist())
+    return f"static const double {name}[{len(rows)}][{rows.shape[1]}] = {{\n  {text}}};"
+
+
+def _plain(line: str) -> str:
+    """Text that cannot end a comment, whatever a robot file calls its joints."""
+    return re.sub(r"[^\x20-\x7e]|[@*?\\]", "_", line)
+
 
 STATES = 300
 """States at which the program is compared."""
 MEAN_TOLERANCE, TABLE_TOLERANCE = 5e-12, 1e-7
-"""Largest difference relative to the largest value: of sums, unless `Predictor.rounding` is larger, and of tables."""
+"""Largest difference relative to the largest value: of sums, unless `rounding` is larger, and of tables."""
 LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3}
 """How many times as much as the mean these may differ: more cancels in them."""
 BETWEEN = ("linearize", "step", "step_jacobian")
 SUFFIXES = {"covariance": "mean_covariance"}
-PURPOSE = Purpose(
-    "the check of an exported model", "the environment variable TMPDIR", "export without it, `unchecked=True`"
-)
 
 
 @dataclass(frozen=True)
@@ -104,7 +285,7 @@ def export_c(
         raise InvalidInput(f"{folder} exists already and is not an empty folder; choose another name.")
     require_writable(folder)
     reference = posterior.predictor(covariance="compressed" if covariance else "none", compile=False)
-    code = exported_code(posterior, reference.compressed)
+    code = posterior.programs(compressed=reference.compressed)
     called = identifier(name or posterior.model.robot.name)
     export = CFiles(posterior, reference, code, called, jacobian, steps, integrator)
     checks = _checks(export)
@@ -122,40 +303,16 @@ def export_c(
     return CExport(export.name, folder, files, differences, inflation)
 
 
-def exported_code(posterior: Posterior, compressed: CompressedCovariance | None = None) -> PredictorCode:
-    """The programs. Raises InvalidInput that names the term of the prior, where one cannot be traced."""
-    try:
-        return posterior.code(compressed=compressed)
-    except InvalidInput as error:
-        raise _named(posterior, error) from None
-
-
-def _named(posterior: Posterior, error: InvalidInput) -> InvalidInput:
-    """The error of a graph that cannot be made, with the term of the prior that is the cause; others as they are."""
-    why, traced, _ = str(error).partition(", which the model's")
-    if not traced:
-        return error
-    rows = rows_for(posterior.training, posterior.trained, posterior.model)
-    states = [x[:1] for x in (rows.q, rows.v, rows.u)]
-
-    def holds(*terms: Any) -> bool:
-        def function(q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
-            dynamics = posterior.dynamics(q, v, u)
-            return [dynamics.H, *(z for term in terms for z in (term.direction(dynamics), *term.features(dynamics)))]
-
-        try:
-            trace(function, states)
-        except InvalidInput:
-            return False
-        return True
-
-    terms = posterior.trained.unknown.named(posterior.model.robot)
-    found = [f"the force {title!r}" for title, term, _ in terms if not holds(term)]
-    what = "a kernel of the prior" if holds() else "a contact or known force of the system"
-    return InvalidInput(
-        f"{found[0] if found and holds() else what} cannot be exported: {why}; write it with other operations and "
-        "without branches on values, or fit without it."
-    )
+def rounding(posterior: Posterior, q: Tensor, v: Tensor, u: Tensor) -> float:
+    """What rounding of the sums over all points may change in the mean, relative to its largest value there."""
+    physics, latent = Physics.of(posterior, posterior.model), posterior.latent
+    W, features = physics.mixing(q, v, u)
+    if not W.shape[-1]:
+        return 0.0
+    mean = posterior.predict(q, v, u, covariance=False).mean
+    parts = zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
+    terms = torch.stack([kernel.cross(z, centers).abs() @ w.abs() for kernel, z, centers, w in parts], dim=-1)
+    return torch.finfo(mean.dtype).eps * float((W.abs() @ terms[..., None]).max() / mean.abs().max())
 
 
 def _checks(export: CFiles) -> list[Check]:
@@ -171,8 +328,8 @@ def _checks(export: CFiles) -> list[Check]:
     if not space.is_vector_space:
         moved[:, : sizes[0]] = space.normalized(moved[:, : sizes[0]])
     between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
-    rounding = made.rounding(*sampled[finite].split(sizes, dim=-1))
-    tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, rounding)
+    lost = rounding(own, *sampled[finite].split(sizes, dim=-1))
+    tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, lost)
     found = []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]
@@ -198,7 +355,7 @@ def _checks(export: CFiles) -> list[Check]:
 def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str, float]:
     """The largest difference by function. Nothing without a compiler; a warning says so."""
     try:
-        PURPOSE.compiler()
+        compiler()
     except CompilerError as error:
         warnings.warn(f"the exported program was not compared with forcegp: {error}", stacklevel=3)
         return {}
@@ -206,7 +363,7 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
     found = {}
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "checked.so"
-        library = compile_library(f'#include "{export.name}.c"\n', options, path, f"{export.name}_mean", PURPOSE)
+        library = compile_library(f'#include "{export.name}.c"\n', options, path, f"{export.name}_mean")
         for check in checks:
             found[check.function] = worst = _difference(export, library[check.function], check)
             if not worst <= check.tolerance:

@@ -1,6 +1,6 @@
 """A posterior as a CasADi function, with all derivatives: for do-mpc, acados, IPOPT, and CasADi's own C.
 
-The graph that programs are written from (`predictor_code`) becomes scalar expressions (SX); sums over centres become
+The graph that programs are written from (`programs`) becomes scalar expressions (SX); sums over centres become
 products of matrices (MX), whose size does not grow with the derivatives. CasADi is an extra (LGPL): it is imported here
 and only here.
 """
@@ -9,6 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,15 +19,14 @@ from torch import Tensor
 from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.codegen.tracing import trace
-from forcegp.errors import MissingExtra, NumericalError, require_type
+from forcegp.errors import NumericalError, require_type, required_extra
 from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
-from forcegp.posterior.c_export import exported_code
-from forcegp.posterior.c_files import identifier
-from forcegp.posterior.fused_rollouts import require_step
+from forcegp.integration import integrator_named
+from forcegp.posterior.c_export import identifier, rounding
 from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.predictor_code import PredictorCode
-from forcegp.posterior.predictor_preparation import rows_for, sample_states
+from forcegp.posterior.preparation import rows_for, sample_states
+from forcegp.posterior.programs import Programs, require_step
 
 STATES = 100
 TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
@@ -50,19 +50,15 @@ def casadi_function(
     Raises MissingExtra without CasADi, InvalidInput for other models than structured ones, for operations that no
     graph holds, steps that are no positive number, and other integrators.
     """
-    try:
-        import casadi
-    except ImportError:
-        raise MissingExtra(
-            "casadi_function needs CasADi, which is not installed; pip install 'forcegp[casadi]'."
-        ) from None
+    casadi: Any = required_extra("casadi", "casadi", "casadi_function")
     require_type("posterior", posterior, Posterior)
-    code = exported_code(posterior)
+    code = posterior.programs()
     name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
     given = *code.sizes, sum(len(part.latents) for part in code.sums)
-    results, names, space = [_function(casadi, "physics", code.physics, code.a, given)(*x, f)], ["a"], code.space
+    physics = _function(casadi, "physics", code.traced.graph, code.traced.a, given)
+    results, names, space = [physics(*x, f)], ["a"], code.space
     acceleration = casadi.Function(name, x, results, ["q", "v", "u"], names)
     if steps is None:
         if space.is_vector_space:
@@ -89,8 +85,7 @@ def export_casadi(
     """
     called = identifier(name or posterior.model.robot.name)
     functions = {called: casadi_function(posterior, name=called)}
-    import casadi  # it is there, or the line above has raised
-
+    casadi: Any = required_extra("casadi", "casadi", "export_casadi")
     rows = rows_for(posterior.training, posterior.trained, posterior.model)
     q, v, u = sample_states(rows, posterior.model.robot.space, STATES, 2, STATES // 3)
     expected = {called: posterior.predict(q, v, u, covariance=False).mean}
@@ -99,7 +94,7 @@ def export_casadi(
         functions[step] = casadi_function(posterior, steps=steps, integrator=integrator, name=step)
         predictor = posterior.predictor(covariance="none", compile=False)
         expected[step] = torch.cat(predictor.step(q, v, u, steps, integrator), dim=-1)
-    rounding, found = posterior.predictor(covariance="none", compile=False).rounding(q, v, u), {}
+    lost, found = rounding(posterior, q, v, u), {}
     for file, function in functions.items():
         try:
             made = _evaluated(function, [x.numpy().T for x in (q, v, u)])[:, : expected[file].shape[1]]
@@ -109,7 +104,7 @@ def export_casadi(
                 "written; give shorter steps, or export to C, whose Newton method shortens what overshoots."
             ) from None
         worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
-        if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, rounding):
+        if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, lost):
             raise NumericalError(
                 f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
                 "to C, or fit with fewer points, which cancel less."
@@ -135,25 +130,18 @@ def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: 
     return _function(casadi, "moved", graph, found.tolist(), sizes)
 
 
-def _stepped(
-    casadi: Any, code: PredictorCode, acceleration: Any, x: Sequence[Any], dt: float, integrator: str
-) -> list[Any]:
-    """The formulas of `integration.integrators`."""
-    (q, v, u), space, (nq, nv, _) = x, code.space, code.sizes
-    if space.is_vector_space:
-        moved, rate = operator.add, lambda step, at: at
-    else:
-        moved, rate = _of_space(casadi, space.integrate, (nq, nv)), _of_space(casadi, space.chart_velocity, (nv, nv))
-    if integrator == "symplectic-euler":
-        v = v + dt * acceleration(q, v, u)
-        return [moved(q, dt * v), v]
-    if integrator == "rk4":
-        k = [(v, acceleration(q, v, u))]
-        for share in (0.5 * dt, 0.5 * dt, dt):
-            at, step = v + share * k[-1][1], share * k[-1][0]
-            k.append((rate(step, at), acceleration(moved(q, step), at, u)))
-        step, change = (dt / 6.0 * (a + 2.0 * b + 2.0 * c + d) for a, b, c, d in zip(*k, strict=True))
-        return [moved(q, step), v + change]
+def _stepped(casadi: Any, code: Programs, acceleration: Any, x: Sequence[Any], dt: float, integrator: str) -> list[Any]:
+    """The steps of `integration.integrators`; Newton's method of the implicit one is CasADi's."""
+    (q, v, u), space = x, code.space
+    if integrator != "implicit-midpoint":
+        method: Any = integrator_named(integrator, code.physics.model)
+        if not space.is_vector_space:
+            nq, nv, _ = code.sizes
+            made = {"integrate": (nq, nv), "chart_velocity": (nv, nv)}
+            own = {name: _of_space(casadi, getattr(space, name), sizes) for name, sizes in made.items()}
+            method = type(method)(SimpleNamespace(**own))
+        moved = method.step(lambda q, v: acceleration(q, v, u), q, v, dt)
+        return [moved.q, moved.v]
     middle, half = casadi.MX.sym("middle", v.numel()), 0.5 * dt
     rest = middle - v - half * acceleration(q + half * middle, middle, u)
     solve = casadi.rootfinder("solve", "newton", {"x": middle, "p": casadi.vertcat(q, v, u), "g": rest})
@@ -168,13 +156,14 @@ def _function(casadi: Any, name: str, graph: Graph, nodes: Sequence[int], sizes:
     return casadi.Function(name, vectors, [casadi.vertcat(*expressed(casadi, graph, nodes, scalars))])
 
 
-def _latents(casadi: Any, code: PredictorCode, x: Sequence[Any]) -> list[Any]:
+def _latents(casadi: Any, code: Programs, x: Sequence[Any]) -> list[Any]:
     """E f of every process in the order of their numbers."""
     graph, found = Graph(sum(code.sizes)), {}
-    copied = Copier(graph, code.physics, dict(zip(code.physics.inputs, graph.inputs, strict=False)))
+    at = code.traced
+    copied = Copier(graph, at.graph, dict(zip(at.graph.inputs, graph.inputs, strict=False)))
     for part in code.sums:
         summed = part.summed if isinstance(part, OneInputCall) else part
-        given = summed.given(graph, copied(code.features[summed.latents[0]]))
+        given = summed.given(graph, copied(at.features[summed.latents[0]]))
         z = _function(casadi, "operands", graph, given, code.sizes)(*x)
         found |= dict(zip(summed.latents, _sum(casadi, summed, casadi.vertsplit(z)), strict=True))
     return [found[c] for c in sorted(found)]

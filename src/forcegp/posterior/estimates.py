@@ -118,12 +118,6 @@ class Estimates(Summary, Mapping[str, Estimate]):
             "converged": self.settled,
         }
 
-    def of(self, prefix: str) -> dict[str, Estimate]:
-        """Those whose names begin with `prefix.`, by the rest of the name: `of("viscous")["joint_1"]`."""
-        return {
-            each.name.removeprefix(f"{prefix}."): each for each in self.entries if each.name.startswith(f"{prefix}.")
-        }
-
     def std_of(self, names: Sequence[str], weights: Sequence[float] | None = None) -> float:
         """Standard deviation of a weighted sum of numbers, for example the mass of all bodies."""
         assert self.covariance is not None, "there are estimates"

@@ -91,11 +91,6 @@ class Fitted(Summary):
         found = dict(hyperparameters), result, dict(settings), latent, engine, estimates or Estimates()
         return cls(model, likelihood, *found)
 
-    @staticmethod
-    def parameter_shapes(model: Model, training: TrainingData) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the hyper-parameters that a posterior on these rows needs."""
-        return MarginalLikelihood(model, training).parameter_shapes
-
     @property
     def kernels(self) -> LatentKernels:
         """Of the latent functions, at their start values."""

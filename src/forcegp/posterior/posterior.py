@@ -14,33 +14,36 @@ from forcegp.errors import InvalidInput, NumericalError, require_type, usable_ar
 from forcegp.evidence import Accelerations
 from forcegp.evidence.training_data import second_moments, shrunk
 from forcegp.forces import Force
-from forcegp.inference.cholesky_update import rows_to_keep
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import Feedback
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import FORCE, Noise
-from forcegp.posterior.components import Components, Curve, components_of, curve_of, quantity_of
 from forcegp.posterior.fitted import Fitted
 from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
     ROWS_PER_BLOCK,
     Array,
+    Components,
+    Curve,
     Gaussian,
     Inputs,
     Positions,
     Prediction,
     Rows,
+    components_of,
+    curve_of,
     join_predictions,
+    quantity_of,
     state_rows,
     state_tensor,
 )
 from forcegp.posterior.predictor import Predictor
-from forcegp.posterior.predictor_code import PredictorCode
-from forcegp.posterior.predictor_preparation import physics_of, prepared_predictor, rows_for
-from forcegp.posterior.rollout import AccelerationModel, Rollout, accelerations_of, remembering, roll_out
-from forcegp.posterior.update import Keep, learn_and_forget, learn_more_rows
+from forcegp.posterior.preparation import prepared_predictor, rows_for
+from forcegp.posterior.programs import Physics, Programs
+from forcegp.posterior.rollout import AccelerationFunction, Rollout, accelerations, remembering, roll_out
+from forcegp.posterior.update import learn_and_forget, learn_more_rows
 from forcegp.robots import Robot
 
 
@@ -197,9 +200,7 @@ class Posterior(Fitted):
         ------
         InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
         """
-        how: Any = {"covariance": covariance, "tolerance": tolerance, "largest_rank": largest_rank, "compile": compile}
-        physics, training = physics_of(self, self.model), rows_for(self.training, self.trained, self.model)
-        return replace(prepared_predictor(self.latent, self.widening, training, physics, **how), posterior=self)
+        return prepared_predictor(self, covariance, tolerance, largest_rank, compile)
 
     def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
         """States as rows of float64 tensors on the model's device, and their batch dimensions.
@@ -208,16 +209,18 @@ class Posterior(Fitted):
         """
         return state_rows(self.model, q, v, u)
 
-    def code(self, model: Model | None = None, compressed: CompressedCovariance | None = None) -> PredictorCode:
-        """The mean as a graph, from which programs are written, in another system if one is given.
+    def programs(
+        self, model: Model | None = None, compressed: CompressedCovariance | None = None, key: str | None = None
+    ) -> Programs:
+        """What is compiled and exported, in another model if one is given; `key` is that of records on disk.
 
-        Raises InvalidInput for operations that no graph holds, models on another device, and noisy torques.
+        Raises InvalidInput for models on another device and noisy torques, and when something is made of them for
+        operations that no graph holds.
         """
         model = self.model if model is None else model
-        physics = physics_of(self, model)
         rows = rows_for(self.training, self.trained, model)
         example = [x[:1] for x in (rows.q, rows.v, rows.u)]
-        return PredictorCode.of(physics, example, model.robot.space, self.latent, compressed, self.widening)
+        return Programs(Physics.of(self, model), example, self.latent, self.widening, compressed, key)
 
     def rollout(
         self,
@@ -260,7 +263,9 @@ class Posterior(Fitted):
         given. Raises InvalidInput for arguments that do not fit, among them tensors that require a gradient without
         `grad`, NumericalError where the initial state cannot be projected.
         """
-        model = self.accelerations(baumgarte)
+        if baumgarte is not None and not self.model.contacts:
+            raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
+        model = replace(self.model, baumgarte=baumgarte)
         if self.model.held_inputs:
             check_time_step(dt)
             u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device), dt)
@@ -268,19 +273,18 @@ class Posterior(Fitted):
             given = state_tensor("u", u, self.model.sizes[2], self.model.robot.device)
             u, feedback = remembering(self.model, given, dt, feedback)
         how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed, "progress": progress}
-        moved = roll_out(model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
+        moved = roll_out(self, model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
         return replace(moved, intervals=self.motion_intervals)
 
-    def accelerations(self, baumgarte: Baumgarte | None) -> AccelerationModel:
-        """What `rollout` integrates, under this stabilisation. Raises InvalidInput for one without contacts."""
-        return accelerations_of(self, baumgarte)
+    def accelerations(self, baumgarte: Baumgarte | None, samples: int = 0, seed: int = 0) -> AccelerationFunction:
+        """(q, v, u) -> a of n rows, as `rollout` integrates it: the mean, or drawn functions, n / samples each."""
+        return accelerations(self, replace(self.model, baumgarte=baumgarte), samples, seed)
 
     def update(
         self,
         rows: Dataset,
         budget: int | None = None,
         *,
-        keep: Keep = rows_to_keep,
         horizon: float | Mapping[str, float] | None = None,
     ) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
@@ -302,7 +306,7 @@ class Posterior(Fitted):
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, rows)
         if horizon is None:
-            return replace(learn_more_rows(own, rows, budget, keep), target=self.target)
+            return replace(learn_more_rows(own, rows, budget), target=self.target)
         return replace(learn_and_forget(own, rows, budget, horizon), target=self.target)
 
     def with_model(self, model: Model) -> "Posterior":

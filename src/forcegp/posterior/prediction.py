@@ -1,7 +1,7 @@
-"""Predictions as frozen values."""
+"""Predictions as values: of accelerations, of every force by itself, and of the u that makes an acceleration."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -10,7 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownRow
+from forcegp.errors import InvalidInput, NumericalError, UnknownName, UnknownRow, require_known
+from forcegp.evidence import Accelerations
+from forcegp.forces import Actuation, UnknownForces
+from forcegp.integration.integrators import find_roots, rows_jacobian
+from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, listed
@@ -175,3 +179,218 @@ def state_tensor(name: str, values: Array, size: int, device: torch.device) -> T
         )
     require_finite(name, tensor)
     return tensor
+
+
+@dataclass(frozen=True, eq=False)
+class ForceComponent:
+    """One of the forces that add up to the unknown force, at a batch of states.
+
+    `joint_force` (..., nv) in Nm or N; `latents` (..., C) are the values of its processes, in `latent_units`;
+    `point_force` (..., 3) in N along the axes of the world, for forces that act at a point of the robot, else None;
+    `acceleration` (..., nv) in rad/s^2 or m/s^2 is what it adds to the acceleration under the constraint.
+    """
+
+    name: str
+    latent_names: tuple[str, ...]
+    latent_units: tuple[str, ...]
+    latents: Gaussian
+    joint_force: Gaussian
+    acceleration: Gaussian
+    point_force: Gaussian | None
+
+
+@dataclass(frozen=True, eq=False)
+class Components(Mapping[str, ForceComponent]):
+    """The components by name, what they add up to, and the constraint's answer.
+
+    `total` (..., nv) in Nm or N is the whole unknown force, with the covariances between components; `multiplier` is
+    lambda (..., m) and `contact_force` the world force of every contact on the robot (..., 3 m), in N, both with the
+    known forces in them.
+    """
+
+    total: Gaussian
+    multiplier: Gaussian
+    contact_force: Gaussian
+    parts: Mapping[str, ForceComponent] = field(default_factory=dict)
+
+    @override
+    def __getitem__(self, name: str) -> ForceComponent:
+        require_known("component", name, "this model", self.parts, UnknownName)
+        return self.parts[name]
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.parts)
+
+    @override
+    def __len__(self) -> int:
+        return len(self.parts)
+
+
+def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: Gaussian) -> Components:
+    """All components of Q_U = B f at the states of `dynamics`."""
+    robot = dynamics.state.robot
+    B = prior.direction(dynamics)
+    parts = {}
+    for name, term, which in prior.named(robot):
+        own, mixing = latents.entries(which), B[..., which]
+        point = term.point_force(dynamics)
+        parts[name] = ForceComponent(
+            name,
+            term.latent_names(robot),
+            term.latent_units(robot),
+            own,
+            joint_force=own.through(mixing),
+            acceleration=own.through(dynamics.H @ mixing),
+            point_force=None if point is None else own.through(point),
+        )
+
+    def constraint(affine: tuple[Tensor, Tensor]) -> Gaussian:
+        return latents.through(affine[1] @ B, affine[0])
+
+    multiplier, contact_force = dynamics.multiplier_map(), dynamics.contact_force_map()
+    return Components(latents.through(B), constraint(multiplier), constraint(contact_force), parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One process over some of its features, for example a friction curve: force over velocity.
+
+    `features` (n, d) and their names with units; `mean` and `std` (n,) in `unit`; `visited` (2, d) is the range of the
+    features in the training data.
+    """
+
+    name: str
+    unit: str
+    feature_names: tuple[str, ...]
+    features: Float[Tensor, "n d"]
+    mean: Float[Tensor, " n"]
+    std: Float[Tensor, " n"]
+    visited: Float[Tensor, "2 d"]
+
+    def interval(self, probability: float = 0.95) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Lower and upper end of the central interval of this probability."""
+        if not 0.0 < probability < 1.0:
+            raise InvalidInput(f"probability is {probability}; give a number between 0 and 1")
+        quantile = torch.special.ndtri(torch.tensor(0.5 * (1.0 + probability), dtype=torch.float64))
+        return self.mean - quantile * self.std, self.mean + quantile * self.std
+
+
+def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:
+    """Q_K + Q_U, the mean of what acts on the joints of a Posterior beside the contacts."""
+    Q_U = posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
+    return dynamics.Q_K + Q_U
+
+
+def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Q_K + Q_U (n, nv) at states (n, nv), and the entries (n, k) of dQ/du, M, A and b one after the other."""
+    Q, slope = rows_jacobian(lambda u: joint_force(posterior, posterior.dynamics(q, v, u)), u)
+    at = posterior.dynamics(q, v, u)
+    return Q, torch.cat([slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b], dim=-1).detach()
+
+
+def require_actuated(posterior: Any) -> None:
+    """Raises InvalidInput for a Posterior of which no u can be solved for."""
+    actuated = any(isinstance(force, Actuation) and force.known for force in posterior.model.laws)
+    nv, nu = posterior.model.sizes[1:]
+    if nv != nu:
+        raise InvalidInput(
+            f"no u makes every acceleration: {posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} "
+            "entries; search for u with `predictor.linearize` or `predictor.rollouts`."
+        )
+    if posterior.carries_known_forces or not actuated:
+        lacks = "RigidBodies()" if posterior.carries_known_forces else "Actuation()"
+        raise InvalidInput(
+            f"this model has no {lacks} among its laws, so no u can be solved for; call `predict`, or fit one that has."
+        )
+
+
+def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool) -> Gaussian:
+    """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a Posterior at rows of q, v and a.
+
+    u stands on both sides: friction in proportion to the load changes with what presses the robot onto the surface,
+    and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
+    J = d(Q_K + Q_U)/du and the covariance S of the processes, that of u is to first order J^-1 B S B^T J^-T.
+    """
+    require_actuated(posterior)
+    q, v, a = (x.detach() for x in states)
+    shape = (len(q), len(posterior.model.contacts))
+    wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
+    if wanted.shape not in (shape, shape[1:]):
+        raise InvalidInput(
+            f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, one per contact."
+        )
+    require_finite("normal_force", wanted)
+
+    def surplus(u: Tensor, learned: bool = True) -> Tensor:
+        """What is left over of Q_K + Q_U + A^T lambda - M a."""
+        at = posterior.dynamics(q, v, u)
+        Q = joint_force(posterior, at) if learned else at.Q_K
+        return Q + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
+
+    with torch.no_grad():
+        # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
+        u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))
+        if not bool(found.all()):
+            raise NumericalError(
+                f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration: friction takes as much "
+                "as u adds, or a number is too large; check q, v, a and normal_force of that row."
+            )
+        if not covariance:
+            return Gaussian(u, None)
+        at = posterior.dynamics(q, v, u)
+        response = torch.linalg.solve(rows_jacobian(surplus, u)[1], posterior.trained.unknown.direction(at))
+        return Gaussian(u, posterior.latents(at, True).through(response).covariance)
+
+
+def quantity_of(posterior: Any, of: Any, predicted: Any, states: Sequence[Any]) -> Gaussian:
+    """One of the quantities that `Posterior.predict` takes as `of`, from its prediction at these states."""
+    contacts, forces = list(posterior.model.contacts), list(posterior.model.unknown_forces)
+    if isinstance(of, Accelerations):
+        return predicted.acceleration
+    if of in contacts:
+        return predicted.contact_force.entries(slice(3 * contacts.index(of), 3 * contacts.index(of) + 3))
+    if of in forces:
+        components = posterior.components(*states, covariance=predicted.covariance is not None)
+        return list(components.values())[forces.index(of)].joint_force
+    raise InvalidInput(
+        f"of holds {of!r}; give Accelerations(), or a contact or an unknown force of the model that predicts."
+    )
+
+
+def curve_of(posterior: Any, latent: str, features: Any, points: int) -> Curve:
+    """What `Posterior.curve` documents."""
+    names = posterior.latent_names
+    require_known("latent", latent, "this model", names)
+    index = names.index(latent)
+    prior, robot = posterior.trained.unknown, posterior.trained.robot
+    with torch.no_grad():
+        given = prior.features(posterior.likelihood.dynamics)[index]
+        visited = torch.stack([given.amin(0), given.amax(0)]) if given.shape[-1] else given[:2]
+        z = _curve_features(latent, features, visited, points)
+        standardization = posterior.likelihood.standardization
+        shift, scale = (part[index] for part in (standardization.shift, standardization.scale))
+        mean, variance = posterior.latent.one(index, (z - shift) / scale)
+    labels = prior.feature_names(robot)
+    inputs = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
+    std = posterior.widening * variance.clamp_min(0.0).sqrt()
+    return Curve(latent, prior.latent_units(robot)[index], inputs, z, mean, std, visited)
+
+
+def _curve_features(latent: str, given: Any, visited: Tensor, points: int) -> Tensor:
+    """Features (n, d) of a curve, checked."""
+    count = visited.shape[-1]
+    if given is None:
+        if not count:
+            return visited[:1]  # a constant has one value
+        if count != 1:
+            raise InvalidInput(f"{latent!r} is a function of {count} features; give features (n, {count})")
+        if points < 1:
+            raise InvalidInput(f"a curve of points={points} was asked for; give 1 or more")
+        steps = torch.linspace(0.0, 1.0, points, dtype=torch.float64, device=visited.device)
+        return visited[0] + steps[:, None] * (visited[1] - visited[0])
+    z = real_tensor(f"features of {latent!r}", given, visited.device)
+    z = z[:, None] if z.dim() == 1 and count == 1 else z
+    if z.dim() != 2 or z.shape[-1] != count or not bool(torch.isfinite(z).all()):
+        raise InvalidInput(f"features of {latent!r} have shape {tuple(z.shape)}; give finite numbers (n, {count})")
+    return z

@@ -1,18 +1,20 @@
 """`Predictor`: a posterior prepared for control rates, where a prediction is due every millisecond.
 
-Rigid-body terms, constraints, prior, features and processes become one C program (`predictor_code`), and the covariance
-uses few combinations of the data (`inference.prepared_kernels`). `structured.predictor_preparation` makes one.
+Rigid-body terms, constraints, prior, features and processes become one C program (`programs`), and the covariance uses
+few combinations of the data (`inference.prepared_kernels`).
 """
 
 import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
@@ -20,15 +22,14 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
-from forcegp.posterior.components import Components, forces_around, inverse_dynamics
-from forcegp.posterior.fused_rollouts import FusedLoop, Motions, fused, steps_of
-from forcegp.posterior.kept_code import KeptCode
-from forcegp.posterior.prediction import Gaussian, JointForces, Linearization
-from forcegp.posterior.predictor_code import MeanWithGradient, TermsFunction
+from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
+from forcegp.posterior.programs import Programs, steps_of
 from forcegp.posterior.rollout import (
+    AccelerationFunction,
+    Motions,
     StepLinearization,
-    by_sample,
     checked_start,
+    fused,
     linearized_on_manifold,
     linearized_step,
     stepped,
@@ -42,8 +43,8 @@ INSTEAD_OF_TRANSFORMS = (
     "compile=False"
 )
 BY_TORCH = "predictions are computed by torch, some hundred times slower"
-BLOCK_NUMBERS = 2**18
-"""Kernel values that torch works on at once: 2 MiB, so that they stay in the processor's cache."""
+BLOCK = 256
+"""States that torch works on at once, so that their kernel values stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,25 +65,27 @@ class Predictor(Summary):
     NumericalWarning says how much slower that is.
     """
 
+    posterior: Any
     space: ConfigurationSpace
     sizes: tuple[int, int, int]  # of q, v and u
     device: torch.device
-    latent: LatentPosterior
-    terms: TermsFunction
-    code: KeptCode | None
+    code: Programs | None
     kind: str
     compressed: CompressedCovariance | None
-    widening: float
-    prepare_seconds: float
-    posterior: Any = None  # what it was made of, by which forces and inverse dynamics are computed
-    _functions: dict[str, RowFunction | None] = field(default_factory=dict)
-    _failed: list[CompilerError] = field(default_factory=list)
-    _loops: dict[tuple[str, int, int], list[FusedLoop] | None] = field(default_factory=dict)
+    prepare_seconds: float = 0.0
+    _made: dict[Any, Any] = field(default_factory=dict)
+    """Programs by their kind, and loops by integrator, functions and seed."""
 
     def __getstate__(self) -> dict[str, Any]:
-        own = {"_functions": {}, "_failed": [], "_loops": {}}  # loaded code means nothing in another process
-        return self.__dict__ | own
+        kept = {name: value for name, value in vars(self).items() if name != "by_torch"}
+        return kept | {"_made": {}}  # loaded code means nothing in another process
 
+    @cached_property
+    def by_torch(self) -> AccelerationFunction:
+        """The mean acceleration of rows."""
+        return self.posterior.accelerations(self.posterior.model.baumgarte)
+
+    @override
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
         covariance = {"joints": self.nv, "covariance": self.kind, "device": self.device}
@@ -100,13 +103,19 @@ class Predictor(Summary):
                 "refreshed takes what posterior.update(...) gave of the predictor's own posterior, and no compressed "
                 "covariance (covariance='none' or 'exact'); make a new one by posterior.predictor()."
             )
-        code = self.code and self.code.refreshed(latent)
-        tables = code.traced.tables if code else []
-        functions = {k: f and RowFunction(f.library, f.inputs, f.outputs, tables) for k, f in self._functions.items()}
-        of_mean = {how: loops for how, loops in self._loops.items() if not how[1]}
-        loops = {how: x and [FusedLoop(loop.library, tables) for loop in x] for how, x in of_mean.items()}
-        made = {"_functions": functions, "_loops": loops}
-        return replace(self, latent=latent, code=code, posterior=posterior, **made)
+        code, made = self.code and self.code.refreshed(latent), {}
+        tables = code.tables() if code else []
+        for how, found in self._made.items():
+            if isinstance(how, str):
+                made[how] = found and found.with_tables(tables)
+            elif not how[1]:  # the mean
+                made[how] = found and [loop.with_tables(tables) for loop in found]
+        return replace(self, posterior=posterior, code=code, _made=made)
+
+    @property
+    def latent(self) -> LatentPosterior:
+        """The posterior of the latent functions."""
+        return self.posterior.latent
 
     @property
     def nv(self) -> int:
@@ -130,7 +139,7 @@ class Predictor(Summary):
             return self._at_one("mean", compiled, one)[0]
         states, single = self._states(q, v, u)
         if not compiled:
-            return _finished([self._mean(*part)[0] for part in self._blocks(states)], single)
+            return _finished([self.by_torch(*part) for part in _blocks(states)], single)
         if torch.is_grad_enabled() and any(x.requires_grad for x in states):
             return _finished([MeanWithGradient.apply(self, *states)], single)  # type: ignore[list-item]  # torch does not type `apply`
         return _single(self.run("mean", states)[0], single)
@@ -150,11 +159,7 @@ class Predictor(Summary):
         if compiled and not (torch.is_grad_enabled() and any(x.requires_grad for x in states)):
             a, covariance = self.run("covariance", states)
             return _single(a, single), _single(covariance.view(-1, nv, nv), single)
-        means, covariances = [], []
-        for part in self._blocks(states):
-            mean, W, features = self._mean(*part)
-            means.append(mean)
-            covariances.append(W @ self._covariance(W, features) @ W.mT)
+        means, covariances = zip(*(self._with_covariance(*part) for part in _blocks(states)), strict=True)
         return _finished(means, single), _finished(covariances, single)
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
@@ -226,14 +231,13 @@ class Predictor(Summary):
     ) -> Motions:
         """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast.
 
-        As `posterior.rollout` with the predictor's own system: rad, rad/s, Nm and s (m, m/s, N); what diverges is NaN
-        from the row `diverged_at` on. Under the mean, or with `functions` once under each of so many functions drawn
-        from the posterior, which then are the first dimension; `divided` takes motions (functions, ..., nv) instead,
-        each under the function of its own. A compiled predictor steps many motions at once, without Python in between,
-        on `threads` threads (None: as many as torch has). Without a graph.
+        As `posterior.rollout` with the predictor's own model; what diverges is NaN from the row `diverged_at` on. Under
+        the mean, or with `functions` once under each of so many functions drawn from the posterior, which then are the
+        first dimension; `divided` takes motions (functions, ..., nv) instead, each under the function of its own. A
+        compiled predictor steps many at once on `threads` threads (None: as many as torch has), without a graph.
         Raises InvalidInput for arguments that do not fit.
         """
-        most = torch.get_num_threads() if threads is None else whole_number("threads", threads, 1)
+        threads = None if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(
             self.sizes, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
@@ -244,15 +248,13 @@ class Predictor(Summary):
             )
         method = integrator_named(integrator, self.posterior.model)
         check_time_step(dt)
-        how = integrator, functions, seed
-        loops, acceleration = self._loops.get(how), self.mean
-        if loops is None and integrator in steps_of(self.space):
-            loops = self._loops[how] = self._made(lambda code: code.loops(integrator, self.latent, functions, seed))
+        loops, acceleration = None, self.mean
+        if integrator in steps_of(self.space):
+            loops = self._of_code((integrator, functions, seed), lambda code: code.loops(integrator, functions, seed))
         if functions:
-            model = self.posterior.accelerations(self.posterior.model.baumgarte)
 
             def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
-                return by_sample(model.sampled(functions, seed), functions)(q, v, u)
+                return self.posterior.accelerations(self.posterior.model.baumgarte, functions, seed)(q, v, u)
 
             if not divided:
                 start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
@@ -263,14 +265,9 @@ class Predictor(Summary):
             if loops is None:
                 motion = integrate(method, acceleration, start, v, forces, dt)
             else:
-                motion = fused(loops, method, acceleration, start, v, forces, dt, most)
+                motion = fused(loops, method, acceleration, start, v, forces, dt, threads)
         q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (motion.q, motion.v, motion.a))
         return Motions(q, v, a, motion.diverged_at.reshape(batch))
-
-    def forces(self, q: Any, v: Any, u: Any, *, covariance: bool = True) -> Components:
-        """Unknown force, multipliers, contact force and every component of the prior, with exact covariances."""
-        self._states(q, v, u)
-        return self.posterior.components(q, v, u, covariance=covariance)
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""
@@ -315,16 +312,37 @@ class Predictor(Summary):
 
     def _by_torch(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
         """What the program gives."""
-        parts = []
-        for part in self._blocks(states):
-            if kind == "linearize":
-                parts.append(self._linearize(part))
-            elif kind == "forces":
-                parts.append(forces_around(self.posterior, *part))
-            else:
-                mean, W, features = self._mean(*part)
-                parts.append((mean, W @ self._covariance(W, features) @ W.mT) if kind == "covariance" else (mean,))
-        return [_finished(list(rows), False).flatten(1) for rows in zip(*parts, strict=True)]
+        with torch.no_grad():
+            parts = [self._block_by_torch(kind, part) for part in _blocks(states)]
+        return [_finished(rows, False).flatten(1) for rows in zip(*parts, strict=True)]
+
+    def _block_by_torch(self, kind: str, states: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        match kind:
+            case "mean":
+                return (self.by_torch(*states),)
+            case "covariance":
+                return self._with_covariance(*states)
+            case "forces":
+                return forces_around(self.posterior, *states)
+        nq, nv, nu = self.sizes
+        a, slopes = rows_jacobian(lambda x: self.by_torch(*x.split(self.sizes, dim=-1)), torch.cat([*states], dim=-1))
+        if self.space.is_vector_space:
+            return a, slopes
+        in_q, rest = slopes.split([nq, nv + nu], dim=-1)
+        return a, torch.cat([in_q @ self.space.tangent(states[0]), rest], dim=-1)
+
+    def _with_covariance(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and covariance by torch."""
+        posterior, prior = self.posterior, self.posterior.trained.unknown
+        dynamics = posterior.dynamics(q, v, u)
+        latents = posterior.latents(dynamics, self.compressed is None)
+        if self.compressed is not None:
+            features = posterior.likelihood.standardization(prior.features(dynamics))
+            spread = posterior.widening**2 * self.compressed.at(posterior.latent, features)
+            latents = Gaussian(latents.mean, spread)
+        affine = posterior.acceleration_map(dynamics)[0]
+        found = latents.through(affine.matrix @ prior.direction(dynamics), affine.offset)
+        return found.mean, found.covariance  # type: ignore[return-value]  # it was asked for
 
     def _at_one(self, kind: str, program: RowFunction, state: Sequence[Tensor]) -> list[Tensor]:
         """The same at what `_one_state` gave, whose numbers are checked on the way."""
@@ -337,69 +355,34 @@ class Predictor(Summary):
         return outputs
 
     def compiled(self, kind: str) -> RowFunction | None:
-        """The program "mean", "linearize" or "covariance", made now if it is not there; None where torch computes."""
-        if self.code is not None and kind not in self._functions:
-            require_plain((), "a compiled predictor", INSTEAD_OF_TRANSFORMS)  # no code can be made or loaded under them
-            self._functions[kind] = self._made(lambda code: code.function(kind))
-        return self._functions.get(kind)
+        """The program "mean", "linearize", "covariance" or "forces", made now if it is not there; None without."""
+        return self._of_code(kind, lambda code: code.function(kind))
 
-    def _made(self, make: Callable[[KeptCode], Any]) -> Any:
-        """What is made of the code, None once that has failed; one warning says so."""
-        if self.code is None or self._failed:
-            return None
-        try:
-            return make(self.code)
-        except CompilerError as error:
-            self._failed.append(error)  # a compiler that hangs is not waited for again
-            warnings.warn(f"{BY_TORCH}: {error}", NumericalWarning, stacklevel=4)
-            return None
-
-    def _mean(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """By torch: the mean, W and the features of all latents."""
-        offset, W, *features = self.terms(q, v, u)
-        if not W.shape[-1]:
-            return offset, W, features
-        return offset + (W @ self.latent.mean(features)[..., None])[..., 0], W, features
-
-    def rounding(self, q: Tensor, v: Tensor, u: Tensor) -> float:
-        """What rounding of the sums over all points may change in the mean, relative to its largest value there."""
-        mean, W, features = self._mean(q, v, u)
-        if not W.shape[-1]:
-            return 0.0
-        latent = self.latent
-        parts = zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)
-        terms = torch.stack([kernel.cross(z, centers).abs() @ w.abs() for kernel, z, centers, w in parts], dim=-1)
-        return torch.finfo(mean.dtype).eps * float((W.abs() @ terms[..., None]).max() / mean.abs().max())
-
-    def _covariance(self, W: Tensor, features: list[Tensor]) -> Tensor:
-        """Of the latents, (n, C, C)."""
-        if not W.shape[-1]:
-            return W.new_zeros(len(W), 0, 0)
-        compressed = self.compressed
-        found = self.latent.covariance(features) if compressed is None else compressed.at(self.latent, features)
-        return self.widening**2 * found
-
-    def _linearize(self, states: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        nq, nv, nu = self.sizes
-        a, jacobian = rows_jacobian(lambda x: self._mean(*x.split(self.sizes, dim=-1))[0], torch.cat([*states], dim=-1))
-        if self.space.is_vector_space:
-            return a, jacobian
-        in_q, rest = jacobian.split([nq, nv + nu], dim=-1)
-        return a, torch.cat([in_q @ self.space.tangent(states[0]), rest], dim=-1)
+    def _of_code(self, how: Any, make: Callable[[Programs], Any]) -> Any:
+        """What is made of the code once, None where torch computes; one warning says why."""
+        if self.code is None or how in self._made:
+            return self._made.get(how)
+        require_plain((), "a compiled predictor", INSTEAD_OF_TRANSFORMS)  # no code can be made or loaded under them
+        found = None
+        if not self._made.get(CompilerError):
+            try:
+                found = make(self.code)
+            except CompilerError as error:
+                self._made[CompilerError] = True  # a compiler that hangs is not waited for again
+                warnings.warn(f"{BY_TORCH}: {error}", NumericalWarning, stacklevel=5)
+        self._made[how] = found
+        return found
 
     def _states(self, q: Any, v: Any, u: Any, names: str = "qvu") -> tuple[list[Tensor], bool]:
         """q, v and u, or a, as rows (n, size), and whether it was a single state."""
         states = [real_tensor(name, x, self.device) for name, x in zip(names, (q, v, u), strict=True)]
         shape, named = states[0].shape, f"q, v or {names[2]}"
         sizes = self.sizes if names[2] == "u" else (*self.sizes[:2], self.nv)
-        wanted_shapes = (shape if size == sizes[0] else (*shape[:-1], size) for size in sizes)
-        fit = shape[-1:] == sizes[:1] and all(x.shape == each for x, each in zip(states, wanted_shapes, strict=True))
-        if len(shape) > 2 or not fit:
+        fit = all(x.shape == (*shape[:-1], size) for x, size in zip(states, sizes, strict=True))
+        if len(shape) not in (1, 2) or not fit:
             shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in zip(names, states, strict=True))
-            wanted = f"all three ({self.nv},) for one state or (n, {self.nv})"
-            if len({*sizes}) > 1:
-                wanted = ", ".join(f"{name} (..., {size})" for name, size in zip(names, sizes, strict=True))
-            raise InvalidInput(f"a predictor was given {shapes}; give {wanted}.")
+            wanted = ", ".join(f"{name} (..., {size})" for name, size in zip(names, sizes, strict=True))
+            raise InvalidInput(f"a predictor was given {shapes}; give {wanted}, one state or rows.")
         if any(x.device.type != self.device.type for x in states):
             raise InvalidInput(f"{named} is on another device than the predictor; move all three to {self.device}.")
         if self.code is not None:
@@ -421,10 +404,6 @@ class Predictor(Summary):
         self.space.check(state[0])
         return state
 
-    def _blocks(self, states: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
-        rows = max(1, BLOCK_NUMBERS // max(1, sum(len(centers) for centers in self.latent.features)))
-        return list(zip(*(x.split(rows) if len(x) else (x,) for x in states), strict=True))
-
 
 NO_RESULT = (
     "the predicted acceleration is not finite: the mass matrix is singular there, or a surface has no normal; "
@@ -436,8 +415,35 @@ def _single(values: Tensor, single: bool) -> Tensor:
     return values[0] if single else values
 
 
-def _finished(blocks: list[Tensor], single: bool) -> Tensor:
-    values = blocks[0] if len(blocks) == 1 else torch.cat(blocks)
+def _blocks(states: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
+    return list(zip(*(x.split(BLOCK) if len(x) else (x,) for x in states), strict=True))
+
+
+def _finished(blocks: Sequence[Tensor], single: bool) -> Tensor:
+    values = blocks[0] if len(blocks) == 1 else torch.cat([*blocks])
     if not math.isfinite(float(values.detach().sum())):
         raise NumericalError(NO_RESULT)
     return _single(values, single)
+
+
+class MeanWithGradient(torch.autograd.Function):
+    """The mean of a compiled predictor, whose backward pass takes the Jacobians of its linearisation."""
+
+    @staticmethod
+    @override
+    def forward(ctx: Any, predictor: Any, *states: Tensor) -> Tensor:
+        ctx.predictor = predictor
+        ctx.save_for_backward(*states)
+        return predictor.run("mean", states)[0]
+
+    @staticmethod
+    @override
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
+            raise InvalidInput(
+                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
+            )
+        (_, nv, nu), space = ctx.predictor.sizes, ctx.predictor.space
+        jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 2 * nv + nu)
+        in_q, in_v, in_u = (grad_outputs[0][:, None] @ jacobian)[:, 0].split([nv, nv, nu], dim=-1)
+        return None, in_q if space.is_vector_space else space.cotangent(ctx.saved_tensors[0], in_q), in_v, in_u

@@ -1,6 +1,5 @@
 """Where a robot goes according to a fitted model: `Rollout`, and one step x+ = f(x, u) with its derivatives."""
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,15 +9,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.inference.pathwise import draw_functions, mean_function
 from forcegp.inference.threads import blas_threads
 from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
 from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
+from forcegp.integration.trajectory import Trajectory, check_start, warn_of_divergence
 from forcegp.mechanics import Baumgarte
 from forcegp.model import Model
-from forcegp.posterior.fused_rollouts import FusedLoop, fused, steps_of
 from forcegp.posterior.motion_intervals import MotionIntervals
+from forcegp.posterior.programs import steps_of
 from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite, whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
@@ -33,54 +34,84 @@ AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
 
 
-@dataclass(frozen=True, eq=False)
-class AccelerationModel:
-    """What a rollout integrates: accelerations of a fitted model, under the stabilisation of that rollout.
+def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0) -> AccelerationFunction:
+    """The mean acceleration of a `Posterior` at states (n, nv) of this model.
 
-    `mean()` is the mean acceleration at states (n, nv). `sampled(samples, seed)` are the accelerations of so many
-    functions drawn from the model, each at states of its own (samples, n, nv).
+    With `samples`, that of so many functions drawn from it, each at n / samples of the states.
+    """
+    prior, standardize = posterior.trained.unknown, posterior.likelihood.standardization
+    samples = samples if len(posterior.kernels.kernels) else 0  # without unknown forces all functions are the same
+    latent, functions = posterior.latent, mean_function(posterior.latent)
+    if samples:
+        functions = draw_functions(latent, samples, seed, posterior.widening)
+
+    def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        shape = v.shape
+        if samples:  # not -1: u may have no columns
+            q, v, u = (x.reshape(samples, len(x) // samples, x.shape[-1]) for x in (q, v, u))
+        dynamics = model.dynamics(q, v, u)
+        affine, _ = posterior.acceleration_map(dynamics)
+        mixing = prior.direction(dynamics)
+        if not mixing.shape[-1]:
+            return affine.offset.reshape(shape)
+        latents = functions(standardize(prior.features(dynamics)))
+        return affine((mixing @ latents[..., None])[..., 0]).reshape(shape)
+
+    return acceleration
+
+
+class Motions(NamedTuple):
+    """q, v (..., T+1, nv) in rad and rad/s (m and m/s), a (..., T, nv) in rad/s^2 (m/s^2), as in a `Rollout`.
+
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
     """
 
-    model: Model
-    baumgarte: Baumgarte | None
-    mean: Callable[[], AccelerationFunction]
-    sampled: Callable[[int, int], AccelerationFunction]
-    compiled: Callable[[str, int, int], list[FusedLoop] | None]
-    """(integrator, samples, seed) -> loops over the functions that `sampled` draws, or with 0 samples over the mean, as
-    machine code; None where there are none."""
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    diverged_at: Tensor
 
 
-def accelerations_of(posterior: Any, baumgarte: Baumgarte | None) -> AccelerationModel:
-    """Of a `Posterior`, under this stabilisation. Raises InvalidInput for one where the model has no contacts."""
-    if baumgarte is not None and not posterior.model.contacts:
-        raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
-    model = replace(posterior.model, baumgarte=baumgarte)
-    prior, standardize = posterior.trained.unknown, posterior.likelihood.standardization
+def fused(
+    loops: Sequence[RowFunction],
+    method: Integrator,
+    acceleration: AccelerationFunction,
+    q: Float[Tensor, "n nq"],
+    v: Float[Tensor, "n nv"],
+    u: Float[Tensor, "steps n nu"],
+    dt: float,
+    threads: int | None = None,
+    what: str = "motions",
+) -> Trajectory:
+    """`integrate`, by compiled loops; each takes as many motions as the others, one after the other.
 
-    def through(functions: Callable[[list[Tensor]], Tensor]) -> AccelerationFunction:
-        def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-            dynamics = model.dynamics(q, v, u)
-            affine, _ = posterior.acceleration_map(dynamics)
-            mixing = prior.direction(dynamics)
-            if not mixing.shape[-1]:
-                return affine.offset
-            latents = functions(standardize(prior.features(dynamics)))
-            return affine((mixing @ latents[..., None])[..., 0])
-
-        return acceleration
-
-    def mean() -> AccelerationFunction:
-        return through(mean_function(posterior.latent))
-
-    def sampled(samples: int, seed: int) -> AccelerationFunction:
-        if not len(posterior.kernels.kernels):  # no unknown force: all functions are the same
-            return mean()
-        return through(draw_functions(posterior.latent, samples, seed, posterior.widening))
-
-    def compiled(integrator: str, samples: int, seed: int) -> list[FusedLoop] | None:
-        return posterior.code(model).loops(integrator, posterior.latent, samples, seed)
-
-    return AccelerationModel(model, baumgarte, mean, sampled, compiled)
+    Several motions stand in the lanes of vector registers, with no Python per step, on several threads. Those that a
+    loop cannot carry to the end, because they diverge, because Newton's method fails, or because they leave the range
+    of a table, are integrated again by torch, with those of the other loops from the same place.
+    """
+    check_start(v, dt)
+    own, (steps, count, _) = len(q) // len(loops), u.shape
+    kept = ((q, steps + 1), (v, steps + 1), (v, steps))
+    Q, V, A = (torch.empty(count, rows, x.shape[-1], dtype=torch.float64) for x, rows in kept)
+    ended = torch.empty(count, dtype=torch.float64)
+    given = [x.flatten(1).contiguous() for x in (q, v, u.movedim(0, 1))]
+    seconds = torch.tensor([[dt]], dtype=torch.float64)
+    for k, loop in enumerate(loops):
+        at = slice(own * k, own * (k + 1))
+        made = [x[at].view(own, -1) for x in (Q, V, A, ended)]
+        loop.rows(own, [*(x[at] for x in given), seconds], made, threads, least=8)
+    ended, not_found = ended.long(), torch.zeros(count, dtype=torch.bool)
+    left = torch.nonzero((ended < -1).view(-1, own).any(0))[:, 0]
+    if len(left):
+        rows = (own * torch.arange(len(loops))[:, None] + left).flatten()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NumericalWarning)  # given below, of all motions
+            again = integrate(method, acceleration, q[rows], v[rows], u[:, rows], dt)
+        for kept, found in ((Q, again.q), (V, again.v), (A, again.a)):
+            kept[rows] = found.movedim(0, 1)
+        ended[rows], not_found[rows] = again.diverged_at, again.not_found
+    warn_of_divergence(ended, not_found, method.failure, dt, what)
+    return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended, not_found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,50 +198,50 @@ class Rollout:
 
 
 def roll_out(
-    model: AccelerationModel,
+    posterior: Any,
+    model: Model,
     q0: Any,
     v0: Any,
     u: Any,
     dt: float,
     *,
-    integrator: str = "symplectic-euler",
-    feedback: Feedback | None = None,
-    samples: int = 0,
-    seed: int = 0,
-    grad: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    integrator: str,
+    feedback: Feedback | None,
+    samples: int,
+    seed: int,
+    grad: bool,
+    progress: Callable[[int, int], None] | None,
 ) -> Rollout:
-    """Integrate a fitted model: what `rollout` calls (`Posterior.rollout` documents it)."""
+    """What `Posterior.rollout` documents, under the stabilisation of `model`."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
-    method = integrator_named(integrator, model.model)
+    method = integrator_named(integrator, model)
     require_type("grad", grad, bool)
-    robot = model.model.robot
-    q, v, forces, batch = checked_start(model.model.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
+    robot = model.robot
+    q, v, forces, batch = checked_start(model.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
     steps = forces.shape[0]
     total = steps * (1 + bool(samples))
-
     counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
 
-    def run(function: AccelerationFunction, copies: tuple[int, ...], what: str, before: int) -> Rollout:
-        shape, count = (*copies, *batch), math.prod(copies)
+    def run(copies: int, what: str, before: int) -> Rollout:
+        shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
         start = q.repeat(count, 1), v.repeat(count, 1)
-        control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
-        report = None if counted is None else counted(before)
-        given = (method, function, *start, forces.repeat(1, count, 1), dt)
+        given = method, accelerations(posterior, model, copies, seed), *start, forces.repeat(1, count, 1), dt
         loops = None
         if feedback is None and not grad:
-            loops = _loops(model, integrator, steps, math.prod(copies) if copies else 0, seed)
+            loops = _loops(posterior, model, integrator, steps, copies, seed)
         if loops is None:
+            control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
+            report = None if counted is None else counted(before)
             motion = integrate(*given, feedback=control, what=what, progress=report)
         else:
-            motion = fused(loops, *given, torch.get_num_threads(), what)
-            if report is not None:
-                report(steps, steps)
+            motion = fused(loops, *given, what=what)
+            if progress is not None:
+                progress(before + steps, total)
         q_rows, v_rows, a_rows = (
             x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
         )
         blocks = zip(*(x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q_rows, v_rows)), strict=True)
-        parts = zip(*(ConstraintManifold(model.model).violation(*block) for block in blocks), strict=True)
+        parts = zip(*(ConstraintManifold(model).violation(*block) for block in blocks), strict=True)
         c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
         change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
         correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
@@ -219,11 +250,8 @@ def roll_out(
         return Rollout(time, *moved, integrator, model.baumgarte, space=robot.space)
 
     with torch.set_grad_enabled(grad), blas_threads(0):
-        mean = run(model.mean(), (), "rollouts", 0)
-        if samples:
-            sampled = by_sample(model.sampled(samples, seed), samples)
-            mean = replace(mean, samples=run(sampled, (samples,), "sampled rollouts", steps))
-        return mean
+        mean = run(0, "rollouts", 0)
+        return replace(mean, samples=run(samples, "sampled rollouts", steps)) if samples else mean
 
 
 def remembering(
@@ -251,14 +279,15 @@ def remembering(
     return u, added
 
 
-def _loops(model: AccelerationModel, integrator: str, steps: int, samples: int, seed: int) -> list[FusedLoop] | None:
+def _loops(
+    posterior: Any, model: Model, integrator: str, steps: int, samples: int, seed: int
+) -> list[RowFunction] | None:
     """Compiled loops, where motions are long enough to be worth compiling them."""
-    space = model.model.robot.space
-    work = steps * max(1, samples) * (1 + len(model.model.contacts))
-    if model.compiled is None or integrator not in steps_of(space) or work < STEPS_TO_COMPILE:
+    work = steps * max(1, samples) * (1 + len(model.contacts))
+    if integrator not in steps_of(model.robot.space) or work < STEPS_TO_COMPILE:
         return None
     try:
-        return model.compiled(integrator, samples, seed)
+        return posterior.programs(model).loops(integrator, samples, seed)
     except CompilerError as error:
         warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=5)
     except InvalidInput:  # an operation that no program holds, another device
@@ -276,16 +305,6 @@ def _flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedb
             given = tuple(added.shape) if isinstance(added, Tensor) else type(added).__name__
             raise InvalidInput(f"feedback gave {given} at step {k}; it must give a tensor {shape}, as u.")
         return added.reshape(-1, size)
-
-    return flat
-
-
-def by_sample(function: AccelerationFunction, samples: int) -> AccelerationFunction:
-    """A function of (samples, n, nv) as one of (samples * n, nv)."""
-
-    def flat(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        rows = v.shape[:-1].numel() // samples  # not -1: u may have no columns
-        return function(*(x.reshape(samples, rows, x.shape[-1]) for x in (q, v, u))).reshape(v.shape)
 
     return flat
 

@@ -1,7 +1,12 @@
 
-int evaluate(long first, long last, const double *const *t, long steps, double dt, const double *start_q,
-             const double *start_v, const double *u, double *Q, double *V, double *A, long long *ended) {
+/* q, v, u and dt of every motion to its q, v, a, and the row at which it stopped */
+int evaluate(long first, long last, const double *const *t, const double *start_q, long s0, const double *start_v, long s1,
+             const double *u, long s2, const double *seconds, long s3, double *Q, long r0, double *V, long r1, double *A,
+             long r2, double *ended, long r3) {
   enum {N = @JOINTS@, NQ = @POSITIONS@, NU = @GIVEN@, ROUNDS = 60};
+  const double dt = seconds[0];
+  const long steps = r2 / N;
+  (void)s0; (void)s1; (void)s2; (void)s3; (void)r0; (void)r1; (void)r3;
   real x[NQ + N + NU], y[@OUTPUTS@], q1[NQ], v1[N], a[N], q0[NQ], v0[N], m[N], d[N];
   (void)q0; (void)v0; (void)m; (void)d;
   for (long i = first; i < last; i += LANES) {

@@ -17,7 +17,7 @@ from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.training_data import TrainingData
 from forcegp.forces import UnknownForces
 from forcegp.inference import ExactPosterior, InducingPosterior, Terms, exact
-from forcegp.inference.cholesky_update import with_only, with_rows
+from forcegp.inference.cholesky_update import rows_to_keep, with_only, with_rows
 from forcegp.inference.engines import ENOUGH, InducingWeights
 from forcegp.inference.memory import require_memory
 from forcegp.inference.threads import blas_threads
@@ -26,8 +26,6 @@ from forcegp.robots.arguments import whole_number
 
 Structured = Any
 """A `Posterior`, whose module imports this one."""
-Keep = Callable[[ExactPosterior, int], Tensor]
-"""(posterior, budget) -> numbers of the rows to keep, ascending."""
 
 SHARE_AT_ONCE = 4
 """With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
@@ -36,8 +34,13 @@ OTHER_NOISE = 0.1
 """Part of the fit's level of noise by which rows may state another one without a warning."""
 
 
-def learn_more_rows(posterior: Structured, rows: Dataset, budget: int | None, keep: Keep) -> Structured:
-    """What `Posterior.update` documents without a horizon."""
+def learn_more_rows(
+    posterior: Structured,
+    rows: Dataset,
+    budget: int | None,
+    keep: Callable[[ExactPosterior, int], Tensor] = rows_to_keep,
+) -> Structured:
+    """What `Posterior.update` documents without a horizon; `keep` gives the numbers of the rows that stay."""
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
     budget = None if budget is None else whole_number("budget", budget, 2)
     height = len(rows) if budget is None else max(1, budget // SHARE_AT_ONCE)

@@ -1,11 +1,11 @@
-from .motion import Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene
+from .motion import (
+    Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene, still_scene as still_scene,
+)
 from .page import (
-    Finding as Finding, Page as Page, Picture as Picture, Table as Table, is_page as is_page, write_page as write_page,
+    Page as Page, Table as Table, is_page as is_page, write_page as write_page,
 )
-from .results import (
+from .page import (
     model_page as model_page, scene_notes as scene_notes,
-    scores_pictures as scores_pictures, scores_sentence as scores_sentence, scores_table as scores_table,
+    scores_sentence as scores_sentence, scores_table as scores_table,
 )
-from .robot_picture import robot_figure as robot_figure, still_scene as still_scene
 from .scene import recording as recording
-from .viewer import serve as serve

@@ -1,7 +1,6 @@
 """One self-contained HTML page: what was found, the robot in motion, pictures, tables, and how it was made."""
 
 import base64
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,35 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from matplotlib.figure import Figure
 
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
-from forcegp.scores.figures import style
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the answer: its subject and what was found."""
-
-    subject: str
-    text: str
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A figure, with a caption that says what is to be seen and `alt` for those who cannot see it."""
-
-    caption: str
-    figure: Figure
-    alt: str = ""
-
-    @property
-    def data(self) -> str:
-        """The PNG as base64."""
-        stream = io.BytesIO()
-        style.rendered(self.figure).save(stream, format="png", optimize=True)
-        return base64.b64encode(stream.getvalue()).decode()
+from forcegp.data import Dataset
+from forcegp.errors import MissingExtra
+from forcegp.posterior.posterior import Posterior
+from forcegp.report.motion import RecordedScene, recorded_scene
+from forcegp.report.scene import recording
+from forcegp.scores import Picture, Scores, overall, unit_of
 
 
 @dataclass(frozen=True)
@@ -57,14 +36,15 @@ class Page:
     title: str
     best: str
     """The one sentence to remember."""
-    findings: Sequence[Finding] = ()
+    findings: Sequence[tuple[str, str]] = ()
+    """Subjects, and what was found."""
     scene: str = ""
     """An HTML document with the robot (`scene.recording`)."""
     scene_notes: Sequence[str] = ()
     """What the arrows are; or why there is no robot."""
     pictures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
-    next_steps: Sequence[Finding] = ()
+    next_steps: Sequence[tuple[str, str]] = ()
     """What to do next, and the command for it."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """The resolved configuration, for those who want to repeat it."""
@@ -84,9 +64,69 @@ def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
     Raises InvalidInput if the folder does not exist, or the file does and may not be replaced.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["base64"] = lambda png: base64.b64encode(png).decode()
     template = environment.from_string(files("forcegp.report").joinpath("page.html").read_text(encoding="utf-8"))
     details = json.dumps(page.details, indent=1, default=str) if page.details else ""
     with atomic_file(path, overwrite=overwrite) as temporary:
         temporary.write_text(
             template.render(page=page, details=details, version=__version__, mark=MARK) + "\n", encoding="utf-8"
         )
+
+
+SECONDS = 10.0
+"""Of the recording in the scene."""
+
+
+def model_page(
+    posterior: Posterior,
+    dataset: Dataset,
+    pictures: Sequence[Picture],
+    *,
+    title: str,
+    best: str,
+    findings: Sequence[tuple[str, str]] = (),
+    tables: Sequence[Table] = (),
+    missing: Sequence[str] = (),
+    next_steps: Sequence[tuple[str, str]] = (),
+    details: Mapping[str, Any] | None = None,
+    shapes: str | Path | None = None,
+) -> Page:
+    """A page with the robot in motion, and pictures.
+
+    What is `missing` (`scores.model_pictures`) is named on the page with the reason, and without viser the robot.
+    `shapes` is a URDF with visual elements.
+    """
+    try:
+        recorded = recorded_scene(dataset, posterior, seconds=SECONDS, shapes=shapes)
+        scene, notes = recording(recorded), scene_notes(recorded)
+    except MissingExtra as error:
+        scene, notes = "", [f"The robot is not shown: {error}."]
+    return Page(title, best, findings, scene, [*notes, *missing], pictures, tables, next_steps, details or {})
+
+
+def scene_notes(recorded: RecordedScene) -> list[str]:
+    """What the arrows of a scene mean, and what of the robot could not be drawn."""
+    arrows = [
+        f"{group.title}: {group.largest:.3g} {group.unit} would be {recorded.arrow_length:.2g} m long"
+        for group in recorded.arrows
+        if group.largest > 0.0
+    ]
+    meaning = "Arrows are forces that the model found, torques along the axes of joints; pale ends are 95 % intervals"
+    return ([f"{meaning}. {'; '.join(arrows)}."] if arrows else []) + recorded.doubts
+
+
+def scores_sentence(scores: Scores, model: str | None = None) -> str:
+    """What was found of one model, in one sentence."""
+    error, known, held = (scores.value(x, model=model) or 0.0 for x in ("mae", "known_physics_mae", "coverage_95"))
+    better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
+    return (
+        f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit_of(scores, 'a')}{better}; "
+        f"95 % intervals contain {100.0 * held:.0f} %."
+    )
+
+
+def scores_table(scores: Scores, names: Mapping[str, str] | None = None) -> Table:
+    """Models side by side, by these names if given."""
+    header, rows = overall(scores)
+    shown = [[(names or {}).get(name, name), *(cell.partition(" (")[0] for cell in cells)] for name, *cells in rows]
+    return Table("Models on time that none of them has seen", header, shown)

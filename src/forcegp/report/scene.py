@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from forcegp.errors import required_extra
 from forcegp.report.motion import RecordedScene
@@ -23,18 +23,22 @@ OPACITY = 0.6
 """Of links: arrows along the axes of joints begin inside of them."""
 
 
-@contextmanager
-def viser_server(host: str = "127.0.0.1", port: int | None = None) -> Iterator[Any]:
-    """A running viser server, on a free port where none is given; stopped at the end. Raises MissingExtra."""
+def recording(recorded: RecordedScene) -> str:
+    """The whole motion as one HTML page that needs no server: viser's recording. Raises MissingExtra without viser."""
     viser = required_extra("viser", "view", "drawing the robot")
-    if port is None:
-        with socket.socket() as probe:
-            probe.bind((host, 0))
-            port = int(probe.getsockname()[1])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
     with redirect_stdout(io.StringIO()):  # where it prints its address, which results must not be mixed with
-        server = viser.ViserServer(host=host, port=port)
+        server = viser.ViserServer(host="127.0.0.1", port=port)
     try:
-        yield server
+        nodes = SceneNodes(server, recorded)
+        serializer = server.get_scene_serializer()
+        for row in range(len(recorded.time)):
+            nodes.show(row)
+            last = row + 1 == len(recorded.time)
+            serializer.insert_sleep(0.0 if last else float(recorded.time[row + 1] - recorded.time[row]))
+        return serializer.as_html()
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
@@ -67,7 +71,6 @@ class SceneNodes:
             if len(path) > 1:
                 segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
                 scene.add_line_segments(f"/paths/{place}", segments, colors=PATH)
-        self.shown = [True] * len(self.arrows)
         self.show(0)
 
     def show(self, row: int) -> None:
@@ -75,17 +78,9 @@ class SceneNodes:
         for place, node in enumerate(self.links):
             pose = self.recorded.poses[row, place]
             node.wxyz, node.position = quaternion(pose[:3, :3]), pose[:3, 3]
-        for group, nodes, shown in zip(self.recorded.arrows, self.arrows, self.shown, strict=True):
-            if shown:
-                for node, points in zip(nodes, group.tips(row, self.recorded.arrow_length), strict=True):
-                    node.points = points.astype(np.float32)
-
-    def show_group(self, place: int, visible: bool, row: int) -> None:
-        """Show or hide one group of arrows."""
-        self.shown[place] = visible
-        for node in self.arrows[place]:
-            node.visible = visible
-        self.show(row)
+        for group, nodes in zip(self.recorded.arrows, self.arrows, strict=True):
+            for node, points in zip(nodes, group.tips(row, self.recorded.arrow_length), strict=True):
+                node.points = points.astype(np.float32)
 
 
 def _arrows(scene: Any, place: int, recorded: RecordedScene) -> tuple[Any, Any]:
@@ -104,18 +99,4 @@ def _arrows(scene: Any, place: int, recorded: RecordedScene) -> tuple[Any, Any]:
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of a rotation matrix (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
-
-
-def recording(recorded: RecordedScene) -> str:
-    """The whole motion as one HTML page that needs no server: viser's recording. Raises MissingExtra without viser."""
-    with viser_server() as server:
-        nodes = SceneNodes(server, recorded)
-        serializer = server.get_scene_serializer()
-        for row in range(len(recorded.time)):
-            nodes.show(row)
-            last = row + 1 == len(recorded.time)
-            serializer.insert_sleep(0.0 if last else float(recorded.time[row + 1] - recorded.time[row]))
-        return serializer.as_html()

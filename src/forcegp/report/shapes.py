@@ -11,8 +11,8 @@ import torch
 from forcegp.errors import InvalidInput, RobotModelError, required_extra
 from forcegp.robots import Robot
 from forcegp.robots.inertia import rotation_from_rpy, transform
-from forcegp.robots.robot_file import read_robot_file
-from forcegp.robots.xml_text import parse_xml
+from forcegp.robots.urdf import parse_xml
+from forcegp.robots.urdf_file import read_robot_file
 
 FORMATS = (".stl", ".obj", ".ply", ".off")
 """Meshes that are read; none of them can name another file that would be read with it."""

@@ -86,24 +86,12 @@ def usable_device(device: torch.device | str) -> torch.device:
         asked = torch.device(device)
         torch.zeros(1, dtype=torch.float64, device=asked)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError):  # as torch's backends happen to raise
+        there = ["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
         raise InvalidInput(
-            f"device {str(device)!r} cannot be used here; there is {', '.join(['cpu', *_gpus()])}{_why()}."
+            f"device {str(device)!r} cannot be used here; there is {', '.join(there)} for torch {torch.__version__} "
+            "(docs/how-to/gpu.md names builds for GPUs)."
         ) from None
     return asked
-
-
-def _gpus() -> list[str]:
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    return [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(count)]
-
-
-def _why() -> str:
-    """What a machine without a usable GPU lacks."""
-    if _gpus():
-        return ""
-    if torch.version.cuda is None and torch.version.hip is None:
-        return f" (torch {torch.__version__} is built for the CPU alone; docs/how-to/gpu.md names the build for GPUs)"
-    return " (torch finds no GPU: see the output of nvidia-smi)"
 
 
 Vector = Sequence[float | int] | np.ndarray | Tensor

@@ -1,29 +1,27 @@
 """`CompiledRobot`: the dynamics of one robot as machine code made for it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.codegen.c_writer import Program, write_program
 from forcegp.codegen.graph import Graph, node_of
 from forcegp.codegen.library import (
     NOT_POSITIVE,
-    Purpose,
     RowFunction,
-    VectorUnit,
     are_plain,
     default_folder,
     load_library,
     require_plain,
 )
 from forcegp.errors import InvalidInput, NumericalError, require_known
-from forcegp.robots.arguments import JointValues, Positions, broadcast_batch
+from forcegp.robots.arguments import broadcast_batch
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
-from forcegp.robots.structure import RobotStructure
+from forcegp.robots.structure import RigidBodyDynamics, RobotStructure
 from forcegp.robots.unrolled import UnrolledKinematics, UnrolledRobot, factorize, scalars, solve_factorized
 
 INSTEAD = "use the robot itself (compiled.robot), whose results are the same"
@@ -61,26 +59,7 @@ def trace_dynamics(unrolled: UnrolledRobot, function: str) -> Program:
     return Program(graph, inputs, {f"result {k}": nodes(result) for k, result in enumerate(made)}, nodes(positive))
 
 
-PURPOSE = Purpose("compiled dynamics", "robot.compile(folder=...)", "use the robot itself")
-
-
-def compiled_program(unrolled: UnrolledRobot, function: str, folder: Path) -> RowFunction:
-    """From ``folder`` if it is there, else compiled into it. Raises CompilerError as `load_library`."""
-
-    def write(unit: VectorUnit) -> str:
-        return write_program(trace_dynamics(unrolled, function), unit.lanes)
-
-    constants: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in unrolled.joints]
-    constants += [x.tolist() for joint in unrolled.joints for x in (joint.rotation, joint.origin)]
-    constants += [unrolled.gravity.tolist(), unrolled.armature.tolist(), [body.tolist() for body in unrolled.inertias]]
-    library, _ = load_library(
-        f"{unrolled.robot.name[:40]}-{function}", f"{constants!r}\0{function}", write, folder, PURPOSE
-    )
-    sizes = [unrolled.robot.nq if name == "q" else unrolled.nv for name in ARGUMENTS[function]]
-    return RowFunction(library, sizes, [unrolled.nv**d for d in DIMENSIONS.get(function, (1,))])
-
-
-class CompiledRobot:
+class CompiledRobot(RigidBodyDynamics):
     """The dynamics of a robot, compiled for it; made by ``robot.compile()``.
 
     The methods take, check and return what those of :class:`~forcegp.robots.Robot` do, also where a base moves.
@@ -119,45 +98,26 @@ class CompiledRobot:
             self.program(name)
         return self
 
-    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
-        """As :meth:`Robot.mass_matrix <forcegp.robots.Robot.mass_matrix>`."""
-        return self._evaluate("mass_matrix", q=q)[0]
-
-    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
-        """As :meth:`Robot.bias_forces <forcegp.robots.Robot.bias_forces>`."""
-        return self._evaluate("bias_forces", q=q, v=v)[0]
-
-    def mass_matrix_and_bias(
-        self, q: Positions, v: JointValues
-    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
-        """As :meth:`Robot.mass_matrix_and_bias <forcegp.robots.Robot.mass_matrix_and_bias>`."""
-        mass, bias = self._evaluate("mass_matrix_and_bias", q=q, v=v)
-        return mass, bias
-
-    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
-        """As :meth:`Robot.gravity_forces <forcegp.robots.Robot.gravity_forces>`."""
-        return self._evaluate("gravity_forces", q=q)[0]
-
-    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
-        """As :meth:`Robot.inverse_dynamics <forcegp.robots.Robot.inverse_dynamics>`."""
-        return self._evaluate("inverse_dynamics", q=q, v=v, a=a)[0]
-
-    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
-        """As :meth:`Robot.forward_dynamics <forcegp.robots.Robot.forward_dynamics>`."""
-        return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)[0]
-
     def program(self, function: str) -> RowFunction:
         """The machine code of a function."""
-        found = self._programs.get(function)
-        if found is None:
-            found = self._programs[function] = compiled_program(self._unrolled, function, self.folder)
-        return found
+        if function not in self._programs:
+            unrolled, nv = self._unrolled, self._nv
 
-    def _evaluate(self, function: str, **arguments: Tensor) -> tuple[Tensor, ...]:
-        nv, given = self._nv, list(arguments.values())
-        plain = self._are_possible(arguments) if self._space.groups else are_plain(given, nv)
+            def write(lanes: int) -> str:
+                return write_program(trace_dynamics(unrolled, function), lanes)
+
+            name = f"{self.robot.name[:40]}-{function}"
+            library = load_library(name, f"{unrolled.constants!r}\0{function}", write, folder=self.folder)
+            outputs = [nv**d for d in DIMENSIONS.get(function, (1,))]
+            self._programs[function] = RowFunction(library, len(ARGUMENTS[function]), outputs)
+        return self._programs[function]
+
+    @override
+    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+        nv, given, names = self._nv, list(arguments), ARGUMENTS[function]
+        plain = self._are_possible(given) if self._space.groups else are_plain(given, nv)
         if not plain:
-            given = [self.robot.checked_input(name, value) for name, value in arguments.items()]
+            given = [self.robot.checked_input(name, value) for name, value in zip(names, given, strict=True)]
             if torch.is_grad_enabled() and any(value.requires_grad for value in given):
                 raise InvalidInput(f"compiled dynamics has no derivatives; {INSTEAD}.")
         require_plain(given, "compiled dynamics", INSTEAD)
@@ -166,7 +126,7 @@ class CompiledRobot:
             bits, results = program.single(*given)
         else:
             if not plain:
-                batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(arguments, given, strict=True)})
+                batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(names, given, strict=True)})
                 given = [value.expand(*batch, value.shape[-1]) for value in given]
             if not plain or len(batch) != 1:
                 given = [value.reshape(batch.numel(), value.shape[-1]).contiguous() for value in given]
@@ -174,14 +134,13 @@ class CompiledRobot:
             bits = program.rows(batch.numel(), given, results)
         if bits & NOT_POSITIVE:
             raise NumericalError(NOT_POSITIVE_DEFINITE)
-        dimensions = DIMENSIONS.get(function, (1,))
-        return tuple(
-            x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in zip(results, dimensions, strict=True)
-        )
+        made = zip(results, DIMENSIONS.get(function, (1,)), strict=True)
+        found = [x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in made]
+        return found[0] if len(found) == 1 else tuple(found)
 
-    def _are_possible(self, arguments: Mapping[str, Tensor]) -> bool:
+    def _are_possible(self, given: Sequence[Tensor]) -> bool:
         """`are_plain` where q has more entries than v and a length to check."""
-        q, *others = arguments.values()
+        q, *others = given
         plain = are_plain([q], self._space.nq) and are_plain(others, self._nv)
         if plain and all(x.shape[:-1] == q.shape[:-1] for x in others):
             self._space.check(q)

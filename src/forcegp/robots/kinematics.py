@@ -147,52 +147,6 @@ def world_inertias(poses: Bodies, inertias: Float[Tensor, "n 4 4 #batch"]) -> Bo
     return product(product(poses, inertias), poses.transpose(1, 2))
 
 
-def mass_matrix(tree: Tree, vectors: Vectors, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch nv nv"]:
-    """Joint-space inertia matrix, armature included on the diagonal."""
-    momenta = product(twists, over_tree(tree.descendants, inertias))
-    # <[[w]x, v], F> is the product of the vector [w; v] with these six combinations of the entries of F
-    momenta = tree.twist_basis.mT @ momenta.flatten(1, 2)
-    above = product(vectors, momenta.transpose(0, 1))
-    # right where the row's joint moves the column's body; elsewhere the transpose is, or neither on different branches
-    out = torch.where(tree.is_above, above, above.transpose(0, 1))
-    if not tree.is_chain:
-        out = out * tree.related
-    if tree.coupled:
-        out = torch.einsum("ki,klb,lj->ijb", tree.coupling, out, tree.coupling)
-    if tree.has_armature:
-        out = out + torch.diag(tree.armature)[..., None]
-    return out.movedim(-1, 0).contiguous()
-
-
-def joint_forces(tree: Tree, twists: Twists, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch nv"]:
-    """Joint forces under which the bodies accelerate so against gravity (without armature)."""
-    wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
-    return of_joints(tree, (twists * wrenches).sum((1, 2)).mT)
-
-
-def torque_regressor(
-    tree: Tree, twists: Twists, accelerations: Twists, frames: Bodies, basis: Float[Tensor, "16 parameters"]
-) -> Float[Tensor, "batch nv n parameters"]:
-    """Joint force (nv) per unit of each parameter of each body (n), without armature.
-
-    The pseudo-inertia of body k is ``frames[k] P frames[k]^T`` with P, row by row, equal to ``basis`` times the body's
-    parameters; so ``tau_i = tr((S_i T)^T (A_k - g) T P)``.
-    """
-    columns = []
-    for k in range(len(twists)):
-        frame = frames[k : k + 1]
-        left, right = product(twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
-        gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
-        columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
-    return of_joints(tree, torch.stack(columns, dim=2))
-
-
-def gravity_forces(tree: Tree, twists: Twists, inertias: Bodies) -> Float[Tensor, "batch nv"]:
-    """Joint forces that hold the robot still."""
-    first_moments = over_tree(tree.descendants, inertias[..., 3:, :])
-    return of_joints(tree, -(product(twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT)
-
-
 @dataclass(frozen=True, eq=False)
 class Kinematics:
     """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
@@ -241,7 +195,10 @@ class Kinematics:
 
     def gravity_forces(self) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
-        return self._rows(gravity_forces(self.robot.tree, self.twists, self.inertias))
+        tree = self.robot.tree
+        first_moments = over_tree(tree.descendants, self.inertias[..., 3:, :])
+        forces = -(product(self.twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
+        return self._rows(of_joints(tree, forces))
 
     def inverse_dynamics(self, a: JointValues) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
@@ -249,8 +206,7 @@ class Kinematics:
         at = self._expanded("a", a.shape[:-1])
         _, v = at._moving("inverse_dynamics")
         tree, a = self.robot.tree, _columns(a, at.batch_shape)
-        accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, a))
-        forces = joint_forces(tree, at.twists, accelerations, at.inertias)
+        forces = at._joint_forces(body_accelerations(tree, at.twists, v, of_bodies(tree, a)), at.inertias)
         return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
     def forward_dynamics(self, tau: JointValues) -> Float[Tensor, "... nv"]:
@@ -277,8 +233,13 @@ class Kinematics:
         tree = self.robot.tree
         accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, _columns(a, at.batch_shape)))
         frames = product(at.poses, self._child_frames()[..., None])
-        basis = standard_basis(self.robot.device)
-        return at._rows(torque_regressor(tree, at.twists, accelerations, frames, basis))
+        basis, columns = standard_basis(self.robot.device), []
+        for k in range(len(frames)):  # tau_i = tr((S_i T)^T (A_k - g) T P), P row by row
+            frame = frames[k : k + 1]
+            left, right = product(at.twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
+            gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
+            columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
+        return at._rows(of_joints(tree, torch.stack(columns, dim=2)))
 
     def dynamics_of_bodies(
         self, parameters: Float[Tensor, "bodies 10"]
@@ -332,12 +293,31 @@ class Kinematics:
     def _child_frames(self) -> Tensor:
         return torch.as_tensor(self.robot.layout.child_frames, device=self.robot.device)
 
-    def _mass_matrix(self, inertias: Tensor) -> Tensor:
-        return mass_matrix(self.robot.tree, self.vectors, self.twists, inertias)
+    def _mass_matrix(self, inertias: Bodies) -> Float[Tensor, "batch nv nv"]:
+        tree = self.robot.tree
+        momenta = product(self.twists, over_tree(tree.descendants, inertias))
+        # <[[w]x, v], F> is the product of the vector [w; v] with these six combinations of the entries of F
+        momenta = tree.twist_basis.mT @ momenta.flatten(1, 2)
+        above = product(self.vectors, momenta.transpose(0, 1))
+        # right where the row's joint moves the column's body; elsewhere the transpose is, or neither on other branches
+        out = torch.where(tree.is_above, above, above.transpose(0, 1))
+        if not tree.is_chain:
+            out = out * tree.related
+        if tree.coupled:
+            out = torch.einsum("ki,klb,lj->ijb", tree.coupling, out, tree.coupling)
+        if tree.has_armature:
+            out = out + torch.diag(tree.armature)[..., None]
+        return out.movedim(-1, 0).contiguous()
 
-    def _bias_forces(self, inertias: Tensor) -> Tensor:
+    def _bias_forces(self, inertias: Bodies) -> Float[Tensor, "batch nv"]:
         accelerations, _ = self._moving("bias_forces")
-        return joint_forces(self.robot.tree, self.twists, accelerations, inertias)
+        return self._joint_forces(accelerations, inertias)
+
+    def _joint_forces(self, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch nv"]:
+        """Joint forces under which the bodies accelerate so against gravity (without armature)."""
+        tree = self.robot.tree
+        wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
+        return of_joints(tree, (self.twists * wrenches).sum((1, 2)).mT)
 
     def _moving(self, what: str) -> tuple[Tensor, Tensor]:
         if self.accelerations is None or self.v is None:

@@ -5,26 +5,158 @@ visits children alphabetically; map by joint name when comparing.) Each of them 
 links fixed to it. A body's frame is the child link's frame turned so that its z axis is the joint axis, which makes
 every joint a rotation about or a translation along z.
 
-A joint that mimics another one moves a body, too, but has no coordinate of its own (:mod:`forcegp.robots.mimic`). The
+A joint that mimics another one moves a body, too, but has no coordinate of its own (:mod:`forcegp.robots.layout`). The
 positions of the bodies' joints are ``G q + g`` with q those of the ``nv`` others; without mimic joints G is the
 identity and body i is that of joint i.
 
 A joint of several degrees of freedom stands for as many joints and bodies, one after the other, which all move together
 (:mod:`forcegp.robots.manifold`). The last of them carries the links; the bodies of the others are empty.
+
+A mimic joint moves its body by ``multiplier q + offset`` with q the position of another joint, or of the one that this
+one mimics in turn. With G from the coordinates to the joints of all bodies,
+
+    M = G^T M_all G,    bias = G^T bias_all,    J = J_all G,
+
+exact, and with the inertia that the other joint feels of it. Nothing is elastic, and nothing slips.
+
+A URDF begins at a root link, and nothing in the format tells an arm on a table from a robot that walks, drives or
+flies. To weld such a robot to the world would answer with wrong forces and no word. So the question is asked where
+links that stand still have mass, no link called world holds them by a fixed joint, and names speak of two legs, wheels
+or rotors, of a pelvis, or of something that flies (measured: benchmarks/robot_files.py).
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from forcegp.errors import InvalidInput, KinematicLoop, RobotModelError, UnknownJoint, UnknownLink, require_known
-from forcegp.robots.base import WORLDS, BaseChoice
+from forcegp.errors import (
+    InvalidInput,
+    KinematicLoop,
+    RobotModelError,
+    UnknownJoint,
+    UnknownLink,
+    UnstatedBase,
+    UnsupportedJoint,
+    require_known,
+)
 from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.manifold import MOTIONS, Group
-from forcegp.robots.mimic import Drive, followed, with_followers
 from forcegp.robots.problems import Problems
-from forcegp.robots.urdf import FREE, MOVABLE, JointDescription, RobotDescription, free_joint
+from forcegp.robots.urdf import FREE, MOVABLE, Joint, RobotDescription, free_joint
+
+BaseChoice = Literal["fixed", "floating", "planar", "spherical"]
+"""How the root link is held: "fixed" in the world, free, free in the plane z = 0, or free to turn about its origin."""
+
+WORLDS = ("world", "map", "odom", "ground", "universe")
+WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
+"""Words of a name: FL foot, upper Leg, front left wheel."""
+LIMB = r".*(foot|feet|toe|leg|wheel|ankle|knee|thigh|calf)s?|[lr]?hips?|shin|sole"
+"""To walk or drive with; `base_footprint` is none."""
+ROTOR = r".*(rotor|propeller)s?"
+BODY = r"pelvis|flying|drone|uav|quadrotor|.*copter"
+ENOUGH = {LIMB: 2, ROTOR: 3, BODY: 1}
+"""So many tell. Rotors count on the links that stand still: motors of arms have some in other places."""
+
+
+def check_choice(base: str | None) -> None:
+    """Raise InvalidInput for another base than `BaseChoice` has."""
+    if base is not None and base not in get_args(BaseChoice):
+        raise InvalidInput(f"base is {base!r}; give one of {', '.join(get_args(BaseChoice))}.")
+
+
+def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
+    """Report a robot that nobody said is bolted to the world, unless that was done.
+
+    ``standing`` are the links that do not move, the root first.
+    """
+    if not standing:
+        return  # nothing stands still
+    root, still = standing[0], set(standing)
+    mass = sum(inertial.mass for name in standing if (inertial := description.links[name]))
+    asked = "base" in problems.given or any(isinstance(error, UnstatedBase) for error in problems.errors)
+    if asked or mass == 0.0:  # one that is NaN or negative is a mistake, and no sign of a robot that is bolted
+        return
+    holding = {joint.type for joint in description.joints if joint.parent == root}
+    if root.lower() in WORLDS and description.links[root] is None and "fixed" in holding:
+        return
+    names = {LIMB: list(description.links), BODY: [description.name, *description.links]}
+    turning = [joint for joint in description.joints if joint.type != "fixed" and joint.parent in still]
+    names[ROTOR] = [f"{joint.name} {joint.child}" for joint in turning]
+    for kind, enough in ENOUGH.items():
+        found = [name for name in names[kind] if any(re.fullmatch(kind, x.lower()) for x in re.findall(WORD, name))]
+        if len(found) >= enough:
+            seen = f"its base {root!r} has {mass:.3g} kg, and there is {', '.join(map(repr, found[:4]))}"
+            doubt = f"{problems.source}: this looks like a robot that is not bolted to the world: {seen}"
+            question = ". base='floating' lets it move freely; base='fixed' takes it as bolted."
+            problems.errors.append(UnstatedBase(doubt, question, {"base": "floating"}))
+            return
+
+
+class Drive(NamedTuple):
+    """How the joint of a body moves: by the coordinate number ``joint``, as ``multiplier q + offset``."""
+
+    joint: int
+    multiplier: float
+    offset: float
+
+
+def followed(
+    description: RobotDescription, locked: Mapping[str, float], problems: Problems
+) -> tuple[dict[str, float], dict[str, tuple[str, float, float]]]:
+    """Joints that stand still, with their positions, and of mimic joints the one that they follow in the end.
+
+    A joint that follows a locked or fixed one stands still, as does one with a multiplier of 0.
+    """
+    by_name = {joint.name: joint for joint in description.joints}
+    held: dict[str, float] = dict(locked)
+    drives: dict[str, tuple[str, float, float]] = {}
+    for joint in description.joints:
+        multiplier, offset, at, passed = 1.0, 0.0, joint, {joint.name}
+        while at.mimics is not None and at.name not in locked:
+            above = by_name.get(at.mimics.joint)
+            if above is None or above.name in passed or above.type in FREE:
+                problems.errors.append(_objection(description.source, joint, at, above is not None))
+                multiplier, offset = 0.0, 0.0
+                break
+            offset += multiplier * at.mimics.offset
+            multiplier *= at.mimics.multiplier
+            passed.add(above.name)
+            at = above
+        if joint.mimics is None or joint.name in locked:
+            continue
+        if multiplier == 0.0 or at.type == "fixed" or at.name in locked:
+            held[joint.name] = multiplier * locked.get(at.name, 0.0) + offset
+        else:
+            drives[joint.name] = (at.name, multiplier, offset)
+    return held, drives
+
+
+def _objection(source: str, joint: Joint, at: Joint, found: bool) -> UnsupportedJoint:
+    """Why a joint cannot be followed to one with a coordinate: at the last one passed."""
+    last = (joint if found else at).mimics
+    seen = f"{source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
+    why = ", and so at last itself, or a joint of several degrees of freedom" if found else ", which the file lacks"
+    return UnsupportedJoint(seen, f"{why}; correct its <mimic>, or lock the joint.", {"locked": {joint.name: 0.0}})
+
+
+def with_followers(
+    joints: Mapping[str, Joint],
+    bodies: Sequence[Joint],
+    drives: Mapping[str, tuple[str, float, float]],
+) -> tuple[Joint, ...]:
+    """The joints with damping and dry friction of those that follow them: factors of multiplier^2 and |multiplier|."""
+    whole = dict(joints)
+    for body in bodies:
+        if body.name in drives:
+            name, multiplier, _ = drives[body.name]
+            damping = whole[name].damping + multiplier**2 * body.damping
+            friction = whole[name].friction + abs(multiplier) * body.friction
+            whole[name] = replace(whole[name], damping=damping, friction=friction)
+    return tuple(whole.values())
+
 
 WORLD = -1
 BASE = "base"
@@ -50,9 +182,9 @@ class Placement:
 class Layout:
     """The tree as plain Python: movable joints in order, the parent body of each, and the placement of every link."""
 
-    bodies: tuple[JointDescription, ...]  # the joint that moves each body
+    bodies: tuple[Joint, ...]  # the joint that moves each body
     drives: tuple[Drive, ...]  # the row of G and the entry of g of each body
-    joints: tuple[JointDescription, ...]  # those with a coordinate of their own
+    joints: tuple[Joint, ...]  # those with a coordinate of their own
     parents: tuple[int, ...]
     origins: tuple[np.ndarray, ...]  # body frame at q = 0 in the parent body's frame
     links: dict[str, Placement]
@@ -115,7 +247,7 @@ def lay_out(
     _check_locked(description, locked)
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)
-    bodies: list[JointDescription] = []
+    bodies: list[Joint] = []
     parents: list[int] = []
     origins: list[np.ndarray] = []
     groups: list[Group] = []
@@ -185,7 +317,7 @@ def lay_out(
     )
 
 
-def _rows_of(joint: JointDescription) -> list[JointDescription]:
+def _rows_of(joint: Joint) -> list[Joint]:
     """A joint of several degrees of freedom as one for each, called "base.x", "base.rz" and so on."""
     kinds = {each: "continuous" if each.startswith("r") else "prismatic" for each in MOTIONS[joint.type].velocities}
     return [replace(joint, name=f"{joint.name}.{each}", type=kind) for each, kind in kinds.items()]
@@ -203,11 +335,11 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
             )
 
 
-def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[JointDescription]]]:
+def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:
     """Root link and the joints below each link; :class:`KinematicLoop` where the joints form no single tree."""
     source = description.source
-    above: dict[str, JointDescription] = {}
-    children: dict[str, list[JointDescription]] = {link: [] for link in description.links}
+    above: dict[str, Joint] = {}
+    children: dict[str, list[Joint]] = {link: [] for link in description.links}
     for joint in description.joints:
         if joint.child in above:
             raise KinematicLoop(
@@ -242,7 +374,7 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[JointDe
     return roots[0], children
 
 
-def joint_motion(joint: JointDescription, position: float) -> np.ndarray:
+def joint_motion(joint: Joint, position: float) -> np.ndarray:
     """How a joint that stands still is displaced, (4, 4)."""
     if not position:
         return np.eye(4)

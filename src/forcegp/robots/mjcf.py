@@ -22,8 +22,8 @@ from forcegp.errors import MalformedMjcf, NonPhysicalInertia, UnreadableRobotFil
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.mjcf_model import WORLD, CompiledModel, Translation
 from forcegp.robots.problems import Problems
+from forcegp.robots.urdf import MOST_TAGS, parse_xml, well_formed
 from forcegp.robots.urdf_file import IN_THE_FILE, nearest_inertia, read_text
-from forcegp.robots.xml_text import MOST_TAGS, parse_xml, well_formed
 
 DEEPEST = 300
 """Levels of elements: MuJoCo's reader calls itself for each."""

@@ -10,8 +10,8 @@ import numpy as np
 from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
 from forcegp.robots.manifold import MOTIONS
 from forcegp.robots.problems import Problems
+from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_parts
-from forcegp.robots.xml_text import numbers
 
 KINDS = {0: "floating", 1: "spherical", 2: "prismatic", 3: "revolute"}
 """Of MuJoCo's joints (mjtJoint) in URDF."""

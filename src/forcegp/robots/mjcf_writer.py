@@ -13,14 +13,12 @@ import numpy as np
 
 from forcegp.errors import RobotModelError
 from forcegp.robots.inertia import inverse, rotation_of_z_onto, transform
-from forcegp.robots.layout import BASE, OUTSIDE, joint_motion
+from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
 from forcegp.robots.manifold import MOTIONS
-from forcegp.robots.mimic import followed
 from forcegp.robots.mjcf_model import LoopDescription
 from forcegp.robots.problems import Problems
 from forcegp.robots.structure import RobotStructure
-from forcegp.robots.urdf import JointDescription, free_joint
-from forcegp.robots.xml_text import numbers
+from forcegp.robots.urdf import Joint, free_joint, numbers
 
 SMALLEST = 2e-15
 """kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
@@ -43,7 +41,7 @@ class MjcfWriter:
         self.held, _ = followed(description, robot.locked, Problems(robot.source))
         self.groups = {group.name: group for group in robot.layout.groups}
         self.moving = {joint.name for joint in robot.layout.bodies} | set(self.groups)
-        self.children: dict[str, list[JointDescription]] = {link: [] for link in description.links}
+        self.children: dict[str, list[Joint]] = {link: [] for link in description.links}
         for joint in description.joints:
             self.children[joint.parent].append(joint)
         self.rotors = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
@@ -107,7 +105,7 @@ class MjcfWriter:
         for joint in self.children[link]:
             self._chain(joint, joint.origin, depth)
 
-    def _chain(self, joint: JointDescription, pose: np.ndarray, depth: int) -> None:
+    def _chain(self, joint: Joint, pose: np.ndarray, depth: int) -> None:
         """The body that a joint moves, with the joints above it that move no mass."""
         if joint.name not in self.moving:
             self._body(joint.child, pose @ joint_motion(joint, self.held.get(joint.name, 0.0)), [], depth)
@@ -143,7 +141,7 @@ class MjcfWriter:
                     names.append(joint.child)
         return found
 
-    def _next(self, link: str) -> list[tuple[np.ndarray, JointDescription]]:
+    def _next(self, link: str) -> list[tuple[np.ndarray, Joint]]:
         """The joints that move against these links, and the frames of their children."""
         return [
             (pose @ joint.origin, joint)
@@ -152,7 +150,7 @@ class MjcfWriter:
             if joint.name in self.moving
         ]
 
-    def _axes(self, joint: JointDescription) -> list[_Axis]:
+    def _axes(self, joint: Joint) -> list[_Axis]:
         """A joint as MuJoCo's; a planar one is two slides and a hinge."""
         if joint.type == "planar":
             parts = (("x", "slide", (1.0, 0.0, 0.0)), ("y", "slide", (0.0, 1.0, 0.0)), ("rz", "hinge", (0.0, 0.0, 1.0)))
@@ -164,7 +162,7 @@ class MjcfWriter:
         axis = None if joint.type in MOTIONS else joint.axis
         return [_Axis(self._attributes(joint, name, kind, first), np.eye(4), axis)]
 
-    def _attributes(self, joint: JointDescription, name: str, kind: str, rotor: str | None = None) -> str:
+    def _attributes(self, joint: Joint, name: str, kind: str, rotor: str | None = None) -> str:
         given = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}
         given["frictionloss"] = joint.friction
         parts = [f'{key}="{value!r}"' for key, value in given.items() if value]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.errors import RobotFileWarning, UnstatedBase, usable_arguments
 from forcegp.robots.arguments import (
@@ -23,34 +24,37 @@ from forcegp.robots.arguments import (
     finite_vector,
     locked_positions,
 )
-from forcegp.robots.base import BaseChoice, check_base, check_choice
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import lay_out
+from forcegp.robots.layout import BaseChoice, check_base, check_choice, lay_out
 from forcegp.robots.mjcf import is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
 from forcegp.robots.mjcf_writer import MjcfWriter
 from forcegp.robots.problems import Problems
-from forcegp.robots.robot_file import before_the_end, read_armature, read_robot_file, with_comment, write_robot_file
-from forcegp.robots.structure import RobotStructure
+from forcegp.robots.structure import RigidBodyDynamics, RobotStructure
 from forcegp.robots.tree import bodies_without_inertia, compile_tree
-from forcegp.robots.urdf import parse_urdf
+from forcegp.robots.urdf import parse_urdf, well_formed
 from forcegp.robots.urdf_file import (
     InertiaChoice,
+    before_the_end,
+    read_armature,
+    read_robot_file,
     read_text,
+    replace_dynamics,
     replace_inertial,
     with_chosen_inertias,
+    with_comment,
     with_root,
+    write_robot_file,
     write_text,
 )
-from forcegp.robots.xml_text import well_formed
 
 GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot(RobotStructure):
+class Robot(RobotStructure, RigidBodyDynamics):
     """A tree of joints on a base that is fixed, floating or planar. Make one with :meth:`from_urdf`.
 
     A joint that mimics another has no coordinate: it moves with that one, whose damping and friction include its own.
@@ -294,6 +298,21 @@ class Robot(RobotStructure):
         robot = Robot._again(text, self.source, self.gravity, armature, self.locked, self.base)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
+    def with_joint_dynamics(self, damping: Tensor | None, friction: Tensor | None) -> "Robot":
+        """A robot whose URDF has <dynamics damping friction> (nv,) of every joint; None leaves what is there.
+
+        That of a joint that others mimic includes theirs, which become 0.
+        """
+        text, layout = self.urdf_text, self.layout
+        free = {body for group in layout.groups for body in range(group.bodies.start, group.bodies.stop)}
+        for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
+            if body not in free:
+                own = float(joint.name == self.joint_names[drive.joint])
+                values = {"damping": damping, "friction": friction}
+                given = {name: own * float(value[drive.joint]) for name, value in values.items() if value is not None}
+                text = replace_dynamics(text, joint.name, given, source=self.source) if given else text
+        return self.with_text(text)
+
     def with_note(self, note: str) -> "Robot":
         """The same robot, whose URDF text ends with this comment."""
         return self.with_text(before_the_end(self.urdf_text, f"<!-- {note.replace('--', '- -')} -->\n"))
@@ -378,34 +397,9 @@ class Robot(RobotStructure):
             q[:, group.places][:, group.motion.turn] = turn
         return self.space.normalized(q).to(self.device)
 
-    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
-        """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
-        return self.kinematics(q).mass_matrix()
-
-    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
-        """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
-        return self.kinematics(q, v).bias_forces()
-
-    def mass_matrix_and_bias(
-        self, q: Positions, v: JointValues
-    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
-        """:meth:`mass_matrix` and :meth:`bias_forces` from one kinematics pass."""
-        return self.kinematics(q, v).mass_matrix_and_bias()
-
-    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
-        """Joint forces (..., nv) in Nm or N that hold the robot still."""
-        return self.kinematics(q).gravity_forces()
-
-    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
-        """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
-        return self.kinematics(q, v).inverse_dynamics(a)
-
-    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
-        """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``, by Cholesky.
-
-        Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
-        """
-        return self.kinematics(q, v).forward_dynamics(tau)
+    @override
+    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+        return getattr(self.kinematics(*arguments[:2]), function)(*arguments[2:])
 
     def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""

@@ -1,6 +1,8 @@
 """What a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
 
-from dataclasses import dataclass, fields
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,16 +11,52 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
-from forcegp.robots.arguments import checked_tensor
-from forcegp.robots.base import BaseChoice
-from forcegp.robots.layout import WORLD, Layout
+from forcegp.robots.arguments import JointValues, Positions, checked_tensor
+from forcegp.robots.layout import WORLD, BaseChoice, Layout
 from forcegp.robots.manifold import ConfigurationSpace, pose
 from forcegp.robots.tree import Tree
-from forcegp.robots.urdf import InertialDescription, Joint, JointDescription, RobotDescription
+from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
 
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
 DOWN = ("down_x", "down_y", "down_z")
+
+
+class RigidBodyDynamics(ABC):
+    """The dynamics of a robot, however they are computed."""
+
+    @abstractmethod
+    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+        """What the method of that name returns."""
+
+    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
+        """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
+        return self._dynamics("mass_matrix", q)
+
+    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
+        """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
+        return self._dynamics("bias_forces", q, v)
+
+    def mass_matrix_and_bias(
+        self, q: Positions, v: JointValues
+    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+        """:meth:`mass_matrix` and :meth:`bias_forces` at once."""
+        return self._dynamics("mass_matrix_and_bias", q, v)
+
+    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
+        """Joint forces (..., nv) in Nm or N that hold the robot still."""
+        return self._dynamics("gravity_forces", q)
+
+    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
+        """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
+        return self._dynamics("inverse_dynamics", q, v, a)
+
+    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
+        """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``.
+
+        Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
+        """
+        return self._dynamics("forward_dynamics", q, v, tau)
 
 
 @dataclass(frozen=True)
@@ -78,11 +116,10 @@ class RobotStructure(Summary):
     @property
     def joints(self) -> tuple[Joint, ...]:
         """Movable joints in the order of v, without those that mimic one; one for each degree of freedom."""
-        names = [field.name for field in fields(Joint)]
-        return tuple(Joint(*(getattr(joint, name) for name in names)) for joint in self.layout.joints)
+        return self.layout.joints
 
     @property
-    def all_joints(self) -> tuple[JointDescription, ...]:
+    def all_joints(self) -> tuple[Joint, ...]:
         """Every joint of the file, fixed ones included, parents before children."""
         places = {name: place for place, name in enumerate(self.layout.links)}
         return tuple(sorted(self.description.joints, key=lambda joint: places[joint.child]))

@@ -25,9 +25,8 @@ import torch
 
 from forcegp.codegen.graph import Expression, Graph
 from forcegp.codegen.tracing import trace
-from forcegp.robots.layout import WORLD
+from forcegp.robots.layout import WORLD, Drive
 from forcegp.robots.manifold import MOTIONS, pose
-from forcegp.robots.mimic import Drive
 from forcegp.robots.structure import RobotStructure
 
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
@@ -91,6 +90,13 @@ class UnrolledRobot:
         self.inertias = [self._scalars(body, float(body.abs().max())) for body in merged]
         self.gravity = self._scalars(tree.gravity, 0.0)
         self.armature = self._scalars(tree.armature, 0.0)
+
+    @property
+    def constants(self) -> list[object]:
+        """All that decides the code."""
+        found: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in self.joints]
+        found += [x.tolist() for joint in self.joints for x in (joint.rotation, joint.origin)]
+        return [*found, self.gravity.tolist(), self.armature.tolist(), [body.tolist() for body in self.inertias]]
 
     @property
     def nv(self) -> int:

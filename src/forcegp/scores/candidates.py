@@ -172,9 +172,8 @@ def _digest(model: Model, *parts: bytes) -> str:
 
 
 def _named_candidate(name: str, expression: str, model: Model, identification: str) -> Candidate:
-    forces, at, evidence_words = expression.partition(EVIDENCE)
-    words, evidence = summands(forces), _evidence(name, summands(evidence_words) if at else ())
-    motions, others = _motions_apart(evidence)
+    words, motions, others = _parts(expression)
+    forces = "+".join(words)
     on_identified, words = words[0] == IDENTIFIED, words[words[0] == IDENTIFIED :]
     try:
         described = named_model(model, words or (GIVEN,))
@@ -212,16 +211,15 @@ def _named_candidate(name: str, expression: str, model: Model, identification: s
     )
 
 
-def _evidence(name: str, words: Sequence[str]) -> tuple[Evidence, ...]:
+def _parts(name: str) -> tuple[tuple[str, ...], tuple[Evidence, ...], tuple[Evidence, ...]]:
+    """Forces, evidence of motions, and other evidence of a name."""
+    forces, _, words = name.partition(EVIDENCE)
     try:
-        return parse_evidence(list(words)) if words else ()
+        evidence = parse_evidence(list(summands(words))) if words else ()
     except InvalidInput as error:
         raise InvalidInput(f"model {name!r}: {error}") from None
-
-
-def _motions_apart(evidence: Sequence[Evidence]) -> tuple[tuple[Evidence, ...], tuple[Evidence, ...]]:
     motions = tuple(each for each in evidence if isinstance(each, Motions))
-    return motions, tuple(each for each in evidence if each not in motions)
+    return summands(forces), motions, tuple(each for each in evidence if each not in motions)
 
 
 def _texts(evidence: Sequence[Evidence]) -> list[str]:
@@ -262,9 +260,8 @@ def _fit_model(model: Model, others: Sequence[Evidence], motions: Sequence[Evide
 
 def checked_identification(name: str, model: Model) -> tuple[Model, Accelerations | Torques]:
     """The model that is open where laws and bodies of this name are, and the evidence. Raises InvalidInput."""
-    forces, at, words = name.partition(EVIDENCE)
-    _, evidence = _motions_apart(_evidence(name, summands(words) if at else ()))
-    opened = named_model(model, summands(forces))
+    words, _, evidence = _parts(name)
+    opened = named_model(model, words)
     if opened.unknown_forces or not opened.is_open:
         raise InvalidInput(f"identification {name!r} has nothing to identify, or unknown forces; name laws and bodies.")
     chosen = evidence[0] if evidence else usual_evidence(opened)
@@ -273,8 +270,12 @@ def checked_identification(name: str, model: Model) -> tuple[Model, Acceleration
     return opened, chosen
 
 
-def identified_model(name: str, model: Model, rows: Dataset) -> Model:
-    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out."""
+def identified_model(name: str, model: Model, rows: Dataset) -> tuple[Model, list[str]]:
+    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out.
+
+    And the rotors that no row shows, whose inertias are those of the prior.
+    """
     opened, evidence = checked_identification(name, model)
     found: Any = fit(opened, rows, evidence)
-    return replace(found.model, noise=held_out_noise(opened, rows, evidence))
+    unseen = [name for name, each in found.estimates.items() if name.startswith("rotor") and each.decided_by == "prior"]
+    return replace(found.model, noise=held_out_noise(opened, rows, evidence)), unseen

@@ -1,23 +1,47 @@
-"""What models are fitted to and scored on: rows, splits, motions, and the one mass matrix of all force errors."""
+"""What models are fitted to and scored on, and the jobs of it: identify a model, or fit and score one, on one split.
+
+All models of a split share one mass matrix for force errors, that of the identified model: a URDF seldom holds rotors.
+"""
 
 import hashlib
-from dataclasses import dataclass, fields
-from functools import cached_property
+import json
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from forcegp.data import Dataset, farthest_rows
+from forcegp.data import Dataset, contact_doubts, farthest_rows
 from forcegp.data.dataset import require_rows
-from forcegp.errors import InvalidInput, require_type
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.integration import integrator_named
+from forcegp.jobs import Job, JobStore
 from forcegp.model import Model
-from forcegp.scores.candidates import Training, checked_identification, usual_identification
-from forcegp.scores.motions import STARTS, HeldOutMotions, held_out_motions
+from forcegp.noise import Noise
+from forcegp.posterior import observing
+from forcegp.posterior.posterior import Posterior
+from forcegp.scores.accuracy import CONTACT_FORCE, Matrices, mass_matrices, row_scores
+from forcegp.scores.candidates import (
+    Candidate,
+    Training,
+    checked_identification,
+    identified_model,
+    usual_identification,
+)
+from forcegp.scores.doubts import doubts, normal_force_rests_on_prior, overlap_warnings
+from forcegp.scores.motions import STARTS, HeldOutMotions, held_out_motions, motion_scores
 from forcegp.scores.splits import Split
 
 SHARE = 2 / 3
 """Of the training rows among which the points of one seed are chosen."""
+IDENTIFICATION, MODEL = "identification", "model"
+OBSERVED = "wind, and the force that stays unexplained, were observed from the rows before each."
+NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
 
 
 def training_subset(train: Dataset, points: int, seed: int) -> Dataset:
@@ -88,6 +112,7 @@ class Experiment:
         subset = training_subset(rows, self.points, seed)
         return Training(subset, self.model, rows, recording, identified, seed, self.restarts, self.iterations)
 
+    @cached_property
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the numbers, as plain JSON values."""
         digested = ("rows", "recording", "model", "splits", "identification")
@@ -101,6 +126,32 @@ class Experiment:
             **{name: list(value) if isinstance(value, tuple) else value for name, value in given.items()},
         }
 
+    def jobs(self, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Job], list[Job]]:
+        """Identifications, and the models, which read their results; those that use all rows with one seed only."""
+        text = json.dumps(self.configuration, sort_keys=True)
+        common = {"configuration": hashlib.sha256(text.encode()).hexdigest()}
+        wanted = sorted({self.identifies, *(each.identification for each in models.values() if each.identification)})
+        identifications: list[Job] = []
+        fits: list[Job] = []
+        for number, split in enumerate(self.splits):
+            places = {name: job_name(split, 0, IDENTIFICATION, name) for name in wanted}
+            for name, place in places.items():
+                spec = {**common, "kind": IDENTIFICATION, "name": name, "split": number, "seed": 0}
+                identifications.append(Job(place, f"{__name__}:compute", spec, arguments=(self, name)))
+            for seed in range(seeds):
+                for name, each in models.items():
+                    if each.all_rows and seed:
+                        continue
+                    read = {"mass_matrix": places[self.identifies]}
+                    read |= {"identified": places[each.identification]} if each.identification else {}
+                    spec = {**common, "kind": MODEL, "name": name, "split": number, "seed": seed, **read}
+                    # where the function is defined, which somebody else may have added
+                    code = () if isinstance(each.fit, Posterior) else (_plain(each.fit).__module__,)
+                    place, inputs = job_name(split, seed, MODEL, name), tuple(sorted({*read.values()}))
+                    spec["digest"] = each.digest
+                    fits.append(Job(place, f"{__name__}:compute", spec, inputs, arguments=(self, each), code=code))
+        return identifications, fits
+
 
 def fingerprint(dataset: Dataset) -> str:
     """SHA-256 of the joints, times and numbers of a Dataset."""
@@ -109,3 +160,104 @@ def fingerprint(dataset: Dataset) -> str:
         values = getattr(dataset, name)
         digest.update(name.encode() if values is None else np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
+
+
+def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    return _plain(function.func) if isinstance(function, partial) else function
+
+
+def job_name(split: Split, seed: int, kind: str, name: str) -> str:
+    """Every character is one that all file systems take."""
+    plain = re.sub(r"[^\w.+@-]+", "_", name.replace(" ", ""))
+    if plain != name.replace(" ", ""):  # names that differ in other characters only
+        plain += f"-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
+    return f"{split.name}-seed{seed}-{'' if kind == MODEL else f'{kind}-'}{plain}"
+
+
+def kept(store: JobStore, name: str) -> dict[str, Any]:
+    """What a finished job found, or why it failed, with its warnings. Raises FileFormatError for a damaged file."""
+    stored = store.load(name)
+    if not {"split", "seed", "error", "warnings"} <= set(stored["result"]):
+        raise FileFormatError(f"{store.place(name)} is damaged; delete it and run the same command again.")
+    warned = [*stored["result"]["warnings"], *stored["warnings"]]
+    return {**stored["result"], "warnings": warned, **{key: stored[key] for key in ("machine", "wall_seconds")}}
+
+
+def compute(
+    store: JobStore, spec: Mapping[str, Any], folder: Path, experiment: Experiment, work: Candidate | str
+) -> dict[str, Any]:
+    """Identify, or fit and score; what goes wrong is kept as well, for it is a result."""
+    found: dict[str, Any] = {"warnings": [], "error": None}
+    split = experiment.splits[spec["split"]]
+    with threadpool_limits(1):
+        try:
+            if isinstance(work, str):
+                found |= _identify(experiment, split.apply(experiment.rows)[0], work)
+            else:
+                found |= _score(store, experiment, split, spec, work)
+        except Exception as problem:  # a model of somebody else may fail in any way; its row names the error
+            name = "" if isinstance(problem, ForceGPError) else f"{type(problem).__name__}: "
+            found["error"] = " ".join(f"{name}{problem}".split())
+    return {"split": split.name, "seed": spec["seed"], **found}
+
+
+def _identify(experiment: Experiment, train: Dataset, name: str) -> dict[str, Any]:
+    start = time.process_time()
+    model, unseen = identified_model(name, experiment.model, train)
+    assert model.noise is not None, "it was found"
+    found = {"noise": model.noise.to_dict(), "model": model.known.to_dict(), "unseen": unseen}
+    return {"cpu_seconds": time.process_time() - start, **found}
+
+
+def _score(
+    store: JobStore, experiment: Experiment, split: Split, spec: Mapping[str, Any], work: Candidate
+) -> dict[str, Any]:
+    train, test = split.apply(experiment.rows)
+    identified, before = identified_before(store, spec["identified"]) if "identified" in spec else (None, 0.0)
+    training = experiment.training(train, split.apply(experiment.recording)[0], identified, spec["seed"])
+    start = time.process_time()
+    posterior = work.fit if isinstance(work.fit, Posterior) else work.fit(training)
+    seconds = before + time.process_time() - start
+    model, _ = identified_before(store, spec["mass_matrix"])
+    whose = f"the model identified from all training rows ({experiment.identifies})"
+    if isinstance(model, str):
+        whose = f"the model as given, because its identification failed ({model.rstrip('.')})"
+    mass = mass_matrices(test, experiment.model if isinstance(model, str) else model)
+    fitted_here = not isinstance(work.fit, Posterior)
+    found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, fitted_here=fitted_here)
+    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": len(training.rows), **found}
+
+
+def identified_before(store: JobStore, name: str) -> tuple[Model | str, float]:
+    """The model of a finished identification, or why there is none, and its CPU seconds."""
+    found = kept(store, name)
+    if found["error"] is not None:
+        return str(found["error"]), 0.0
+    return replace(Model.from_dict(found["model"]), noise=Noise.from_dict(found["noise"])), found["cpu_seconds"]
+
+
+def scored(
+    posterior: Posterior,
+    test: Dataset,
+    motions: HeldOutMotions,
+    integrator: str = "rk4",
+    mass: Matrices | None = None,
+    *,
+    fitted_here: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """One model on one test log as plain JSON values: the table, errors by stretch and motion, and warnings.
+
+    Where the model has observers (`forcegp.posterior.observing`), they see the rows before each one. Rows that training
+    and test share are named unless the model was `fitted_here`, to the other side of a split.
+    """
+    alone, recorded = posterior, test
+    if test.time_ordered:
+        posterior, test = observing(posterior, test, whole=True)
+    table, stretches = row_scores(posterior, test, mass, progress)
+    moving, facts = motion_scores(alone, motions, integrator)
+    before = [] if fitted_here else [*overlap_warnings(alone, recorded), *contact_doubts(test, posterior.model)]
+    told = [str(doubt) for doubt in (*before, *doubts(posterior, test, table))]
+    told += [] if posterior is alone else [OBSERVED]
+    told += [NORMAL_FORCES] if CONTACT_FORCE in table and normal_force_rests_on_prior(alone) else []
+    return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

@@ -1,6 +1,6 @@
 """The page of scores in Markdown, and the same tables as rows of text for terminals and reports."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -8,22 +8,17 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Preparation, preparation_report
-from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE
+from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE, TRUE_ACCELERATION
 from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference
 from forcegp.scores.scores import Scores
 from forcegp.scores.tables import formatted, markdown_table, number, rendered
 
-ALT_TEXTS = {
-    "errors": "Errors of accelerations and in force space, by joint and model",
-    "calibration": "Calibration of the intervals",
-    "motions": "Errors of predicted motions against their length",
-}
 Column = tuple[str, str, str, int]
 """Title, quantity, score and decimals; of a coverage in percent."""
 
 
-def page(scores: Scores, figures: Collection[str] = ()) -> str:
-    """Markdown: what was done, the model to take, tables with the best marked, and what failed."""
+def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
+    """Markdown: what was done, the model to take, tables, and what failed; `figures` have names and captions."""
     finished = [name for name in scores.models if scores.finished(name)]
     by_joint = [
         (title, markdown_table(["model", *scores.joint_names], joint_rows(scores, title, quantity, score, digits)))
@@ -44,12 +39,51 @@ def page(scores: Scores, figures: Collection[str] = ()) -> str:
         overall=markdown_table(*overall(scores, "**")) if finished else "",
         at_rest=", ".join(f"{name} {number(x, 3)}" for name, x in zip(scores.joint_names, at_rest, strict=False) if x),
         by_joint=by_joint,
-        figures=[(name, ALT_TEXTS[name]) for name in figures],
+        figures=figures,
         listed=[[name, each["kind"], each["summary"], str(len(scores.finished(name)))]
                 for name, each in scores.models.items()],
         failures=scores.failures,
         warnings=scores.warnings,
     )  # fmt: skip
+
+
+BY_JOINT: tuple[Column, ...] = (
+    ("MAE", ACCELERATION, "mae", 4),
+    ("noise-free", TRUE_ACCELERATION, "mae", 4),
+    ("RMSE", ACCELERATION, "rmse", 4),
+    ("NLPD", ACCELERATION, "nlpd", 2),
+    ("in 95 %", ACCELERATION, "coverage_95", 1),
+    ("known physics", ACCELERATION, "known_physics_mae", 4),
+)
+OF_QUANTITIES = (
+    ("MAE", "mae", 4),
+    ("RMSE", "rmse", 4),
+    ("RMSE / size", "relative_rmse", 3),
+    ("in 95 %", "coverage_95", 1),
+)
+
+
+def joint_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of one model: errors of the acceleration by joint, then of all together (NLPD: jointly)."""
+    held, columns = scores.quantities(model), [[*scores.joint_names, "all joints"]]
+    for _, quantity, score, digits in BY_JOINT:
+        known = score in held.get(quantity, ())
+        each = scores.columns(score, quantity, model) if known else [None] * len(scores.joint_names)
+        whole = scores.value(score, ALL_JOINTS if score == "nlpd" else quantity, model) if known else None
+        columns.append([_cell(value, score, digits, None, "") for value in (*each, whole)])
+    return ["joint", *(title for title, *_ in BY_JOINT)], [list(row) for row in zip(*columns, strict=True)]
+
+
+def quantity_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of one model: what was scored beside accelerations, all columns together, in their units."""
+    rows = []
+    for name, held in scores.quantities(model).items():
+        found = [
+            (scores.value(score, name, model) if score in held else None, score, n) for _, score, n in OF_QUANTITIES
+        ]
+        if name not in (ACCELERATION, ALL_JOINTS) and any(value is not None for value, *_ in found):
+            rows.append([name, *(_cell(value, score, digits, None, "") for value, score, digits in found)])
+    return ["of all joints", *(title for title, *_ in OF_QUANTITIES)], rows
 
 
 def columns_of(scores: Scores) -> list[Column]:
@@ -138,7 +172,8 @@ def _difference(found: PairedDifference | None) -> str:
 def unit_of(scores: Scores, quantity: str) -> str:
     """`Nm`, or `Nm or N` where joints differ."""
     units = scores.units.get(quantity, "")
-    return units if isinstance(units, str) else " or ".join(dict.fromkeys(units))
+    each = [units] if isinstance(units, str) else list(dict.fromkeys(units))
+    return " or ".join(each).replace("^2", "²")
 
 
 def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:

@@ -72,7 +72,7 @@ class PairedDifference:
 
     @property
     def sentence(self) -> str:
-        """The outcome with its numbers."""
+        """The outcome with its numbers; what it goes by is for the reader to name."""
         answer = {"better": "**Better**", "worse": "**Worse**", "no difference": "**No difference that the data show**"}
         interval = "one stretch and one seed, so no interval"
         if self.interval is not None:
@@ -84,7 +84,7 @@ class PairedDifference:
             pair = f"{self.challenger} / {self.baseline} = {_formatted(self.criterion, self.value)}"
         what = "motions" if self.criterion == "motion" else "held-out stretches of time"
         better = f"better in {self.wins} of {self.runs} runs and in {self.ahead} of {self.stretches} {what}"
-        return f"{answer[self.outcome]} by the {CRITERIA[self.criterion]}: {pair} ({interval}; {better})."
+        return f"{answer[self.outcome]}: {pair} ({interval}; {better})."
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""

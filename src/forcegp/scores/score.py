@@ -16,8 +16,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
-from forcegp.jobs import JobStore, Progress, run_jobs
-from forcegp.jobs.job import machine
+from forcegp.jobs import JobStore, Progress, machine, run_jobs
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior.posterior import Posterior
@@ -30,18 +29,14 @@ from forcegp.scores.candidates import (
     identified_model,
     kind_and_summary,
 )
-from forcegp.scores.experiment import Experiment, fingerprint
-from forcegp.scores.jobs import jobs_of, kept
-from forcegp.scores.leave_out import leave_out
+from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
 from forcegp.scores.motions import STARTS, held_out_motions
-from forcegp.scores.one_model import scored
 from forcegp.scores.page import page, preparation_lines
 from forcegp.scores.scores import Scores
 from forcegp.scores.splits import Split, split_named
 
 KIND = "forcegp score"
 RESULTS, PAGE = "results.json", "report.md"
-LEAVE_OUT = "leave-out"
 
 
 def score(
@@ -76,8 +71,7 @@ def score(
     ----------
     models: a posterior; or by name posteriors, models to fit, functions of a `Training` that fit one, and names of
         models FORCES[@EVIDENCE] (`scores.candidates`), of which a list will do. None takes some of every kind.
-    split: text of `split_named` or its result; None is "auto" where anything is fitted. "leave-out" fits every model
-        once, to all rows, and leaves stretches of time out in closed form: densities alone, of models to fit.
+    split: text of `split_named` or its result; None is "auto" where anything is fitted.
     horizons: of predicted motions in s; none with (). None takes .1, .2, .5 and 1 s, as far as the log lasts, where
         anything is fitted, else none.
     folder: where everything is kept, with the page report.md, its figures and results.json; None keeps nothing.
@@ -122,8 +116,6 @@ def score(
     robot = log.model if model is None else model
     if robot is None:
         raise InvalidInput("the log does not carry its robot; give model=Model(robot, contacts).")
-    if split == LEAVE_OUT:
-        return leave_out(given, log, robot, points=points, restarts=restarts, iterations=iterations, about=about)
     splits = split_named(log, split or "auto") if split is None or isinstance(split, str) else tuple(split)
     settings: Any = (points, horizons, starts, integrator, identification, restarts, iterations)
     experiment = Experiment(log, recording or log, robot, splits, *settings)
@@ -131,8 +123,8 @@ def score(
     checked_jobs(jobs)
     with tempfile.TemporaryDirectory() as nowhere:
         place = Path(nowhere, "scores") if folder is None else Path(folder)
-        store = JobStore.open(place, KIND, experiment.configuration(), overwrite=overwrite)
-        identifications, fits = jobs_of(experiment, chosen, seeds)
+        store = JobStore.open(place, KIND, experiment.configuration, overwrite=overwrite)
+        identifications, fits = experiment.jobs(chosen, seeds)
         run_jobs(store, [*identifications, *fits], jobs, progress)
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
@@ -140,9 +132,10 @@ def score(
         found = [kept(store, job.name) for job in identifications]
         about |= {
             "splits": [_split_facts(experiment, each) for each in splits],
-            "configuration": experiment.configuration(),
+            "configuration": experiment.configuration,
             "seeds": list(range(seeds)),
             "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
+            "notes": unseen_rotors(found),
         }
         kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
         scores = replace(_scores(log, runs, kinds, about), fit=partial(_on_all_rows, experiment, chosen))
@@ -156,21 +149,29 @@ def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: 
     work, rows = chosen[name], experiment.rows
     if isinstance(work.fit, Posterior):
         return work.fit
-    identified = None if work.identification is None else identified_model(work.identification, experiment.model, rows)
+    identified = (
+        None if work.identification is None else identified_model(work.identification, experiment.model, rows)[0]
+    )
     return work.fit(experiment.training(rows, experiment.recording, identified, 0))
+
+
+def unseen_rotors(identifications: Sequence[Mapping[str, Any]]) -> list[str]:
+    """That errors of forces mean little at joints whose inertia no row shows."""
+    names = dict.fromkeys(name.partition(".")[2] for each in identifications for name in each.get("unseen", ()))
+    told = f"the rows do not show the inertia of the rotors of {', '.join(names)}; errors of forces mean little there."
+    return [told] if names else []
 
 
 def write(scores: Scores, folder: Path) -> None:
     """The page, its figures and all numbers into a folder."""
-    from forcegp.scores.figures.scores import figures_of
-    from forcegp.scores.figures.style import save_figure
+    from forcegp.scores.figures.scores import scores_pictures
 
     folder.mkdir(parents=True, exist_ok=True)
-    figures = figures_of(scores)
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
+    pictures = scores_pictures(scores)
+    for picture in pictures:
+        picture.save(folder)
     write_json(folder / RESULTS, scores.to_dict())
-    write_text(folder / PAGE, page(scores, figures))
+    write_text(folder / PAGE, page(scores, [(picture.name, picture.caption) for picture in pictures]))
 
 
 def _fitted_before(
@@ -198,7 +199,7 @@ def _fitted_before(
         run |= {"mass_matrix": "the model itself", "training_rows": len(posterior.training)}
         runs[name], models[name] = [run], kind_and_summary(posterior)
     about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
-    return replace(_scores(log, runs, models, about), posteriors=dict(given))
+    return replace(_scores(log, runs, models, about), fit=given.__getitem__)
 
 
 def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:

@@ -36,7 +36,6 @@ class Scores(Summary):
         "stretches" and "motions" for differences, "warnings", and "error" where it failed.
     joint_names, units: of the log.
     about: what was done, for the page.
-    posteriors: models that were fitted only once, and those that were given.
     fit: how a model by this name is fitted to all rows.
     """
 
@@ -45,7 +44,6 @@ class Scores(Summary):
     joint_names: tuple[str, ...]
     units: Mapping[str, Any]
     about: Mapping[str, Any] = field(default_factory=dict)
-    posteriors: Mapping[str, Posterior] = field(default_factory=dict)
     fit: Callable[[str], Posterior] | None = field(default=None, compare=False)
 
     # ------------------------------------------------------------------ numbers
@@ -156,13 +154,13 @@ class Scores(Summary):
         The one rule of verdicts. A criterion that no model has is missing.
         """
         out = {}
-        for criterion, words in CRITERIA.items():
+        for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
             if simple is None or other is None:
                 if (only := simple or other) is not None:
                     second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
                     found = None if second is None else self.difference(criterion, only, second)
-                    why = f"the lowest {words}" if found is None else found.sentence
+                    why = "no other model was scored" if found is None else found.sentence
                     out[criterion] = {"model": only, "why": why}
                 continue
             found = self.difference(criterion, other, simple)
@@ -188,7 +186,9 @@ class Scores(Summary):
         name = self.recommended if model is None else self._named(model)
         if name is None:
             raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
-        return self.posteriors[name] if self.fit is None else self.fit(name)
+        if self.fit is None:
+            raise FitError("these scores came without their models.")
+        return self.fit(name)
 
     @cached_property
     def rival(self) -> str | None:
@@ -207,7 +207,8 @@ class Scores(Summary):
     @property
     def verdicts(self) -> list[str]:
         """A sentence for every other model and criterion: is it better than the rival?"""
-        return [each.sentence for found in self.differences.values() for each in found.values() if each is not None]
+        found = [(by, each) for pairs in self.differences.values() for by, each in pairs.items() if each is not None]
+        return [f"By the {CRITERIA[by]}: {each.sentence}" for by, each in found]
 
     # ------------------------------------------------------------------ to show
 

@@ -22,20 +22,6 @@ DEFAULT_FRACTION, DEFAULT_BLOCKS = 0.25, "blocks:5:3,5"
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """The time `begin` <= t < `end` [s] of one episode; infinite where it goes to the end of the recording."""
-
-    episode: int
-    begin: float = -math.inf
-    end: float = math.inf
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values; None where there is no end."""
-        ends = {name: getattr(self, name) for name in ("begin", "end")}
-        return {"episode": self.episode} | {name: t if math.isfinite(t) else None for name, t in ends.items()}
-
-
-@dataclass(frozen=True)
 class Split:
     """Which stretches of time are held out, and how far training rows must stay away from them.
 
@@ -45,23 +31,18 @@ class Split:
     ------
     name: short, unlike those of other splits of the same data; a file name may hold it.
     words: what was done, as part of a sentence.
-    held_out: the stretches to predict.
+    held_out: the stretches to predict: episode, begin <= t, and t < end [s], infinite at the ends of a recording.
     guard: seconds between any training row and a held-out stretch of the same episode.
     """
 
     name: str
     words: str
-    held_out: tuple[Stretch, ...]
+    held_out: tuple[tuple[int, float, float], ...]
     guard: float = 0.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.guard) and self.guard >= 0.0):
             raise InvalidInput(f"guard is {self.guard} s; it must be finite and at least 0.")
-        if not self.held_out:
-            raise InvalidInput("nothing is held out; name at least one episode or block.")
-        for one in self.held_out:
-            if not one.begin < one.end:
-                raise InvalidInput(f"a held-out stretch begins at {one.begin} s and ends at {one.end} s; end it later.")
 
     def test_rows(self, dataset: Dataset) -> Bool[np.ndarray, " rows"]:
         """Which rows are held out."""
@@ -72,10 +53,9 @@ class Split:
         return ~self._near(dataset, self.guard)
 
     def _near(self, dataset: Dataset, margin: float) -> Bool[np.ndarray, " rows"]:
-        inside = np.zeros(len(dataset), dtype=bool)
-        for stretch in self.held_out:
-            after, before = dataset.time >= stretch.begin - margin, dataset.time < stretch.end + margin
-            inside |= (dataset.episode == stretch.episode) & after & before
+        t, inside = dataset.time, np.zeros(len(dataset), dtype=bool)
+        for episode, begin, end in self.held_out:
+            inside |= (dataset.episode == episode) & (t >= begin - margin) & (t < end + margin)
         return inside
 
     def apply(self, dataset: Dataset) -> tuple[Dataset, Dataset]:
@@ -91,14 +71,17 @@ class Split:
                     f"and the guard is {self.guard} s."
                 )
         sides = dataset.rows(train), dataset.rows(test)
-        whole = all(stretch == Stretch(stretch.episode) for stretch in self.held_out)
+        whole = all(math.isinf(begin) and math.isinf(end) for _, begin, end in self.held_out)
         # Blocks of one episode have equal metadata by nature; of those only repeated rows are refused.
         require_disjoint(sides[0] if whole else replace(sides[0], metadata={}), sides[1])
         return sides
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        held_out = [stretch.to_dict() for stretch in self.held_out]
+        """Plain JSON values; None where a stretch goes to the end of the recording."""
+        held_out = [
+            {"episode": episode, "begin": None if math.isinf(begin) else begin, "end": None if math.isinf(end) else end}
+            for episode, begin, end in self.held_out
+        ]
         return {"name": self.name, "words": self.words, "held_out": held_out, "guard": self.guard}
 
 
@@ -139,19 +122,21 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     raise InvalidInput(f"the split is {text!r}; give auto, {FORMS}, for example {DEFAULT_BLOCKS}.")
 
 
+def _require_some(what: str, chosen: Sequence[int], known: Sequence[int]) -> None:
+    if not set(chosen) < set(known) or len(set(chosen)) < len(chosen) or not chosen:
+        raise InvalidInput(
+            f"held-out {what} are {list(chosen)}; name some of {list(known)}, each once, and leave one to learn from, "
+            f"or hold out blocks of time ({DEFAULT_BLOCKS})."
+        )
+
+
 def _episodes_apart(dataset: Dataset, episodes: Sequence[int]) -> Split:
     """Whole episodes."""
-    if len(set(episodes)) < len(episodes) or not set(episodes) <= set(dataset.episodes):
-        known = list(dataset.episodes)
-        raise InvalidInput(f"held-out episodes are {list(episodes)}; name some of {known}, each once.")
+    _require_some("episodes", episodes, dataset.episodes)
     rest = [number for number in dataset.episodes if number not in episodes]
-    if not rest:
-        raise InvalidInput(
-            f"all episodes {list(dataset.episodes)} are held out; leave one to learn from, or hold out blocks of time "
-            f"({DEFAULT_BLOCKS})."
-        )
     words = f"trained on whole episodes ({_listed(rest)}), tested on others ({_listed(episodes)})"
-    return Split(f"episodes-{'-'.join(map(str, episodes))}", words, tuple(Stretch(number) for number in episodes))
+    held_out = tuple((number, -math.inf, math.inf) for number in episodes)
+    return Split(f"episodes-{'-'.join(map(str, episodes))}", words, held_out)
 
 
 def _fraction_apart(dataset: Dataset, fraction: float, seed: int) -> Split:
@@ -164,25 +149,19 @@ def _fraction_apart(dataset: Dataset, fraction: float, seed: int) -> Split:
 
 
 def _blocks_apart(dataset: Dataset, blocks: int, held_out: Sequence[int], guard: float) -> Split:
-    numbers = sorted(held_out)
-    if blocks < 2 or not set(numbers) < set(range(1, blocks + 1)) or len(set(numbers)) < len(numbers):
-        raise InvalidInput(
-            f"held-out blocks are {list(held_out)} of {blocks}; name some of 1 to {blocks}, each once, and "
-            "leave one to learn from."
-        )
-    stretches = []
+    numbers, stretches = sorted(held_out), []
+    _require_some("blocks", numbers, range(1, blocks + 1))
     for episode in dataset.episodes:
         time = dataset.time[dataset.episode == episode]
         edges = np.linspace(time.min(), time.max(), blocks + 1)
         if not edges[0] < edges[-1]:
             raise InvalidInput(f"episode {episode} has one row; it cannot be cut into blocks of time.")
         edges[0], edges[-1] = -math.inf, math.inf  # what lies outside of the rows seen here belongs to the ends
-        stretches += [Stretch(episode, float(edges[n - 1]), float(edges[n])) for n in numbers]
+        stretches += [(episode, float(edges[n - 1]), float(edges[n])) for n in numbers]
     each = "the recording" if len(dataset.episodes) == 1 else "every episode"
-    plural = "s" if len(numbers) > 1 else ""
     words = (
-        f"{each} cut into {blocks} consecutive blocks of equal duration, block{plural} {_listed(numbers)} held out, "
-        f"and training rows within {guard:g} s of them left out"
+        f"{each} cut into {blocks} consecutive blocks of equal duration, block{'s' if len(numbers) > 1 else ''} "
+        f"{_listed(numbers)} held out, and training rows within {guard:g} s of them left out"
     )
     return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
 

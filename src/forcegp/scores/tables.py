@@ -18,16 +18,16 @@ def median_and_range(values: Iterable[float | None]) -> dict[str, Any] | None:
 
 def formatted(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
     """`.0831 (.0825–.0847)` of a median with its range, `.0831` of a number, a dash of nothing."""
-    if value is None:
-        return "–"
     if not isinstance(value, Mapping):
         return number(value, digits)
     middle, low, high = (number(value[name], digits) for name in ("median", "min", "max"))
     return middle if len(value["values"]) == 1 else f"{middle} ({low}–{high})"
 
 
-def number(value: float, digits: int = 4) -> str:
+def number(value: float | None, digits: int = 4) -> str:
     """With that many decimals; where three or more are asked for, very small and very large ones as a power of ten."""
+    if value is None:
+        return "–"
     if digits < 3 or value == 0 or 10.0**-digits * 5 <= abs(value) < 1e4:
         return f"{value:.{digits}f}"
     return f"{value:.1e}"

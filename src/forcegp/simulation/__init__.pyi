@@ -1,7 +1,7 @@
 from .quadrotor import simulate_quadrotor as simulate_quadrotor
 from .quadruped import simulate_quadruped as simulate_quadruped
 from .free_arms import simulate_free_arm as simulate_free_arm
-from .kuka_motion import kuka_file as kuka_file
+from .kuka_surface import kuka_file as kuka_file
 from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface
 from .scenarios import (
     FreeArmConfig as FreeArmConfig,
@@ -9,5 +9,5 @@ from .scenarios import (
     QuadrotorConfig as QuadrotorConfig,
     QuadrupedConfig as QuadrupedConfig,
     SCENARIOS as SCENARIOS,
-    Scenario as Scenario,
+    simulate as simulate,
 )

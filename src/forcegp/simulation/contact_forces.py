@@ -3,13 +3,13 @@
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from forcegp.errors import InvalidInput, SimulationError
-from forcegp.robots.xml_text import numbers
+from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.trajectory import FlatTable, Table
 
@@ -82,14 +82,13 @@ class RoughPatch:
         return float(1.0 + (self.factor - 1.0) * inside)
 
 
-@dataclass(frozen=True, eq=False)
-class ContactForces:
+class ContactForces(NamedTuple):
     """What acted at the tool during a step: normal force [N], friction (3,) [N, world axes] and its joint torques."""
 
-    normal_force: float
-    friction: Float[np.ndarray, "3"]
-    joint_friction_torques: Float[np.ndarray, " nv"]
-    acts: bool
+    multiplier: float
+    tool_force: Float[np.ndarray, "3"]
+    tool_torques: Float[np.ndarray, " nv"]
+    in_contact: bool
 
 
 class NoContact:

@@ -1,21 +1,197 @@
 """The `kuka-surface` scenario: an iiwa slides its tool on a surface with friction (after Rath, Geist, Trimpe 2021)."""
 
-from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from forcegp import __version__
 from forcegp.data import Dataset
-from forcegp.errors import SimulationError
+from forcegp.errors import MissingExtra, RobotModelError, SimulationError
 from forcegp.forces import Actuation, RigidBodies
+from forcegp.forces.registry import force_class
 from forcegp.mechanics import Baumgarte, Contact
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.simulation.kuka_motion import TOOL_LINK, Motion, kuka_urdf, simulate_episode
+from forcegp.robots.urdf import numbers
+from forcegp.simulation.bullet import ArmState, BulletArm
+from forcegp.simulation.contact_forces import (
+    BulletContact,
+    DryFriction,
+    IdealContact,
+    NoContact,
+    PointFriction,
+    RoughPatch,
+    ViscousFriction,
+    with_tool_sphere,
+)
 from forcegp.simulation.recording import recorded
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import table_of
+from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
+
+TOOL_LINK = "lbr_iiwa_link_7"
+BASE_LINK = "lbr_iiwa_link_0"
+
+
+def kuka_file() -> Path:
+    """The URDF of the arm, with meshes beside it, in PyBullet's data. Raises MissingExtra without PyBullet."""
+    try:
+        import pybullet_data
+    except ImportError as error:
+        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
+    return Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+
+
+def kuka_urdf(config: KukaSurfaceConfig) -> str:
+    """The URDF with the inertia of link 7, the joint damping and the base height of a scenario.
+
+    A link `world` with a fixed joint carries the base. Meshes and materials are left out: no file path may go into a
+    Dataset, and collisions are off. The base cannot move and is massless. The licence comment of the original stays at
+    the head. Raises MissingExtra without PyBullet.
+    """
+    path = kuka_file()
+    text = path.read_text(encoding="utf-8")
+    root = ElementTree.fromstring(text)
+    for unused in root.findall("material"):
+        root.remove(unused)
+    for link in root.findall("link"):
+        for child in list(link):
+            if child.tag != "inertial":
+                link.remove(child)
+    for dynamics in root.iter("dynamics"):
+        dynamics.set("damping", repr(config.joint_damping))
+    tool, base = (root.find(f"link[@name='{name}']/inertial") for name in (TOOL_LINK, BASE_LINK))
+    if tool is None or base is None:
+        raise RobotModelError(
+            f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia; install pybullet 3.2.6 or 3.2.7."
+        )
+    _write_inertial(tool, config.tool_mass, config.tool_center_of_mass, config.tool_inertia)
+    _write_inertial(base, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    joint = (
+        f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
+        f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, config.base_height))}"/></joint>'
+    )
+    root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
+    ElementTree.indent(root)
+    head = text[: text.index("<robot")]
+    changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
+    return head + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _write_inertial(
+    inertial: ElementTree.Element, mass: float, center_of_mass: Sequence[float], moments: Sequence[float]
+) -> None:
+    ixx, iyy, izz = map(float, moments)
+    inertial[:] = ElementTree.fromstring(
+        f'<inertial><origin rpy="0 0 0" xyz="{numbers(center_of_mass)}"/><mass value="{float(mass)}"/>'
+        f'<inertia ixy="0" ixz="0" iyz="0" ixx="{ixx}" iyy="{iyy}" izz="{izz}"/></inertial>'
+    )
+
+
+STEPS_PER_REPORT = 240
+DIVERGED = 100.0  # rad/s
+
+
+Motion = dict[str, np.ndarray]
+"""The recorded rows of one episode: q, v, u, a and time, true forces (joint_torques, tool_torques, tool_force,
+multiplier), and in_contact, gap [m] and saturated."""
+
+
+def random_stream(config: KukaSurfaceConfig, episode: int, stream: int) -> np.random.Generator:
+    """Stream 0 draws way-points, 1 noise, 2 lifts: independent of each other and of other episodes and seeds."""
+    return np.random.default_rng([config.seed, episode, stream])
+
+
+def simulate_episode(
+    config: KukaSurfaceConfig, robot: Robot, urdf: str, episode: int, report: Callable[[int], None]
+) -> Motion:
+    """One continuous motion of the arm. `report(steps done)` is called now and then.
+
+    Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
+    """
+    settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
+    limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
+    joint_law = config.joint_law(robot)
+    columns: dict[str, np.ndarray] = {}
+    if config.contact == "bullet":
+        urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
+
+    with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
+        arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))
+        contact = _contact(config, table, arm)
+        streams = (random_stream(config, episode, stream) for stream in (0, 2))
+        tool = arm.tool(np.zeros(7))[0]
+        path = PathOverTable.random(config, table, tool, steps * config.time_step, *streams)
+        reference = path.sample(config.time_step * np.arange(steps))
+        for step in range(steps):
+            aim = reference[0][step], reference[1][step], reference[2][step]
+            _require_bounded(config, arm.state()[1], episode, step)
+            state = ArmState.of(arm)
+            v = state.v
+            try:
+                wanted = controller.joint_acceleration(state, aim)
+            except np.linalg.LinAlgError as error:
+                raise SimulationError(
+                    f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
+                    "Start from another posture (start_degrees) or keep the way-points nearer."
+                ) from error
+            asked = state.mass @ wanted + state.bias + config.joint_damping * v
+            if config.pressing_force:
+                asked = asked - config.pressing_force * (table.normal(state.position) @ state.jacobian[:3])
+            commanded = np.clip(asked, -limits, limits)
+            u = commanded - config.joint_damping * v
+            now = step * config.time_step
+            joint_torques = joint_law(v, u, state.mass, now)
+            forces = contact.step(arm, state, u + joint_torques)
+            row = {"q": state.q, "v": v, "u": u, "joint_torques": joint_torques, "gap": table.distance(state.position)}
+            row |= {**forces._asdict(), "saturated": (commanded != asked).any()}
+            if step == 0:
+                columns = {name: np.zeros((steps, *np.shape(x)), np.asarray(x).dtype) for name, x in row.items()}
+            for name, value in row.items():
+                columns[name][step] = value
+            if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
+                report(step + 1)
+        last_v = arm.state()[1]
+        _require_bounded(config, last_v, episode, steps)
+
+    if config.surface != "none" and not columns["in_contact"][: settle + 1].any():
+        raise SimulationError(
+            f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
+            "Give it more time, or a start posture nearer to the surface."
+        )
+    columns["a"] = np.diff(columns["v"], axis=0, append=last_v[None]) / config.time_step
+    columns["time"] = config.time_step * np.arange(steps)
+    return {name: values[settle:] for name, values in columns.items()}
+
+
+def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> NoContact | IdealContact | BulletContact:
+    if config.surface == "none":
+        return NoContact()
+    if config.contact == "bullet":
+        return BulletContact(arm, table, config.coulomb_coefficient)
+    patch = None if config.patch_factor == 1.0 else RoughPatch(*config.patch_x, factor=config.patch_factor)
+    return IdealContact(table, tool_friction_of(config), config.baumgarte_omega, config.baumgarte_zeta, patch)
+
+
+def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
+    """The law of the ideal contact."""
+    if config.friction == "viscous":
+        return ViscousFriction(config.viscous_coefficient)
+    falls = "breakaway" in force_class(str(config.friction)).coefficients
+    static = config.static_coefficient if falls else config.coulomb_coefficient
+    return DryFriction(config.coulomb_coefficient, static, config.breakaway_velocity, config.friction_smoothing)
+
+
+def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:
+    if not np.abs(v).max() < DIVERGED:  # also NaN
+        raise SimulationError(
+            f"episode {episode} diverged after {step * config.time_step:.3g} s (joint velocity {np.abs(v).max():.3g} "
+            "rad/s). Use the published constants, a shorter time_step or a softer controller."
+        )
+
 
 Progress = Callable[[int, int], None]
 """Called as `progress(steps done, steps in total)`."""
@@ -56,18 +232,17 @@ def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None =
 def _require_useful(config: KukaSurfaceConfig, robot: Robot, motion: Motion, episode: int) -> None:
     """Refuse rows that an ideal robot on an ideal plane would not give."""
     remedy = "Use the published constants, or slower segments (segment_seconds) and way-points within reach."
-    gap = float(np.abs(motion.gap).max())
+    gap = float(np.abs(motion["gap"]).max())
     if config.surface != "none" and config.contact == "ideal" and not gap < LARGEST_GAP:
         raise SimulationError(f"episode {episode}: the tool leaves the surface by {gap:.3g} m. {remedy}")
-    lower = np.array([joint.lower for joint in robot.joints])
-    upper = np.array([joint.upper for joint in robot.joints])
-    excess = np.maximum(lower - motion.q, motion.q - upper).max(axis=0)
+    lower, upper = np.array([(joint.lower, joint.upper) for joint in robot.joints]).T
+    excess = np.maximum(lower - motion["q"], motion["q"] - upper).max(axis=0)
     if excess.max() > LARGEST_LIMIT_EXCESS:
         joint = robot.joint_names[int(excess.argmax())]
         raise SimulationError(
             f"episode {episode}: {joint} passes its limit by {np.rad2deg(excess.max()):.3g} deg. {remedy}"
         )
-    share = float(motion.saturated.mean())
+    share = float(motion["saturated"].mean())
     if share > LARGEST_SATURATED_SHARE:
         raise SimulationError(f"episode {episode}: {share:.1%} of the torques are at their limit. {remedy}")
 
@@ -78,12 +253,8 @@ def _model(config: KukaSurfaceConfig, robot: Robot) -> Model:
         contacts = (Contact(TOOL_LINK, config.tool_point, table_of(config).surface()),)
     # PyBullet's contact does not follow Baumgarte's law.
     stabilised = contacts and config.contact == "ideal"
-    return Model(
-        robot=robot,
-        contacts=contacts,
-        forces=(Actuation(), RigidBodies()),
-        baumgarte=Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if stabilised else None,
-    )
+    baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if stabilised else None
+    return Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
 
 
 def _truth(config: KukaSurfaceConfig, column: Callable[[str], np.ndarray]) -> dict[str, np.ndarray]:
@@ -102,16 +273,9 @@ def _truth(config: KukaSurfaceConfig, column: Callable[[str], np.ndarray]) -> di
 
 def _dataset(config: KukaSurfaceConfig, robot: Robot, motions: list[Motion]) -> Dataset:
     def column(name: str) -> np.ndarray:
-        return np.concatenate([getattr(motion, name) for motion in motions])
+        return np.concatenate([motion[name] for motion in motions])
 
     signals = {name: column(name) for name in ("q", "v", "u", "a", "time")}
-    versions = {"forcegp": __version__, "pybullet": _pybullet_version(), "numpy": np.__version__}
+    versions = {"forcegp": __version__, "pybullet": version("pybullet"), "numpy": np.__version__}
     more = {"u": "commanded torque minus joint damping", "versions": versions}
     return recorded("kuka-surface", config, _model(config, robot), signals, _truth(config, column), more)
-
-
-def _pybullet_version() -> str:
-    try:
-        return version("pybullet")
-    except PackageNotFoundError:  # built from source without package metadata
-        return "unknown"

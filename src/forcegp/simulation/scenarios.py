@@ -22,21 +22,6 @@ POSITIVE: Range = ("finite and > 0", 1e-12, 1e9)
 NOT_NEGATIVE: Range = ("finite and >= 0", 0.0, 1e9)
 
 
-def checked_number(name: str, value: Any, allowed: Range) -> float:
-    """The value as float. Raises InvalidInput naming the field and its range."""
-    words, lower, upper = allowed
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not lower <= value <= upper:  # NaN fails every comparison
-        raise InvalidInput(f"{name} is {value!r}; it must be one number, {words}.")
-    return float(value)
-
-
-def require_integer(name: str, value: Any, lower: int, upper: int) -> None:
-    """Raise InvalidInput naming the field for anything else than an integer in the range."""
-    if isinstance(value, bool) or not isinstance(value, int) or not lower <= value <= upper:
-        raise InvalidInput(f"{name} is {value!r}; it must be an integer from {lower} to {upper}.")
-
-
 def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
     """Raise InvalidInput for what is neither none, nor one of these, nor laws of joints."""
     if name in ("none", *more):
@@ -44,13 +29,14 @@ def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
     from forcegp.forces.force import JointLaw  # torch, which lists of options do without
     from forcegp.forces.registry import FORCES, force_class, parse_forces
 
+    laws = [each for each in FORCES if issubclass(force_class(each), JointLaw)]
+    allowed = f"joint_friction is {name!r}; give one of {', '.join(('none', *more, *laws))}"
     try:
         known = isinstance(name, str) and all(isinstance(law, JointLaw) for law in parse_forces(name))
     except InvalidInput as error:
-        raise InvalidInput(f"joint_friction is {name!r}: {error}") from None
+        raise InvalidInput(f"{allowed} ({error})") from None
     if not known:
-        laws = (each for each in FORCES if issubclass(force_class(each), JointLaw))
-        raise InvalidInput(f"joint_friction is {name!r}; give one of {', '.join(('none', *more, *laws))}.")
+        raise InvalidInput(f"{allowed}.")
 
 
 def usual_dry_friction(config: Any) -> None:
@@ -62,8 +48,6 @@ def usual_dry_friction(config: Any) -> None:
     require_joint_friction(config.joint_friction)
 
 
-OF_PLANTS = ("exponential", "asymmetric", "load", "lugre", "drift")
-"""Joint friction that no model has (`JointFrictionLaw`)."""
 Surface = Literal["plane", "tilted", "sphere", "none"]
 ContactKind = Literal["ideal", "bullet"]
 
@@ -82,10 +66,15 @@ class CommonConfig:
 
     def _check(self, **ranges: Range) -> None:
         """Raise InvalidInput for these numbers, and those that have one of the ranges."""
-        for name, allowed in {"seconds": SECONDS, "noise": NOT_NEGATIVE, **ranges}.items():
-            object.__setattr__(self, name, checked_number(name, getattr(self, name), allowed))
-        require_integer("seed", self.seed, 0, 2**63 - 1)
-        require_integer("episodes", self.episodes, 1, 10_000)
+        for name, (words, lower, upper) in {"seconds": SECONDS, "noise": NOT_NEGATIVE, **ranges}.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not lower <= value <= upper:
+                raise InvalidInput(f"{name} is {value!r}; it must be one number, {words}.")
+            object.__setattr__(self, name, float(value))
+        for name, least, most in (("seed", 0, 2**63 - 1), ("episodes", 1, 10_000)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise InvalidInput(f"{name} is {value!r}; it must be an integer from {least} to {most}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,13 +123,11 @@ class KukaSurfaceConfig(CommonConfig):
     """How many times as large friction is on the patch; 1 for no patch."""
     joint_friction: str = "none"
     """Friction of the joints that is not part of `u`, besides the force at the tool: viscous friction and laws of
-    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below; or one
-    that no model has: "exponential" (more near rest), "asymmetric" (another force backwards, a hard sign), "load",
-    "lugre" (bristles that yield before they slide) or "drift" (`JointFrictionLaw`)."""
+    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below."""
     joint_breakaway_velocity: float = 0.2
     """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
     joint_smoothing: float = 0.1
-    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign, see `JointFrictionLaw`."""
+    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign."""
 
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
@@ -157,10 +144,7 @@ class KukaSurfaceConfig(CommonConfig):
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
-    joint_asymmetry: ClassVar[float] = 0.7  # Coulomb friction backwards over that forwards
-    joint_load: ClassVar[tuple[float, float]] = (0.04, 0.015)  # per torque of a joint that drives, that is driven back
-    joint_presliding: ClassVar[float] = 0.01  # how far a joint gives before it slides (lugre)
-    joint_drift: ClassVar[tuple[float, float]] = (0.3, 60.0)  # of Coulomb friction lost as gears warm up; in s
+    own_laws: ClassVar[tuple[str, ...]] = ()  # names of joint friction that a subclass has by `joint_law`
     baumgarte_omega: ClassVar[float] = 10.0
     baumgarte_zeta: ClassVar[float] = 1.0
     start_degrees: ClassVar[Numbers] = (85, 50, -10, -100, -170, -25, -100)  # also the posture of the null space
@@ -183,15 +167,13 @@ class KukaSurfaceConfig(CommonConfig):
         self._check(**_RANGES)
         if self.friction is None:
             object.__setattr__(self, "friction", "coulomb" if self.contact == "bullet" else "viscous")
-        for name, choices in {"surface": Surface, "contact": ContactKind}.items():
-            if getattr(self, name) not in get_args(choices):
-                allowed = ", ".join(get_args(choices))
-                raise InvalidInput(f"{name} is {getattr(self, name)!r}; it must be one of {allowed}.")
+        require_known("surface", self.surface, "kuka-surface", get_args(Surface))
+        require_known("contact", self.contact, "kuka-surface", get_args(ContactKind))
         if self.friction != "viscous":
             from forcegp.forces.registry import dry_laws
 
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
-        require_joint_friction(self.joint_friction, OF_PLANTS)
+        require_joint_friction(self.joint_friction, self.own_laws)
         if self.contact == "bullet":
             if self.surface == "none":
                 raise InvalidInput("surface is 'none'; contact 'bullet' needs a surface: plane, tilted or sphere.")
@@ -202,6 +184,20 @@ class KukaSurfaceConfig(CommonConfig):
                 f"patch_factor is {self.patch_factor}; a patch needs a surface and an ideal contact (PyBullet has one "
                 "coefficient for a whole body). Use 1, or surface plane, tilted or sphere and contact ideal."
             )
+
+    def joint_laws(self, robot: Any) -> Any:
+        """The laws that `joint_friction` names (`LawsOfJoints`), with the numbers above where it gives none."""
+        from forcegp.simulation.joint_friction import LawsOfJoints
+
+        more = tuple(near - level for near, level in zip(self.joint_static, self.joint_coulomb, strict=True))
+        numbers: dict[str, Any] = {"damping": self.joint_viscous, "level": self.joint_coulomb, "breakaway": more}
+        numbers |= {"velocity_scale": self.joint_smoothing, "velocity": self.joint_breakaway_velocity}
+        return LawsOfJoints.named(self.joint_friction, robot, numbers)
+
+    def joint_law(self, robot: Any) -> Callable[..., Any]:
+        """Torques of friction [Nm] in the next step, of velocities [rad/s], applied torques, inertias and the time."""
+        laws = self.joint_laws(robot)
+        return lambda v, u, mass, time: laws(v, u)
 
     @property
     def pressing_force(self) -> float:
@@ -298,45 +294,27 @@ class QuadrotorConfig(CommonConfig):
         self._check(wind=("from 0 to 15 m/s", 0.0, 15.0), lag=("from 0.005 to 0.2 s", 0.005, 0.2))
 
 
-@dataclass(frozen=True)
-class Scenario:
-    """A simulation that makes a Dataset. Its libraries are imported at `simulate`, so that listing scenarios is quick.
-
-    summary: one line; config: frozen dataclass of all its numbers; function: "module:name" of a function
-    `(config, progress=None) -> Dataset`.
-    """
-
-    summary: str
-    config: type
-    function: str
-
-    def simulate(self, config: Any, progress: Callable[[int, int], None] | None = None) -> forcegp.data.Dataset:
-        """Run it. `progress(steps done, steps in total)` is called now and then."""
-        if not isinstance(config, self.config):
-            raise InvalidInput(f"config is {type(config).__name__}; this scenario takes {self.config.__name__}.")
-        module, _, name = self.function.partition(":")
-        return getattr(import_module(module), name)(config, progress)
-
-
-FREE_ARM = "forcegp.simulation.free_arms:simulate_free_arm"
-SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
+FREE_ARM = FreeArmConfig, "free_arms:simulate_free_arm"
+SCENARIOS: Mapping[str, tuple[type, str]] = MappingProxyType(
     {
-        "kuka-surface": Scenario(
-            summary="a KUKA iiwa slides its tool on a surface with friction that nobody models",
-            config=KukaSurfaceConfig,
-            function="forcegp.simulation.kuka_surface:simulate_kuka_surface",
-        ),
-        "ur5-free": Scenario("a UR5 that touches nothing, with friction in every joint", FreeArmConfig, FREE_ARM),
-        "quadruped": Scenario(
-            "a quadruped that stands and shifts its weight, with a load and friction in every joint",
-            QuadrupedConfig,
-            "forcegp.simulation.quadruped:simulate_quadruped",
-        ),
-        "quadrotor": Scenario(
-            "a drone that follows a path in wind, with late rotors and air forces that nobody models",
-            QuadrotorConfig,
-            "forcegp.simulation.quadrotor:simulate_quadrotor",
-        ),
-        "double-pendulum": Scenario("two driven rods with friction in both hinges", FreeArmConfig, FREE_ARM),
+        "kuka-surface": (KukaSurfaceConfig, "kuka_surface:simulate_kuka_surface"),
+        "ur5-free": FREE_ARM,
+        "double-pendulum": FREE_ARM,
+        "quadruped": (QuadrupedConfig, "quadruped:simulate_quadruped"),
+        "quadrotor": (QuadrotorConfig, "quadrotor:simulate_quadrotor"),
     }
 )
+"""Name -> the frozen dataclass of all its numbers, and "module:name" of a function `(config, progress) -> Dataset`."""
+
+
+def simulate(scenario: str, progress: Callable[[int, int], None] | None = None, **numbers: Any) -> forcegp.data.Dataset:
+    """Run a scenario by name with these fields of its config. `progress(steps, of all)` is called now and then.
+
+    Libraries are imported here, so that listing scenarios is quick. Raises InvalidInput for numbers out of range, and
+    MissingExtra without a library of the scenario.
+    """
+    require_known("scenario", scenario, "forcegp simulate", SCENARIOS)
+    config, function = SCENARIOS[scenario]
+    numbers |= {"arm": scenario} if config is FreeArmConfig else {}
+    module, _, name = function.partition(":")
+    return getattr(import_module(f"forcegp.simulation.{module}"), name)(config(**numbers), progress)

@@ -9,31 +9,12 @@ from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
 from forcegp.checks.torques import needed_torques
-from forcegp.data import Dataset, episodes_in_order, motion_spectrum
+from forcegp.data import Dataset, motion_spectrum
 from forcegp.data.configurations import as_vectors, space_of
 from forcegp.scores.figures import style
 
 DECADES = 12.0
 """Most that an axis of powers shows below its top."""
-
-
-def _draw_time_steps(axes: Axes, dataset: Dataset) -> None:
-    """Every time step of a log against time, episodes one after the other."""
-    elapsed = 0.0
-    steps: list[float] = []
-    for _, rows, _ in episodes_in_order(dataset):
-        time = rows.time - rows.time[0]
-        own = 1e3 * np.diff(time)
-        axes.plot(elapsed + time[1:], own, ".", color=style.MEASUREMENT, markersize=1.5, rasterized=True)
-        elapsed += float(time[-1])
-        steps += own.tolist()
-    if not steps:
-        return
-    median = float(np.median(steps))
-    axes.axhline(median, color=style.PREDICTION, linewidth=1.0, linestyle=style.DASHED, label=f"median {median:.4g} ms")
-    axes.set_ylim(0.0, 1.15 * max(steps))
-    axes.margins(x=0)
-    axes.legend(fontsize=style.SMALL, frameon=False, loc="upper right")
 
 
 COLUMNS, ENTRIES = 3, 6  # panels and names of a legend beside each other
@@ -42,7 +23,7 @@ MOST_ROWS = 1000
 
 
 def check_figure(report: CheckReport) -> Figure:
-    """Torques of every joint over up to 5 s, then the spectra of all accelerations, then all time steps.
+    """Torques of every joint over up to 5 s, then the spectra of all accelerations.
 
     Where torques were not compared, positions are drawn instead.
     """
@@ -67,11 +48,9 @@ def check_figure(report: CheckReport) -> Figure:
     wrong = report.doubts.at("wrong").subjects
     told = f"{counts['wrong']} wrong{wrong and f' ({wrong})'}, {counts['look']} to look at, {counts['ok']} ok"
     style.legend_above(halves[0], f"Check: {told}", *(panel for panel, _ in panels), markerscale=4)
-    left, right = halves[1].subplots(1, 2, squeeze=False)[0]
-    _draw_spectra(left, report, names)
-    style.legend_below(halves[1], left, columns=min(nv + 1, ENTRIES))
-    _draw_time_steps(right, inputs.log)
-    style.quiet(right, title="Time steps as logged", x="recorded time [s]", y="ms")
+    spectra = halves[1].subplots()
+    _draw_spectra(spectra, report, names)
+    style.legend_below(halves[1], spectra, columns=min(nv + 1, ENTRIES))
     return figure
 
 

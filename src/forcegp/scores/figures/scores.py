@@ -1,11 +1,11 @@
-"""Figures of scores: errors per joint, calibration, and errors of predicted motions against their length."""
+"""Figures of scores: errors per joint, and errors of predicted motions against their length."""
 
 import re
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from forcegp.scores.accuracy import ACCELERATION, FORCE, LEVELS
+from forcegp.scores.accuracy import ACCELERATION, FORCE
 from forcegp.scores.figures import style
 from forcegp.scores.page import unit_of
 from forcegp.scores.scores import Scores
@@ -23,13 +23,14 @@ MOST_COLUMNS = 7
 """Panels beside each other that a page still shows large enough to read."""
 
 
-def figures_of(scores: Scores) -> dict[str, Figure]:
-    """File name without ending -> figure; those for which there are numbers."""
+def scores_pictures(scores: Scores) -> list[style.Picture]:
+    """Those for which there are numbers."""
     models = [name for name in scores.models if ACCELERATION in scores.quantities(name)]
     if not models:
-        return {}
-    figures = {"errors": errors_figure(scores, models), "calibration": calibration_figure(scores, models)}
-    return figures | ({"motions": motions_figure(scores, models)} if scores.horizons else {})
+        return []
+    moved, errors = "How the error of predicted positions grows, on time that no model has seen.", "Errors by joint."
+    found = [style.Picture("motions", moved, motions_figure(scores, models))] if scores.horizons else []
+    return [*found, style.Picture("errors", errors, errors_figure(scores, models))]
 
 
 def errors_figure(scores: Scores, models: list[str]) -> Figure:
@@ -66,24 +67,6 @@ def errors_figure(scores: Scores, models: list[str]) -> Figure:
             style.plain_ticks(axes.xaxis)
         panels[0, 0].set_yticks(range(len(models)), models)
         panels[0, 0].set_ylim(len(models) - 0.5, -0.5)
-    return figure
-
-
-def calibration_figure(scores: Scores, models: list[str]) -> Figure:
-    """The share of held-out accelerations inside the central intervals, against the share that should be."""
-    figure = style.new_figure(7.6, 4.4)
-    axes = figure.subplots()
-    axes.plot([0, 1], [0, 1], color=style.TRUTH, linewidth=1.0, label="exact")
-    for name, looks in _looks(scores, models).items():
-        covered: Any = [scores.value(f"coverage_{100 * level:.0f}", model=name) for level in LEVELS]
-        axes.plot(LEVELS, covered, label=name, **looks)
-    title = "Calibration, mean over joints, median over runs"
-    style.quiet(axes, title=title, x="nominal interval", y="held-out rows inside")
-    axes.set_aspect("equal")
-    corner = {"fontsize": style.NORMAL, "color": style.QUIET}
-    axes.text(0.98, 0.02, "intervals too narrow", ha="right", **corner)
-    axes.text(0.0, 0.97, "too wide", **corner)
-    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
     return figure
 
 

@@ -1,6 +1,9 @@
 """What all figures share: colours that everyone can distinguish, quiet axes, names, units, and whole PNG files."""
 
+import io
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -114,20 +117,34 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A figure under the name of its file without ending, with a caption that says what is to be seen."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+    @cached_property
+    def png(self) -> bytes:
+        """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
+        canvas, stream = self.figure.canvas, io.BytesIO()
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas
+        image = Image.fromarray(pixels[..., :3].copy())
+        few = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(stream, format="png", optimize=True)
+        return stream.getvalue()
+
+    def save(self, folder: Path) -> None:
+        """Write NAME.png. Raises InvalidInput if the folder does not exist."""
+        with atomic_file(folder / f"{self.name}.png") as temporary:
+            temporary.write_bytes(self.png)
+
+
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a PNG. Raises InvalidInput if the folder does not exist."""
-    with atomic_file(path) as temporary:
-        rendered(figure).save(temporary, format="png", optimize=True)
-
-
-def rendered(figure: Figure) -> Image.Image:
-    """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
-    canvas = figure.canvas
-    canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas
-    return Image.fromarray(pixels[..., :3].copy()).quantize(
-        256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
-    )
+    Picture(Path(path).stem, "", figure).save(Path(path).parent)
 
 
 def window(dataset: Dataset, start: float, seconds: float) -> Dataset:

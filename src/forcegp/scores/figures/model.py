@@ -1,5 +1,6 @@
-"""Plots: predicted accelerations and normal forces against the truth, and the course of the search."""
+"""Plots of one model on a recording: accelerations, normal forces and short motions, and which of them there are."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,12 +8,50 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.data import Dataset, recorded_motions
+from forcegp.errors import ForceGPError, InvalidInput
 from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.figures import style
+from forcegp.scores.figures.friction_curves import curve_panels, friction_curves_figure
+from forcegp.scores.motions import apart_from, interval_about
 from forcegp.scores.predicted_rows import PredictedRows, predict_rows
+
+LARGEST_GRID = 12
+SAMPLES = 24
+"""Functions drawn for an interval where the model has no calibrated ones."""
+
+
+def model_pictures(
+    posterior: Posterior, dataset: Dataset, progress: Callable[[int, int, str], None] | None = None
+) -> tuple[list[style.Picture], list[str]]:
+    """Every plot that the model and the recording allow, and why others are missing (uneven time steps, say)."""
+    wanted: list[tuple[str, str, Callable[[Posterior, Dataset], Figure]]] = [
+        (
+            "motions_ahead",
+            "Every half second a prediction begins at the recorded state and follows the recorded u. The line is its "
+            "error, the band its 95 % interval.",
+            motion_bands_figure,
+        ),
+        ("prediction", "Accelerations over time, and their errors on the right.", prediction_figure),
+    ]
+    if curve_panels(posterior):
+        caption = (
+            "Forces over velocity, with 95 % bands: the friction laws of the model and what was learned beside them. "
+            "Ticks are the velocities of the training data."
+        )
+        wanted.insert(0, ("forces", caption, friction_curves_figure))
+    if posterior.model.contacts:
+        wanted.insert(-1, ("normal_force", "The forces of contacts, which no sensor measured.", normal_force_figure))
+    pictures, missing = [], []
+    for done, (name, caption, draw) in enumerate(wanted):
+        if progress is not None:
+            progress(done, len(wanted), name)
+        try:
+            pictures.append(style.Picture(name, caption, draw(posterior, dataset)))
+        except ForceGPError as error:
+            missing.append(f"{name.replace('_', ' ')}: not drawn, because {error}")
+    return pictures, missing
 
 
 def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
@@ -114,3 +153,51 @@ def _contact_labels(contact: Contact) -> tuple[str, str]:
     if isinstance(contact, LoopClosure) and contact.turning:
         return f"{contact.frame} about {axis}", "torque [Nm]"
     return f"{contact.frame} along {axis}", "force [N]"
+
+
+def motion_bands_figure(
+    posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 6.0, horizon: float = 0.5
+) -> Figure:
+    """Errors of q over time: every `horizon` s a prediction begins at the recorded state and follows the recorded u.
+
+    Bands are 95 % intervals: calibrated ones of the model, else those of functions drawn from it; a model without
+    either has none. Positions would coincide at this scale, so their errors are drawn. At most 12 joints.
+
+    Raises InvalidInput for a recording whose rows are not evenly spaced, or shorter than `horizon`.
+    """
+    rows = style.window(dataset, start, seconds)
+    elapsed = rows.time - rows.time[0]
+    starts = np.searchsorted(elapsed, np.arange(0.0, elapsed[-1] - horizon, horizon) - 1e-9)
+    recorded = recorded_motions(rows, [int(row) for row in starts] or 1, horizon)
+    q0, v0, u = (torch.tensor(x) for x in (recorded.q[:, 0], recorded.v[:, 0], recorded.u))
+    calibrated = posterior.motion_intervals is not None
+    drawn = len(posterior.latent_names) > 0
+    samples = SAMPLES if drawn and not calibrated else 0
+    rollout = posterior.rollout(q0, v0, u, recorded.dt, integrator="rk4", samples=samples)
+    half_widths = None
+    if calibrated or samples:
+        low, high = interval_about(rollout, rollout.q)
+        half_widths = 0.5 * (high - low).cpu().numpy()
+    joints = min(rows.nv, LARGEST_GRID)
+    columns = 1 if joints < 3 else 2 if joints < 9 else 3
+    figure = style.new_figure(11.0, 1.0 + 1.55 * -(-joints // columns))
+    names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "q")
+    panels = style.joint_panels(figure, joints, columns)
+    there = torch.as_tensor(recorded.q.copy(), device=rollout.q.device)
+    signed = apart_from(there, rollout.q, rollout.space).cpu().numpy()
+    for joint, (axes, lowest) in enumerate(panels):
+        axes.axhline(0.0, color="#B8BCC2", linewidth=0.8)
+        for motion, row in enumerate(recorded.rows):
+            time = elapsed[row] + recorded.time
+            first = motion == 0
+            if half_widths is not None:
+                half = half_widths[motion, :, joint]
+                band = {"alpha": 0.28, "label": "95 % interval" if first else None}
+                style.draw_band(axes, time, np.zeros_like(half), half, **band)
+            label = "predicted − recorded" if first else None
+            style.draw_line(axes, time, signed[motion, :, joint], style.TRUTH, 1.1, label)
+        axes.margins(x=0)
+        style.quiet(axes, title=names[joint], y=units[joint], x="time [s]" if lowest else "")
+    shown = f" ({joints} of {rows.nv} joints)" if joints < rows.nv else ""
+    style.legend_above(figure, f"Errors of positions predicted {horizon:g} s ahead{shown}", panels[0][0])
+    return figure

@@ -1,34 +1,22 @@
-"""Which robot a command works with, and how it prepares a raw log."""
+"""Options of a subject, shared by commands: the robot, what it touches, models to compare, and the search."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from typing_extensions import override
 from tyro.conf import UseAppendAction, arg
 
 import forcegp
-import forcegp.data
+import forcegp.mechanics
 import forcegp.posterior
 from forcegp.atomic_files import SUMS, require_unchanged
-from forcegp.cli.command import (
-    FIELDS,
-    IDENTIFIED,
-    URDF,
-    Command,
-    listed,
-    numbers_of,
-    split_list,
-    unless_given,
-)
-from forcegp.cli.terminal import Terminal
+from forcegp.cli.command import FIELDS, IDENTIFIED, URDF, listed, numbers_of, split_list, unless_given
 from forcegp.errors import FileFormatError, InvalidInput
 
-ROBOT_OPTIONS = ("robot", "inertias", "base", "root", "lock", "armature", "gravity", "identified")
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp fit` wrote holds robot and known forces."""
 
@@ -36,8 +24,8 @@ BASES = unless_given("fixed|floating|planar|spherical", "fixed; asked where a fi
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotFileOptions(Command):
-    """What every command asks that reads a robot file."""
+class RobotFileOptions:
+    """How a robot file is read."""
 
     inertias: Literal["strict", "nearest"] = "strict"
     """What to do about a physically impossible inertia. strict: refuse the URDF. nearest: use the nearest possible
@@ -47,21 +35,20 @@ class RobotFileOptions(Command):
     floating: free. planar: free in the plane z = 0. spherical: free to turn."""
     root: Annotated[str | None, unless_given("LINK", "that of the file", str)] = None
     """A link that the URDF does not define, such as world, which the base hangs on."""
-    lock: Annotated[tuple[str, ...], listed("JOINT=RAD,...", "as recorded")] = ()
+    lock: Annotated[tuple[str, ...], listed(), unless_given("JOINT=RAD,...", "as recorded")] = ()
     """Hold joints of the URDF at these positions (rad or m), for instance a finger that was not recorded."""
-    armature: Annotated[tuple[str, ...], listed("JOINT=VALUE,...", "as recorded, or 0")] = ()
+    armature: Annotated[tuple[str, ...], listed(), unless_given("JOINT=VALUE,...", "as recorded, or 0")] = ()
     """Rotor inertias seen at joints, in kg m² (kg for a prismatic one)."""
-    gravity: Annotated[str | None, unless_given("X,Y,Z", "as recorded, or 0,0,-9.81", str)] = None
+    gravity: Annotated[tuple[float, ...], listed(float), unless_given("X,Y,Z", "as recorded, or 0,0,-9.81")] = ()
     """Gravitational acceleration in the axes of the base, in m/s²; another one if the base is not mounted upright."""
 
-    def _changes(self) -> dict[str, Any]:
+    def changes(self) -> dict[str, Any]:
         """Arguments of `Robot.from_file` by name."""
         changes: dict[str, Any] = {name: value for name in ("base", "root") if (value := getattr(self, name))}
-        if self.gravity is not None:
-            words = self.gravity.split(",")
-            if len(words) != 3:
-                raise InvalidInput(f"--gravity {self.gravity} holds {len(words)} numbers; write --gravity 0,0,-9.81.")
-            changes["gravity"] = [_finite(word, f"--gravity {self.gravity}") for word in words]
+        if self.gravity:
+            if len(self.gravity) != 3:
+                raise InvalidInput(f"--gravity holds {len(self.gravity)} numbers; write --gravity 0,0,-9.81.")
+            changes["gravity"] = self.gravity
         if self.lock:
             changes["locked"] = _named(self.lock, "--lock", "JOINT=RAD")
         if self.armature:
@@ -71,10 +58,10 @@ class RobotFileOptions(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotOptions(RobotFileOptions):
-    """What every command asks that needs a robot."""
+    """Which robot a command works with."""
 
-    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's")] = None
-    """Use this robot (URDF or MJCF) instead of the dataset's."""
+    robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's or the model's", Path)] = None
+    """Use this robot (URDF or MJCF)."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
     """Begin with the robot and the known forces that `forcegp fit` estimated, instead of --robot."""
 
@@ -84,11 +71,11 @@ class RobotOptions(RobotFileOptions):
         Closed loops of a file come along. None where there is neither. Raises InvalidInput for options that contradict
         each other or make no sense, and what `Robot.from_file` raises.
         """
-        found = self._identified_system()
-        if found is not None:
+        if self.identified is not None:
+            found = self._identified_system(self.identified)
             kept = {} if recorded is None else {"contacts": recorded.contacts, "baumgarte": recorded.baumgarte}
             return replace(found, **kept)
-        changes = self._changes()
+        changes = self.changes()
         if self.robot is None and (recorded is None or not changes):
             if changes:
                 raise InvalidInput(f"--{next(iter(changes)).replace('locked', 'lock')} needs --robot ARM.urdf.")
@@ -138,21 +125,18 @@ class RobotOptions(RobotFileOptions):
             )
         return model
 
-    def _identified_system(self) -> forcegp.Model | None:
-        if self.identified is None:
-            return None
-        given = ("robot", "base", "root", "lock", "armature", "gravity")
-        contradicting = [f"--{name}" for name in given if getattr(self, name)]
+    def _identified_system(self, place: Path) -> forcegp.Model:
+        contradicting = [f"--{each.name}" for each in fields(self) if each.name not in ("identified", "inertias")
+                         and getattr(self, each.name)]  # fmt: skip
         if contradicting:
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
-
-        path = self.identified / SYSTEM_FILE if self.identified.is_dir() else self.identified
-        if (self.identified / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
-            require_unchanged(self.identified, "fit again")
-        if path != self.identified and not path.exists() and (self.identified / "model.json").exists():
+        path = place / SYSTEM_FILE if place.is_dir() else place
+        if (place / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
+            require_unchanged(place, "fit again")
+        if path != place and not path.exists() and (place / "model.json").exists():
             from forcegp.posterior import load_posterior  # that of `save_posterior`
 
-            return identified_system(load_posterior(self.identified).model)
+            return identified_system(load_posterior(place).model)
         if path.is_fifo():  # to open it would wait for a writer for ever
             raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp fit` wrote.")
         try:
@@ -177,49 +161,6 @@ def forces_of(model: forcegp.Model) -> list[str]:
     return [] if set(titles) <= {"actuation", "rigid-bodies"} else [f"forces: {', '.join(titles)}"]
 
 
-def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
-    """Words NAME=NUMBER as a mapping, each name once."""
-    out: dict[str, float] = {}
-    for word in words:
-        name, _, text = word.rpartition("=")
-        if not name:
-            raise InvalidInput(f"{option} {word} is not {syntax}.")
-        if name in out:
-            raise InvalidInput(f"{option} names {name} twice; give each joint once.")
-        out[name] = _finite(text, f"{option} {word}")
-    return out
-
-
-def _finite(text: str, what: str) -> float:
-    complaint = f"{what}: {text!r} is not a finite number."
-    [value] = numbers_of(text, complaint, one=True)
-    if not math.isfinite(value):
-        raise InvalidInput(complaint)
-    return value
-
-
-SystemChoice = Literal["model", "data"]
-
-
-def for_system(
-    terminal: Terminal, posterior: forcegp.posterior.Posterior, log: forcegp.Dataset, choice: SystemChoice
-) -> forcegp.posterior.Posterior:
-    """A fitted model for the chosen system; what was changed is reported on stderr.
-
-    A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the log.
-    Raises InvalidInput where the log carries no system, and where the model cannot move there.
-    """
-    if choice == "model":
-        return posterior
-    if log.model is None:
-        raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-    model = log.model
-    if posterior.parameters:
-        model = replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
-        terminal.note("--system data: contacts of the data; the robot stays the identified one")
-    return posterior.with_model(model)
-
-
 def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
     """Refuse a recording of another robot: InvalidInput."""
     if tuple(posterior.joint_names) != dataset.joint_names:
@@ -229,9 +170,25 @@ def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp
         )
 
 
+def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
+    """Words NAME=NUMBER as a mapping, each name once."""
+    out: dict[str, float] = {}
+    for word in words:
+        name, _, text = word.rpartition("=")
+        if not name:
+            raise InvalidInput(f"{option} {word} is not {syntax}.")
+        if name in out:
+            raise InvalidInput(f"{option} names {name} twice; give each joint once.")
+        complaint = f"{option} {word}: {text!r} is not a finite number."
+        [out[name]] = numbers_of(text, complaint, one=True)
+        if not math.isfinite(out[name]):
+            raise InvalidInput(complaint)
+    return out
+
+
 @dataclass(frozen=True, kw_only=True)
-class CandidateOptions(Command):
-    """What every command asks that compares models."""
+class CandidateOptions:
+    """Which models are compared."""
 
     forces: Annotated[UseAppendAction[tuple[str, ...]], unless_given("FORCE,...", "some of every kind")] = ()
     """A model to fit, FORCE,...[@EVIDENCE,...] as for forcegp fit; give one --forces per model. given: the robot as
@@ -239,7 +196,7 @@ class CandidateOptions(Command):
     gp:joint-friction: unknown forces on the robot as given; identified,gp:joint-friction: on it as identified.
     viscous,coulomb@torques: laws alone. identified@motions:1: refined on motions."""
 
-    def candidates(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """Their names in Python, FORCES[@EVIDENCE] joined by "+"."""
         names = tuple("@".join("+".join(split_list(part, FIELDS)) for part in each.split("@")) for each in self.forces)
         for name in names:
@@ -249,60 +206,103 @@ class CandidateOptions(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CutoffOptions(Command):
-    """What every command asks that filters a log."""
+class SearchOptions:
+    """How functions are learned."""
 
-    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
-    """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
-    torques."""
-    differentiate: Literal["q", "v"] = "q"
-    """q: v and a from filtered positions. v: a from filtered velocities. Only with --cutoff."""
-
-    def _preparation(self) -> forcegp.Preparation:
-        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
-        if self.cutoff in ("none", "auto"):
-            cutoff = None if self.cutoff == "none" else "auto"
-        else:
-            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
-            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
-        return forcegp.Preparation(cutoff=cutoff, differentiate=self.differentiate)
+    points: Annotated[
+        int | None, unless_given("N", "200; 100 to compare; all for functions of one or two inputs", int)
+    ] = None
+    """Learn functions from N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N
+    as far as --engine is exact. Numbers of laws are found from all rows."""
+    restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1", int)] = None
+    """Starts of every search for hyper-parameters; the best is kept."""
+    iterations: Annotated[int | None, unless_given("N", "200", int)] = None
+    """Most L-BFGS iterations of each start."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """Pieces of work at once, each on one core."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PreparationOptions(CutoffOptions):
-    """What every command asks that makes rows to learn from out of a raw log."""
+# ---------------------------------------------------------------------- what the robot touches
 
-    delay: Annotated[str, arg(metavar="S|auto")] = "0"
-    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together,
-    which needs the robot."""
-    lag: Annotated[str, arg(metavar="S|auto")] = "0"
-    """Time constant in s with which actuators of first order follow u. auto: estimated, for thrusters alone."""
-    every: Annotated[int | None, unless_given("N", "1", int)] = None
-    """Keep every N-th row, after the filter."""
-    trim: Annotated[float, arg(metavar="S")] = 0.0
-    """Drop S seconds at both ends of each episode, after the filter."""
+SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
+"""Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
+CONTACTS = "FRAME@x,y,z:SURFACE,..."
+EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
+FEET, WHEELS = "FRAME@x,y,z,...", "FRAME=RADIUS,..."
+FLAT, BALL = ":flat", ":ball="
+"""Behind the frame of a foot that does not turn while it stands; of a ball that rolls, with its radius in m."""
+STANDS = "{}_stands"
+"""The input that switches the contact of a foot."""
 
-    @override
-    def _preparation(self) -> forcegp.Preparation:
-        late: dict[str, Any] = {}
-        for name in ("delay", "lag"):
-            given = getattr(self, name)
-            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, or auto.".format
-            if given != "auto":
-                each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in given.split(","))
-                given = each[0] if len(each) == 1 else each
-            late[name] = given
-        return replace(super()._preparation(), every=1 if self.every is None else self.every, trim=self.trim, **late)
 
-    def with_delay_that_shows(
-        self, terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
-    ) -> forcegp.Preparation:
-        """The same with a delay of 0 instead of "auto" where a log shows none, which is reported on stderr."""
-        contacts = dataset.model is not None and dataset.model.contacts
-        if preparation.delay != "auto" or (forcegp.data.torques_of_joints(dataset) and not contacts):
-            return preparation
-        terminal.note(
-            "u is taken to be on time: delays are estimated where it holds the torques of all joints and nothing is "
-            "touched; give --delay in s where it is late"
+def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
+    """One contact per text; the single text `none` is no contact. Raises InvalidInput for anything else."""
+    if "none" in texts:
+        if len(texts) > 1:
+            raise InvalidInput("--contact none stands alone; the other contacts contradict it.")
+        return ()
+    return tuple(parse_contact(text) for text in texts)
+
+
+def parse_contact(text: str) -> forcegp.Contact:
+    """`FRAME@x,y,z:SURFACE:numbers`, without `@x,y,z` at the frame's origin. Raises InvalidInput with an example."""
+    place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
+    if kind not in SYNTAX or not place:
+        forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
+        raise InvalidInput(
+            f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
         )
-        return replace(preparation, delay=0.0)
+    frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
+    values = []
+    for what, given, form in ((kind, numbers, SYNTAX[kind]), ("the point", point, "x,y,z")):
+        count = form.count(",") + 1
+        needs = f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
+        values.append(numbers_of(given, needs))
+        if len(values[-1]) != count:
+            raise InvalidInput(needs)
+    (*given, size), (x, y, z) = values
+    vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
+    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere, "cylinder": forcegp.Cylinder}[kind]
+    return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
+
+
+def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
+    """Points `FRAME@x,y,z`, rolling balls `FRAME@x,y,z:ball=RADIUS` or flat feet `FRAME:flat`, each with a switch.
+
+    Raises InvalidInput.
+    """
+    feet: dict[str, tuple[forcegp.Contact, ...]] = {}
+    for text in texts:
+        flat = text.endswith(FLAT)
+        named, ball, radius = text.removesuffix(FLAT).partition(BALL)
+        frame, _, point = named.rpartition("@") if "@" in named else (named, "", "0,0,0")
+        complaint = (
+            f"--feet {text!r} is not FRAME, FRAME@x,y,z (m), FRAME{BALL}RADIUS (m) or FRAME{FLAT}; for example "
+            "FL_foot@0,0,-0.02"
+        )
+        place = numbers_of(point, complaint)
+        if not frame or len(place) != 3 or (flat and (ball or "@" in named)):
+            raise InvalidInput(complaint)
+        if frame in feet:
+            raise InvalidInput(f"--feet names {frame} twice; a frame has one foot.")
+        switch, (x, y, z) = STANDS.format(frame), place
+        if flat:
+            feet[frame] = forcegp.mechanics.fixed_frame(frame, switch)
+        elif ball:
+            size = numbers_of(radius, complaint, one=True)[0]
+            feet[frame] = forcegp.mechanics.rolling(frame, size, None, (x, y, z), switch=switch)
+        else:
+            feet[frame] = forcegp.mechanics.fixed_point(frame, (x, y, z), switch)
+    return tuple(contact for points in feet.values() for contact in points)
+
+
+def parse_wheels(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
+    """Wheels `FRAME=RADIUS` that turn about the y axis of their frame on level ground. Raises InvalidInput."""
+    wheels: list[forcegp.Contact] = []
+    for text in texts:
+        frame, _, radius = text.rpartition("=")
+        complaint = f"--wheels {text!r} is not FRAME=RADIUS (m); for example left_wheel=0.1"
+        if not frame:
+            raise InvalidInput(complaint)
+        wheels += forcegp.mechanics.rolling(frame, numbers_of(radius, complaint, one=True)[0])
+    return tuple(wheels)

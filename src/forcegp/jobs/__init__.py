@@ -1,5 +1,0 @@
-"""Pieces of work whose results are kept: computed once, on any backend, until their settings or their code change."""
-
-import lazy_loader as lazy
-
-__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)  # each name is imported at its first use

@@ -1,0 +1,163 @@
+"""A posterior made ready for control rates: its programs, and its covariance, compressed at states around the data."""
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from forcegp.errors import InvalidInput, NumericalWarning
+from forcegp.evidence.training_data import TrainingData
+from forcegp.forces import ObservedWrench
+from forcegp.inference.posterior import ExactPosterior, LatentPosterior
+from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress
+from forcegp.model import Model
+from forcegp.posterior.predictor import Predictor
+from forcegp.posterior.programs import Physics, kept_record, record_key
+from forcegp.robots.manifold import ConfigurationSpace
+
+COVARIANCES = ("auto", "compressed", "exact", "none")
+UNCHANGED = 1e-7
+"""Relative difference from torch that rounding and tables explain."""
+SAMPLES, CHECKS = 300, 150
+"""States that choose the compressed covariance, and others that show how good it is."""
+STEP = 0.3
+"""Length of a step away from a training state, in differences of two others."""
+
+
+def prepared_predictor(
+    posterior: Any, covariance: str, tolerance: float, largest_rank: int, compile: bool
+) -> Predictor:
+    """What `Posterior.predictor` documents."""
+    if not isinstance(covariance, str) or covariance not in COVARIANCES:
+        raise InvalidInput(f"covariance is {covariance!r}; give one of {', '.join(map(repr, COVARIANCES))}.")
+    number = isinstance(tolerance, int | float)
+    if not (number and 0.0 < tolerance < math.inf and isinstance(largest_rank, int) and largest_rank >= 1):
+        raise InvalidInput(
+            f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
+            "0.01, and an integer from 1."
+        )
+    begin, latent, model = time.perf_counter(), posterior.latent, posterior.model
+    physics, training = Physics.of(posterior, model), rows_for(posterior.training, posterior.trained, model)
+    if covariance == "auto":
+        covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
+    options = [covariance, tolerance, largest_rank, posterior.widening]
+    key = record_key(physics, options, _numbers(latent, training, physics))
+    compressed = None
+    if covariance == "compressed" and len(latent.kernels.dense):
+        if not isinstance(latent, ExactPosterior):
+            raise InvalidInput(
+                "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
+                f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
+                f"'none', or {latent.remedy}."
+            )
+        compressed = _kept(key, lambda: _compressed(latent, training, physics, tolerance, largest_rank))
+        reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
+        if reached > tolerance:
+            warnings.warn(
+                f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large, more "
+                f"than the tolerance {tolerance:.2g}; give a larger largest_rank or tolerance, or "
+                "covariance='exact'.",
+                NumericalWarning,
+                stacklevel=3,
+            )
+    code = posterior.programs(compressed=compressed, key=key) if compile else None
+    where = model.robot.space, model.sizes, training.q.device
+    made = Predictor(posterior, *where, code, covariance, compressed)
+    first = "mean" if compressed is None else "covariance"
+    if made.compiled(first) and code is not None and not code.is_traced:
+        some = [x[:: 1 + len(x) // 3] for x in (training.q, training.v, training.u)]
+        with torch.no_grad():
+            expected = made.by_torch(*some)
+        if float((made.run(first, some)[0] - expected).abs().max()) > UNCHANGED * float(expected.abs().max()):
+            made = replace(made, code=replace(code, key=None), _made={})  # a prior's code changed: no key shows it
+            made.compiled(first)
+    return replace(made, prepare_seconds=time.perf_counter() - begin)
+
+
+def _kept(key: str | None, make: Callable[[], CompressedCovariance]) -> CompressedCovariance:
+    """A compressed covariance, found or made."""
+
+    def made() -> tuple[dict[str, Tensor], str]:
+        found = make()
+        return {str(k): F for k, F in enumerate(found.factors)} | {"inflation": found.inflation}, ""
+
+    numbers, _ = kept_record(key, "compressed", made)
+    return CompressedCovariance(tuple(numbers[str(k)] for k in range(len(numbers) - 1)), numbers["inflation"])
+
+
+def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingData:
+    """The training rows with the inputs of another system, such as one without the switches of contacts.
+
+    A wrench that an observer reports was 0 where nothing observed it. Raises InvalidInput for other inputs that they
+    lack.
+    """
+    had = trained.inputs
+    if model.inputs == had:
+        return training
+    reported = [name for force in model.forces if isinstance(force, ObservedWrench) for name in force.names]
+    new = [name for name in model.inputs if name not in (*had, *reported)]
+    if new:
+        raise InvalidInput(
+            f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
+        )
+    with_zero = torch.nn.functional.pad(training.u, (0, 1))
+    return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in model.inputs]])
+
+
+def _numbers(latent: LatentPosterior, training: TrainingData, physics: Physics) -> list[Tensor]:
+    """All that decide a predictor of a described system and prior."""
+    found = [training.q, training.v, training.u, *latent.features, *latent.weights]
+    found += [*latent.kernels.state_dict().values(), *physics.standardization.shift, *physics.standardization.scale]
+    return [*found, latent.system.factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
+
+
+def _compressed(
+    latent: ExactPosterior,
+    training: TrainingData,
+    physics: Physics,
+    tolerance: float,
+    largest_rank: int,
+) -> CompressedCovariance:
+    # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
+    rough = any(z.shape[-1] == 1 for z in latent.features)
+
+    def sample(count: int, seed: int, rows: int) -> Sample:
+        with torch.no_grad():
+            states = sample_states(training, physics.model.robot.space, count, seed, rows)
+            W, features = physics.mixing(*states)
+        usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
+        return Sample([z[usable] for z in features], W[usable])
+
+    chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
+    return compress(latent, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
+
+
+def sample_states(
+    training: TrainingData, space: ConfigurationSpace, count: int, seed: int, rows: int
+) -> list[Float[Tensor, "_ size"]]:
+    """q, v and u of states of three kinds: `rows` training rows, or all, and a third of `count` of the others each.
+
+    These are rows moved by a fraction of the difference of two others; and positions, velocities and forces of
+    different rows together.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    states = [training.q, training.v, training.u]
+
+    def some(number: int) -> Tensor:
+        return torch.randint(len(training.q), (number,), generator=generator)
+
+    own = torch.randperm(len(training.q), generator=generator)[:rows]
+    third = count // 3
+    i, j, k = some(third), some(third), some(third)
+    mixed = [some(count - 2 * third) for _ in states]
+    moved = [x[i] + STEP * (x[j] - x[k]) for x in states]
+    if not space.is_vector_space:
+        q = states[0]
+        moved[0] = space.integrate(q[i], STEP * space.difference(q[k], q[j]))
+    return [torch.cat([x[own], between, x[other]]) for x, between, other in zip(states, moved, mixed, strict=True)]

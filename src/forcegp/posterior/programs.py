@@ -1,0 +1,429 @@
+"""Predictions of a posterior as programs: one graph, traced once, and what is compiled of it, kept on disk.
+
+The Python code that `predict` runs is traced (`codegen.tracing`); processes are C functions that the graph calls
+(`inference.kernel_sums`). From the one graph come the mean, its Jacobians, the covariance and loops of steps, each
+compiled when it is first asked for. A step calls the program of the acceleration; the implicit one is Newton's method
+with its exact Jacobian, shortened where it overshoots.
+
+What took long to make lies beside the compiled libraries, in records named by a hash of all that decides them: the code
+of this package, the model, the data and the hyper-parameters. Models whose parts cannot be described, such as surfaces
+of the user's own code, have none. The oldest records go where all together grow too large.
+"""
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from forcegp.atomic_files import atomic_file
+from forcegp.codegen.c_writer import ROWS, Program, c_text, filled, head, sections, write_entry, write_function
+from forcegp.codegen.derivatives import jacobian
+from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph
+from forcegp.codegen.library import (
+    RowFunction,
+    aligned,
+    code_digest,
+    default_folder,
+    load_library,
+    opened_library,
+    own_file,
+    own_folder,
+    vector_unit,
+)
+from forcegp.codegen.tracing import trace
+from forcegp.errors import CompilerError, ForceGPError, InvalidInput
+from forcegp.evidence.training_data import Standardization
+from forcegp.forces import Actuation, RigidBodies, UnknownForces, force_to_dict
+from forcegp.inference.kernel_sums import PADDING
+from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls, refreshed_calls
+from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.prepared_kernels import CompressedCovariance
+from forcegp.integration.integrators import check_time_step, integrator_named
+from forcegp.integration.trajectory import SPEED_LIMIT
+from forcegp.mechanics import ConstrainedDynamics
+from forcegp.model import Model
+from forcegp.robots.manifold import ConfigurationSpace
+
+LARGEST = 2**30
+"""Bytes of all records together."""
+WITH_SLOPES = ("linearize", "forces")
+STEPS = sections(__name__, "rollout_steps.c")
+"""One step in C: from x = [q, v, u] to q1, v1, with the acceleration a at its beginning."""
+ON_A_MANIFOLD = "-on-a-manifold"
+
+
+def steps_of(space: ConfigurationSpace) -> dict[str, str]:
+    """The steps in C, by integrator, of a robot with these positions."""
+    apart = {name: text for name, text in STEPS.items() if name.endswith(ON_A_MANIFOLD) != space.is_vector_space}
+    return {name.removesuffix(ON_A_MANIFOLD): text for name, text in apart.items()}
+
+
+def require_step(seconds: object, integrator: str, model: Model) -> None:
+    """Raise InvalidInput for anything but a positive number of seconds, and an integrator that has no step in C."""
+    check_time_step(seconds)
+    integrator_named(integrator, model)
+    there = steps_of(model.robot.space)
+    if integrator not in there:
+        raise InvalidInput(
+            f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, there))} as `integrator`."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Physics:
+    """The physics of a posterior in a model, differentiable, by the same code as `predict`."""
+
+    model: Model
+    forces: UnknownForces
+    standardization: Standardization
+
+    @classmethod
+    def of(cls, posterior: Any, model: Model) -> "Physics":
+        """Of a `Posterior` in this model. Raises InvalidInput where u is a noisy measurement."""
+        noise = posterior.trained.noise
+        if noise is not None and noise.measured_torque:
+            raise InvalidInput(
+                "a program is for commanded torques, and in this model u comes from a noisy sensor; call predict, or "
+                "fit with Noise(..., measured_torque=False)."
+            )
+        return cls(model, posterior.trained.unknown, posterior.likelihood.standardization)
+
+    def mixing(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """W (n, nv, C) of a = offset + W f, and the features of every process (n, d)."""
+        dynamics = self.model.dynamics(q, v, u)
+        return dynamics.H @ self.forces.direction(dynamics), self._features(dynamics)
+
+    def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
+        """[a, W, Q_K + Q_U, passive forces, M, A, b, features ...]: what programs are written from."""
+        dynamics = self.model.dynamics(q, v, u)
+        B = self.forces.direction(dynamics)
+        passive = Q_U = (B @ f[..., None])[..., 0]
+        for force in self.model.laws:
+            if not isinstance(force, Actuation | RigidBodies):
+                passive = passive + force.force(dynamics.state)
+        Q = Q_U + dynamics.Q_K
+        around = passive, dynamics.M, dynamics.A, dynamics.b
+        return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
+
+    def held(
+        self, q: Tensor, v: Tensor, u: Tensor, f: Tensor, a: Tensor, multiplier: Tensor, left: Tensor
+    ) -> list[Tensor]:
+        """[lambda, b - A a, r, s, t, H, G], by which derivatives do not go through factors and pseudo-inverses.
+
+        With the acceleration, the multiplier and what is `left` of b - A a (redundant contacts) held,
+
+            r = Q - M a + A^T lambda,  s = b - A a,  t = A^T left,
+            da = H dr + G (ds + G^T dt),  G = M^-1 A^T (A M^-1 A^T)^+
+
+        which is implicit differentiation, and for `left` the derivative of a pseudo-inverse of constant rank (Golub &
+        Pereyra, SIAM J. Numer. Anal. 10, 1973, eq. 4.12).
+        """
+        dynamics = self.model.dynamics(q, v, u)
+        A, lower, inverse = dynamics.A, dynamics.inverse_lower, dynamics.pseudo_inverse
+        Q = (self.forces.direction(dynamics) @ f[..., None])[..., 0] + dynamics.Q_K
+        change = inverse @ (dynamics.b[..., None] - A @ (lower.mT @ (lower @ Q[..., None])))
+        found = [(inverse.mT @ change)[..., 0], dynamics.b - (A @ dynamics.acceleration_under(Q)[..., None])[..., 0]]
+        kinematics = dynamics.state.kinematics
+        inertial = kinematics.inverse_dynamics(a) - kinematics.bias_forces()
+        for force in self.model.laws:
+            added = force.added_inertia(self.model.robot)
+            if added is not None:
+                inertial = inertial + (added @ a[..., None])[..., 0]
+        r = Q - inertial + (A.mT @ multiplier[..., None])[..., 0]
+        s, t = dynamics.b - (A @ a[..., None])[..., 0], (A.mT @ left[..., None])[..., 0]
+        return [*found, r, s, t, dynamics.H, lower.mT @ inverse]
+
+    def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:
+        return list(self.standardization(self.forces.features(dynamics)))
+
+
+class Traced(NamedTuple):
+    """The graph of `Physics.traced`, and the nodes of what it gives."""
+
+    graph: Graph
+    a: list[int]
+    W: list[list[int]]
+    features: list[list[int]]
+    forces: list[int]
+    around: list[int]
+    passive: list[int]
+    held: list[Any]  # what derivatives are made of where q does not add up
+
+
+@dataclass(eq=False)
+class Programs:
+    """The programs of a posterior in a model, and their C text; `example` are one state's q, v and u (1, size).
+
+    `key` names their records. Raises InvalidInput, when something is traced, for what no graph holds.
+    """
+
+    physics: Physics
+    example: Sequence[Tensor]
+    latent: LatentPosterior
+    widening: float
+    compressed: CompressedCovariance | None = None
+    key: str | None = None
+    given: tuple[Traced, tuple[LatentCall, ...]] | None = None
+    """What was traced of another posterior, and the processes of this one."""
+
+    def __post_init__(self) -> None:
+        self.space: ConfigurationSpace = self.physics.model.robot.space
+        self.sizes: tuple[int, int, int] = self.physics.model.sizes
+        if self.example[0].device.type != "cpu":
+            raise InvalidInput(
+                f"compiled code runs on the CPU, and the model is on {self.example[0].device}; give compile=False, or "
+                "a model on the CPU."
+            )
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether something was made anew."""
+        return "traced" in vars(self)
+
+    @cached_property
+    def sums(self) -> tuple[LatentCall, ...]:
+        """The processes as C functions."""
+        return self.given[1] if self.given else latent_calls(self.latent, self.compressed)
+
+    @cached_property
+    def traced(self) -> Traced:
+        """The physics as a graph."""
+        if self.given:
+            return self.given[0]
+        inputs = [*self.example, torch.ones(1, len(self._latents), dtype=torch.float64)]
+        graph, found = trace(self.physics.traced, inputs)
+        (a, W, Q, passive, *around), features = ([x[0].tolist() for x in part] for part in (found[:7], found[7:]))
+        held: list[Any] = []
+        if not self.space.is_vector_space:
+            m = found[5].shape[-2]
+            more = [torch.zeros(1, size, dtype=torch.float64) for size in (len(a), m, m)]
+            graph.more_inputs(sum(x.numel() for x in more))
+            nodes = [Expression(graph, node) for node in graph.inputs]
+            held = [x[0].tolist() for x in trace(self.physics.held, [*inputs, *more], graph, nodes)[1]]
+        flat = [int(node) for values in around for node in np.ravel(values)]
+        return Traced(graph, a, W, features, Q, flat, passive, held)
+
+    @cached_property
+    def _latents(self) -> list[int]:
+        """All processes in the order of the sums."""
+        return [c for part in self.sums for c in part.latents]
+
+    def program(self, kind: str) -> Program:
+        """The program "mean", "linearize", "covariance", "forces", or "passive" ones: all but actuation and bias."""
+        at, given, count = self.traced, dict(zip("qvu", self.sizes, strict=True)), sum(self.sizes)
+        graph, f, slopes = Graph(count), {}, kind in WITH_SLOPES
+        if kind == "linearize" and at.held:
+            graph.more_inputs(len(at.graph.inputs) - count - len(self._latents))
+        copied = Copier(graph, at.graph, dict(zip(at.graph.inputs, graph.inputs, strict=False)))
+        features = [copied(at.features[part.latents[0]]) for part in self.sums]
+        for part, z in zip(self.sums, features, strict=True):
+            f |= dict(zip(part.latents, part.call(graph, z, slopes), strict=True))
+        copied.known.update(
+            zip(at.graph.inputs[count:], [*(f[c] for c in sorted(f)), *graph.inputs[count:]], strict=False)
+        )
+        match kind:
+            case "forces":
+                slope = jacobian(graph, Q := copied(at.forces), graph.inputs[-self.sizes[2] :])
+                outputs = {"Q": Q, "around": [node for row in slope for node in row] + copied(at.around)}
+            case "passive":
+                outputs = {"Q": copied(at.passive)}
+            case "mean":
+                outputs = {"a": copied(at.a)}
+            case "linearize" if at.held:
+                graph, outputs = self._implicit(graph, copied, copied(at.a))
+            case "linearize":
+                rows = jacobian(graph, a := copied(at.a), graph.inputs)
+                outputs = {"a": a, "jacobian": [node for row in rows for node in row]}
+            case _:
+                a, terms = copied(at.a), copied([row[c] for row in at.W for c in self._latents])
+                terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.variance(graph, z)]
+                terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.given(graph, z)]
+                outputs = {"a": a, "covariance": terms}
+        return Program(graph, given, outputs)
+
+    def _implicit(self, graph: Graph, copied: Copier, a: list[int]) -> tuple[Graph, dict[str, list[int]]]:
+        """The acceleration and its derivatives in a step from q, in v and in u, by `Physics.held`."""
+        (nq, nv, nu), count = self.sizes, sum(self.sizes)
+        multiplier, left, r, s, t = (copied(nodes) for nodes in self.traced.held[:5])
+        H, G = ([copied(row) for row in rows] for rows in self.traced.held[5:])
+        inputs = [Expression(graph, node) for node in graph.inputs[:nq]]
+        tangent = trace(lambda q: [self.space.tangent(q)], [self.space.neutral()], graph, inputs)[1][0].tolist()
+        rest = [[ONE if i == j else ZERO for j in range(nv + nu)] for i in range(nv + nu)]
+        seeds = [row + [ZERO] * (nv + nu) for row in tangent] + [[ZERO] * nv + row for row in rest]
+        slopes = jacobian(graph, [*r, *s, *t], graph.inputs[:count], seeds)
+        made = Graph(count)  # where what was held is what it is
+        there = Copier(made, graph, dict(zip(graph.inputs, made.inputs, strict=False)))
+        there.known.update(zip(graph.inputs[count:], there([*a, *multiplier, *left]), strict=True))
+        columns = [there(list(column)) for column in zip(*slopes, strict=True)]
+        H, G = ([there(row) for row in rows] for rows in (H, G))
+        found = []
+        for column in columns:
+            dr, ds, dt = column[:nv], column[nv : nv + len(s)], column[nv + len(s) :]
+            change = [made.apply("add", d, made.dot(g, dt)) for d, g in zip(ds, zip(*G, strict=True), strict=False)]
+            found.append([made.apply("add", made.dot(h, dr), made.dot(g, change)) for h, g in zip(H, G, strict=True)])
+        return made, {"a": there(a), "jacobian": [node for row in zip(*found, strict=True) for node in row]}
+
+    def c_source(self, kind: str, lanes: int, entry: str = "") -> str:
+        """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`.
+
+        `entry` is another text that calls `program(t, live, x, y)` instead.
+        """
+        integrator = kind if kind in steps_of(self.space) else ""
+        if integrator:
+            kind = "linearize" if integrator == "implicit-midpoint" else "mean"
+        program, slopes = self.program(kind), kind in WITH_SLOPES
+        names = [part.name + ("_slopes" if slopes else "") for part in self.sums]
+        text = [head(lanes), *(part.c_source(lanes, slopes) for part in self.sums)]
+        finish = None
+        if kind == "covariance":
+            text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self.covariance_source()]
+            finish = {"covariance": ("covariance", self.sizes[1] ** 2)}
+        text.append(write_function("program", program.graph, program.nodes, lanes, names))
+        if integrator:
+            text += [*self.motion_source(lanes), ROWS, self._loop_source(integrator, len(program.nodes))]
+        else:
+            text.append(entry or write_entry(program, "program", finish))
+        return "\n".join(text)
+
+    def step_source(self, integrator: str, function: str) -> str:
+        """The text of a step that calls `function`, whose slopes are those in a step from q, v and u."""
+        columns = 2 * self.sizes[1] + self.sizes[2]
+        return filled(steps_of(self.space)[integrator], {"PROGRAM": function, "COLUMNS": columns})
+
+    def _loop_source(self, integrator: str, outputs: int) -> str:
+        words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
+        words |= {"OUTPUTS": outputs, "LIMIT": SPEED_LIMIT, "STEP": self.step_source(integrator, "program")}
+        return filled(c_text(__name__, "rollout_loop.c"), words)
+
+    def motion_source(self, lanes: int) -> list[str]:
+        """C functions that steps on a manifold call: q after a step, and the rate of a step under a velocity."""
+        if self.space.is_vector_space:
+            return []
+        q, step = self.space.neutral(), torch.zeros(self.sizes[1], dtype=torch.float64)
+        made = {"moved": trace(lambda q, step: [self.space.integrate(q, step)], [q, step])}
+        made["step_rate"] = trace(lambda step, v: [self.space.chart_velocity(step, v)], [step, step])
+        return [write_function(name, graph, x.tolist(), lanes) for name, (graph, (x,)) in made.items()]
+
+    def covariance_source(self) -> str:
+        """The C function that makes the covariance of the outputs of its program."""
+        calls, C = [], len(self._latents)
+        first, place = 0, self.sizes[1] * C + C
+        for k, part in enumerate(self.sums):
+            calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
+            first, place = first + len(part.latents), place + len(part.operands)
+        words = {"JOINTS": self.sizes[1], "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
+        return filled(c_text(__name__, "covariance.c"), words | {"ROOTS": "\n  ".join(calls)})
+
+    @property
+    def rank(self) -> int:
+        """Numbers per process of the compressed covariance, filled up to whole vectors."""
+        assert self.compressed is not None, "asked for by programs of the covariance only"
+        return self.compressed.rank + -self.compressed.rank % PADDING
+
+    def tables(self, kind: str = "mean") -> list[Tensor]:
+        """What the C functions of the sums take, then for a covariance its roots."""
+        found = [part.table() for part in self.sums]
+        return [aligned(x) for x in found + [part.root_table() for part in self.sums if kind == "covariance"]]
+
+    def refreshed(self, latent: LatentPosterior) -> "Programs":
+        """Those of another posterior with the same kernels. Raises InvalidInput as `refreshed_calls`."""
+        given = self.traced, refreshed_calls(self.sums, latent)
+        return replace(self, latent=latent, key=None, given=given)
+
+    def drawn(self, samples: int, seed: int) -> "Sequence[Programs] | None":
+        """Those of each drawn function, whose texts are equal; None where one has no form in pieces."""
+        if not samples or not self.sums:
+            return [self] * max(1, samples)
+        drawn = drawn_calls(self.latent, self.sums, samples, seed, self.widening)
+        if drawn is None:
+            return None
+        return [replace(self, compressed=None, key=None, given=(self.traced, calls)) for calls in drawn]
+
+    def function(self, kind: str) -> RowFunction:
+        """A program, or the loop of an integrator: found or made. Raises CompilerError where that cannot be."""
+        (_, nv, nu), m = self.sizes, len(self.physics.model.contacts)
+        outputs = {
+            "linearize": [nv, nv * (2 * nv + nu)],
+            "covariance": [nv, nv**2],
+            "forces": [nv, nv * nu + nv**2 + m * nv + m],
+            "mean": [nv],
+        }.get(kind, [0] * 4)  # a loop gives as much as it is asked for
+        inputs = 3 + (kind in steps_of(self.space))
+
+        def make() -> tuple[dict[str, Tensor], str]:
+            text = self.c_source(kind, vector_unit()[0])
+            library = load_library(f"predictor-{kind}", text, lambda _: text)
+            return {str(k): x for k, x in enumerate(self.tables(kind))}, Path(library._name).name
+
+        numbers, path = kept_record(self.key, kind, make)
+        tables = [aligned(numbers[str(k)].numpy()) for k in range(len(numbers))]
+        return RowFunction(opened_library(path), inputs, outputs, tables)
+
+    def loops(self, integrator: str, samples: int = 0, seed: int = 0) -> list[RowFunction] | None:
+        """Over the mean or each drawn function; None where one has no form in pieces, or no such step is written in C.
+
+        Raises CompilerError.
+        """
+        if integrator not in steps_of(self.space):
+            return None
+        if not samples:
+            return [self.function(integrator)]
+        if (codes := self.drawn(samples, seed)) is None:
+            return None
+        first = codes[0].function(integrator)
+        return [first.with_tables(code.tables()) for code in codes]
+
+
+def record_key(physics: Physics, options: Sequence[object], numbers: Iterable[Tensor]) -> str | None:
+    """The hash of a description, of tensors, and of the code; None where the physics holds code of the user's."""
+    try:
+        parts = [physics.model.to_dict(), *map(force_to_dict, physics.forces.terms), options, torch.__version__]
+        text = json.dumps([*parts, repr(vector_unit()), code_digest()])
+    except (ForceGPError, TypeError, ValueError):
+        return None
+    digest = hashlib.sha256(text.encode())
+    for x in numbers:
+        values = x.detach().cpu().contiguous()
+        digest.update(repr((values.shape, values.dtype)).encode())
+        digest.update(values.numpy().data)
+    return digest.hexdigest()[:32]
+
+
+def kept_record(
+    key: str | None, kind: str, make: Callable[[], tuple[Mapping[str, Tensor], str]]
+) -> tuple[Mapping[str, Tensor], Path]:
+    """Numbers and the file of a library in the folder: found, or made and kept where that is possible."""
+    with contextlib.suppress(OSError, SafetensorError, CompilerError):
+        path = own_folder() / f"predictor-{key}-{kind}.safetensors"
+        if key is not None and path.is_file():
+            own_file(path)
+            with safe_open(path, "pt") as file:  # type: ignore[reportUnknownVariableType]  # no types
+                numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
+                library = path.parent / Path(file.metadata()["library"]).name
+            if library.exists():
+                path.touch()
+                return numbers, library
+    numbers, name = make()
+    folder = default_folder()
+    with contextlib.suppress(OSError, CompilerError):
+        folder = own_folder()
+        if key is not None:
+            data = save({name: x.detach().contiguous() for name, x in numbers.items()}, {"library": name})
+            with atomic_file(folder / f"predictor-{key}-{kind}.safetensors") as path:
+                path.write_bytes(data)
+            left = LARGEST
+            for path in sorted(folder.glob("predictor-*.safetensors"), key=lambda path: -path.stat().st_mtime):
+                left -= path.stat().st_size
+                if left < 0:
+                    path.unlink()
+    return numbers, folder / name
