@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from forcegp import AerodynamicForce, Dataset, fit
-from forcegp.data import recorded_motions
-from forcegp.data.delay import lagged
+from forcegp.data import Lag, recorded_motions
 from forcegp.posterior import Posterior, observing
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -23,7 +22,7 @@ HORIZONS = (0.1, 0.25, 0.5, 1.0)
 def flight(seed: int, wind: float) -> Dataset:
     """With the rotor speeds that act, from .3 s on."""
     dataset = simulate_quadrotor(QuadrotorConfig(seconds=20.0, seed=seed, wind=wind))
-    late = np.stack([lagged(column, dataset.time, 0.06) for column in dataset.u.T], axis=1)
+    late = Lag(0.06)(dataset.u, dataset.time)
     return replace(dataset, u=late).rows(np.arange(72, len(dataset)))
 
 

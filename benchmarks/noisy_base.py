@@ -49,7 +49,7 @@ def main() -> None:
                 steps[:, 6:] *= 0.2
                 q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
                 noisy = log.__class__(q=q, v=log.v, u=log.u, a=log.a, time=log.time, model=log.model)
-                prepared = Preparation(cutoff=cutoff, stance="auto", trim=0.3).apply(noisy).dataset
+                prepared = Preparation(cutoff=cutoff, stance="auto", trim=0.3).apply(noisy)
                 model = prepared.model.with_forces(RigidBodies("all"), Viscous(), Coulomb())
                 result = fit(model, prepared, EVIDENCE[likelihood], rows=ROWS)
                 found.append((*result.parameters.total_mass, *(errors(result.model) / given)))

@@ -57,7 +57,7 @@ def prepared(ur5: Any, seed: int, mass: float, center: np.ndarray) -> Dataset:
     robot = Robot.from_urdf_text(ur5.URDF)
     data = {"q": q, "v": v, "u": u, "a": np.gradient(v, rows[:, 0], axis=0), "time": rows[:, 0]}
     raw = Dataset(**data, joint_names=robot.joint_names, model=Model(robot))
-    return Preparation(cutoff="auto", delay="auto", trim=0.5).apply(raw).dataset
+    return Preparation(cutoff="auto", delay="auto", trim=0.5).apply(raw)
 
 
 def payloads(ur5: Any) -> dict[str, float]:

@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from forcegp import AerodynamicForce, Dataset, fit
-from forcegp.data import estimate_thruster_lag
-from forcegp.data.delay import lagged
+from forcegp.data import Lag, estimate_thruster_lag
 from forcegp.posterior import Posterior, observing
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -29,7 +28,7 @@ HORIZON, STRIDE = 120, 60  # rows: of .5 s, and between starts
 
 
 def acting(dataset: Dataset, lag: float) -> Dataset:
-    late = np.stack([lagged(column, dataset.time, lag) for column in dataset.u.T], axis=1)
+    late = Lag(lag)(dataset.u, dataset.time)
     keep = np.arange(240, len(dataset))
     return replace(dataset, u=late).rows(keep)
 

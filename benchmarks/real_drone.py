@@ -62,7 +62,7 @@ def flight(given: str, model: Model, cutoff: float) -> Dataset:
         time=time,
         model=model,
     )
-    return Preparation(cutoff=cutoff, trim=0.1, differentiate="v").apply(log).dataset
+    return Preparation(cutoff=cutoff, trim=0.1, differentiate="v").apply(log)
 
 
 def joined(flights: list[Dataset]) -> Dataset:

@@ -24,7 +24,7 @@ def with_noise_of_poses(log: Dataset, noise: float, seed: int) -> Dataset:
     steps = noise * np.random.default_rng(seed).standard_normal(log.v.shape)
     steps[:, 6:] *= 0.2
     q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
-    return Preparation(cutoff=CUTOFF).apply(replace(log, q=q, truth={}, noise_std=None)).dataset
+    return Preparation(cutoff=CUTOFF).apply(replace(log, q=q, truth={}, noise_std=None))
 
 
 def main() -> None:

@@ -30,7 +30,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset, Preparation, farthest_rows, resample, units_for
-from forcegp.data.motion_records import RecordedMotions, recorded_motions
+from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.evidence import Windows
 from forcegp.fit import fit
@@ -163,7 +163,7 @@ def fitted(rig: Rig, source: Source, points: int, seed: int) -> Posterior:
     if isinstance(how, Windows):
         noise = None if rig.force_noise is None else Noise(None, rig.force_noise, learn=True)
         return fit(replace(model, noise=noise), _later(rig.train, 5 * seed), how, points=points, restarts=1)
-    rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train).dataset
+    rows = Preparation(cutoff=how, trim=TRIM).apply(rig.train)
     noise = Noise(1.0, rig.force_noise, learn=True)
     return fit(replace(model, noise=noise), farthest_rows(rows, points, start=seed), restarts=1)
 
@@ -183,7 +183,7 @@ class Targets:
 
     @classmethod
     def of(cls, rig: Rig) -> Targets:
-        filtered = Preparation(cutoff=rig.reference, trim=TRIM).apply(rig.test).dataset
+        filtered = Preparation(cutoff=rig.reference, trim=TRIM).apply(rig.test)
         stamps = zip(rig.test.episode, rig.test.time, strict=True)
         raw = {(number, round(t, 6)): row for row, (number, t) in enumerate(stamps)}
         at = [raw[number, round(t, 6)] for number, t in zip(filtered.episode, filtered.time, strict=True)]

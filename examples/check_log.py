@@ -17,6 +17,6 @@ noise = np.random.default_rng(0)
 q = motion[0] + 2e-5 * noise.standard_normal(phase.shape)
 v = np.gradient(q, time, axis=0, edge_order=2)
 a = np.gradient(v, time, axis=0, edge_order=2)
-for finding in check(Dataset(q=q, v=v, u=u, a=a, time=time, model=NOMINAL)).findings:
-    if finding.severity == "wrong":
-        print(f"{finding.subject}: {finding.seen}\n  remedy: {finding.remedy}")
+for doubt in check(Dataset(q=q, v=v, u=u, a=a, time=time, model=NOMINAL)).doubts:
+    if doubt.level == "wrong":
+        print(f"{doubt.about}: {doubt.what}\n  remedy: {doubt.advice}")

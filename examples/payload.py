@@ -11,7 +11,7 @@ from forcegp import Dataset, Model, Offset, Payload, Preparation, Robot, Rotor, 
 time, q, v, u = np.split(recorded(seconds=12.0), [1, 7, 13], axis=1)
 a = np.gradient(v, time[:, 0], axis=0)
 log = Dataset(q=q, v=v, u=u, a=a, time=time[:, 0], model=Model(Robot.from_urdf_text(URDF)))
-data = Preparation(cutoff=12.0, every=13, trim=0.1).apply(log).dataset
+data = Preparation(cutoff=12.0, every=13, trim=0.1).apply(log)
 
 model = data.model.with_forces(Viscous(), Stribeck(), Offset(), Rotor(), Payload("tool0"))
 found = fit(model, data).parameters

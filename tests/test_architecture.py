@@ -19,6 +19,7 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 PACKAGES = {
     "errors": set(),
     "summary": set(),
+    "doubts": {"errors"},
     "atomic_files": {"errors"},
     "codegen": {"errors", "atomic_files"},
     "parallel": {"errors"},
@@ -29,7 +30,7 @@ PACKAGES = {
     "noise": {"errors"},
     "model": {"errors", "summary", "robots", "mechanics", "forces", "noise"},
 }
-MODEL = {"errors", "summary", "robots", "mechanics", "forces", "noise", "model"}
+MODEL = {"errors", "summary", "doubts", "robots", "mechanics", "forces", "noise", "model"}
 PACKAGES |= {
     "data": MODEL | {"atomic_files"},
     "recordings": MODEL | {"atomic_files", "data"},

@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks.paper.data import test_trajectory
 from benchmarks.paper.fits import MODEL
 from forcegp.data import Dataset
-from forcegp.data.motion_records import recorded_motions
+from forcegp.data.views import recorded_motions
 from forcegp.integration import Feedback, SymplecticEuler, integrate
 from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte

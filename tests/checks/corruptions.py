@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from tests.checks.logs import column, exchanged
 
 from forcegp.checks import check, quick_check
-from forcegp.cli.fit import findings_in_one_line
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
 from forcegp.mechanics import Contact, Plane
@@ -229,54 +227,40 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "a in degrees": (lambda d: at(d, "a", degrees(d)), "acceleration"),
     "u in mNm": (lambda d: at(d, "u", [1000.0] * 2), "torque unit"),
     "motor side of gears, u": (lambda d: at(d, "u", [1 / 50, 1 / 100]), "torque unit"),
-    "motor side of one gear, u": (lambda d: at(d, "u", [1.0, 1 / 30]), "torque unit"),
-    "motor side of a gear, q v a": (lambda d: at(d, "qva", [1.0, 6.0]), "motion|gear"),
-    "motor currents": (lambda d: at(d, "u", [1 / 0.07, 1 / 0.11]), "torque unit"),
     "torque constant 30 % off": (lambda d: at(d, "u", [1.0, 1.3]), "torque constant|torque unit|mass"),
-    "torque constant 30 % low": (lambda d: at(d, "u", [0.7, 1.0]), "torque constant|torque unit|mass"),
     "torque sign of one": (lambda d: at(d, "u", [1, -1]), "torque sign"),
     "torque sign of all": (lambda d: at(d, "u", [-1, -1]), "torque sign"),
     "motion sign of one": (lambda d: at(d, "qva", [-1, 1]), "sign"),
     "axis of one": (lambda d: at(d, "qvau", [1, -1]), "sign"),
     "velocity sign": (lambda d: at(d, "v", [1, -1]), "velocity"),
-    "acceleration sign": (lambda d: at(d, "a", [-1, 1]), "acceleration"),
     "torques exchanged": (lambda d: exchanged(d, "u", [1, 0]), "joints exchanged"),
     "motions exchanged": (lambda d: exchanged(d, "qva", [1, 0]), "joints exchanged"),
     "joints exchanged": (lambda d: exchanged(d, "qvau", [1, 0]), "joints exchanged"),
     "velocities exchanged": (lambda d: exchanged(d, "v", [1, 0]), "velocity"),
     "torques 20 ms late": (lambda d: late(d, "u", 0.02), "delay"),
-    "torques 20 ms early": (lambda d: late(d, "u", -0.02), "delay"),
     "velocities 20 ms late": (lambda d: late(d, "v", 0.02), "velocity"),
     "gravity upside down": (lambda d: recorded_under(d, (0, 0, 9.81)), "gravity"),
-    "gravity of a wall": (lambda d: recorded_under(d, (9.81, 0, 0)), "gravity"),
-    "recorded without gravity": (lambda d: recorded_under(d, (0, 0, 0)), "gravity"),
     "gravity not stated": (lambda d: other_robot(d, gravity=(0, 0, 0)), "gravity"),
-    "masses doubled": (lambda d: scaled(d, (2.0, 2.0)), "mass"),
     "a mass doubled": (lambda d: scaled(d, (1.0, 2.0)), "mass"),
     "a mass halved": (lambda d: scaled(d, (0.5, 1.0)), "mass|torque unit|inertia"),
     "length .4 -> .6": (lambda d: scaled(d, length=1.5), "length"),
-    "length .4 -> .25": (lambda d: scaled(d, length=0.625), "length"),
     "3 % of all rows zero": (lambda d: dropped(d, "qvau", 0.03), "zero|drop"),
-    "3 % of torques zero": (lambda d: dropped(d, "u", 0.03), "zero|drop"),
     "3 % of q zero": (lambda d: dropped(d, "q", 0.03), "zero|drop|velocity"),
     "frozen position": (lambda d: column(d, "q", 1, held), "frozen"),
-    "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "saturation": (lambda d: column(d, "u", 0, lambda x: np.clip(x, *np.quantile(x, [0.1, 0.9]))), "saturation"),
     "noise_std 100 times too small": (lambda d: replace(d, noise_std=np.full(2, 1e-3)), "noise"),
-    "noise_std 100 times too large": (lambda d: replace(d, noise_std=np.full(2, 10.0)), "noise"),
+    "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "encoder zero off by .4": (lambda d: replace(d, q=d.q + np.array([0.0, 0.4])), "zero"),
     "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "dead torque|constant"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
-    "coarse positions": (lambda d: replace(d, q=d.q.round(2)), "resolution"),
 }
 CONTACT_CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "contact 2 cm sideways": (lambda d: moved(d, (0.02, 0.0, 0.0)), "contact"),
-    "contact missing": (without_contacts, "contact"),
 }
 
 
 UNSEEN: Mapping[str, tuple[str, ...]] = {
-    "crane": ("length .4 -> .6", "length .4 -> .25", "gravity of a wall"),  # these change no torque, or a constant
+    "crane": ("length .4 -> .6",),  # these change no torque, or a constant
 }
 
 
@@ -299,8 +283,8 @@ def named(said: str, words: str) -> bool:
 
 
 def said_by_check(data: Dataset) -> str:
-    found = check(data).findings
-    return "\n".join(f"[{each.severity}] {each.subject}: {each.seen}" for each in found if each.severity != "ok")
+    found = check(data).doubts
+    return "\n".join(f"[{each.level}] {each.about}: {each.what}" for each in found if each.level != "ok")
 
 
 def said_by_fit(data: Dataset) -> str:
@@ -311,4 +295,4 @@ def said_by_fit(data: Dataset) -> str:
         data.model.check_states(q, v, u)
     except ForceGPError as error:
         return str(error)
-    return findings_in_one_line(quick_check(data), Path("log.h5")) or ""
+    return quick_check(data).in_one_line()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from forcegp import ColumnMapping, Dataset, Model, Robot, check, excitation, import_recordings
 from forcegp.checks import quick_check
 from forcegp.data.configurations import rates
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import InvalidInput
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
@@ -23,17 +23,17 @@ def log():
     return simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=5, noise=0.05))
 
 
-def test_a_clean_log_has_no_finding(log):
+def test_a_clean_log_has_no_doubt(log):
     assert not quick_check(log)
 
 
 def test_a_quaternion_that_begins_with_w_is_named(log):
     q = log.q.copy()
     q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
-    (finding,) = quick_check(replace(log, q=q))
-    assert (finding.severity, finding.subject) == ("wrong", "base")
-    assert "w, x, y, z" in finding.seen
-    assert "forcegp import --orientation wxyz" in finding.remedy
+    (doubt,) = quick_check(replace(log, q=q))
+    assert (doubt.level, doubt.about) == ("wrong", "base")
+    assert "w, x, y, z" in doubt.what
+    assert "forcegp import --orientation wxyz" in doubt.advice
 
 
 def test_velocities_in_the_axes_of_the_world_are_named(log):
@@ -46,20 +46,20 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
     c, s = np.cos(turn), np.sin(turn)
     yaw = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # the base turned about its own z axis
     v[:, :3], v[:, 3:6] = v[:, :3] @ yaw.T, v[:, 3:6] @ yaw.T
-    assert not [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
+    assert not [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
     turned = rotation @ yaw.T
     v[:, :3] = (turned @ v[:, :3, None])[..., 0]
     v[:, 3:6] = (turned @ v[:, 3:6, None])[..., 0]
-    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
-    assert findings[0].seen.startswith("positions of 'base' change as if it had velocities in the axes of the world")
-    assert "--axes v=world. " in findings[0].remedy
+    doubts = [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
+    assert doubts[0].what.startswith("positions of 'base' change as if it had velocities in the axes of the world")
+    assert "--axes v=world" in doubts[0].command
     v[:, 3:6] = (np.linalg.inv(turned) @ v[:, 3:6, None])[..., 0]
-    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
-    assert "linear velocities in the axes of the world" in findings[0].seen
-    assert "--axes v=world,body." in findings[0].remedy
+    doubts = [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
+    assert "linear velocities in the axes of the world" in doubts[0].what
+    assert "--axes v=world,body" in doubts[0].command
     q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
-    findings = [each for each in quick_check(replace(log, q=q, v=v)) if each.subject == "base"]
-    assert "--orientation wxyz --axes v=world,body." in findings[0].remedy
+    doubts = [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
+    assert "--orientation wxyz --axes v=world,body" in doubts[0].command
 
 
 def swaying(speed: float, noise: float) -> Dataset:
@@ -80,42 +80,30 @@ def swaying(speed: float, noise: float) -> Dataset:
 def test_rates_in_the_axes_of_the_world_are_named_in_noise_as_well():
     """Where turns are slow, both readings miss by much of the speed; what they differ in decides."""
     log = swaying(0.3, noise=0.05)
-    (finding,) = [each for each in quick_check(log) if each.subject == "base"]
-    assert finding.severity == "wrong"
-    assert "angular velocities in the axes of the world" in finding.seen
-    assert "--axes v=body,world." in finding.remedy
+    (doubt,) = [each for each in quick_check(log) if each.about == "base"]
+    assert doubt.level == "wrong"
+    assert "angular velocities in the axes of the world" in doubt.what
+    assert "--axes v=body,world" in doubt.command
     stated = {"import": {"mapping": {"axes": {"v": ["world", "body"]}}}}  # linear ones were turned already
-    (finding,) = [each for each in quick_check(replace(log, metadata=stated)) if each.subject == "base"]
-    assert "--axes v=world." in finding.remedy
-
-
-def test_noise_alone_is_not_taken_for_other_axes():
-    found = [each for each in quick_check(swaying(0.0, noise=0.1)) if each.subject == "base"]
-    assert [each.severity for each in found] == ["look"]  # no motion to compare with
+    (doubt,) = [each for each in quick_check(replace(log, metadata=stated)) if each.about == "base"]
+    assert "--axes v=world" in doubt.command
 
 
 def test_an_accelerometer_is_no_acceleration(log):
     a = log.a.copy()
     rotation = log.model.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
     a[:, :3] += np.cross(log.v[:, 3:6], log.v[:, :3]) + 9.81 * rotation[:, 2, :]
-    (finding,) = quick_check(replace(log, a=a))
-    assert (finding.subject, finding.severity) == ("base acceleration", "wrong")
-    assert "--axes a=imu" in finding.remedy
+    (doubt,) = quick_check(replace(log, a=a))
+    assert (doubt.about, doubt.level) == ("base acceleration", "wrong")
+    assert "--axes a=imu" in doubt.command
     a[:, :3] *= -1.0
-    (finding,) = quick_check(replace(log, a=a))
-    assert (finding.subject, finding.severity) == ("base acceleration", "look")
-
-
-def test_quaternions_of_another_length_are_refused(log):
-    q = log.q.copy()
-    q[:, 3:7] *= 0.7
-    with pytest.raises(DatasetError, match=r"base\.qx.*length 0\.7"):
-        replace(log, q=q)
+    (doubt,) = quick_check(replace(log, a=a))
+    assert (doubt.about, doubt.level) == ("base acceleration", "look")
 
 
 def test_check_reports_the_base(log):
     report = check(log)
-    assert [(each.subject, each.severity) for each in report.findings] == [
+    assert [(each.about, each.level) for each in report.doubts] == [
         ("base", "ok"),
         ("velocity", "ok"),
         *[("contact flag", "ok")] * 4,
@@ -139,30 +127,30 @@ def test_velocities_of_the_joints_are_compared_beside_a_base(log, what, tmp_path
     signals = {name: (f"{name}{{0..{getattr(log, name).shape[1] - 1}}}",) for name in "qvu"}
     mapping = ColumnMapping(time="t", **signals)
     wrong = import_recordings([tmp_path / "log.csv"], mapping, model=log.model)
-    (finding,) = quick_check(wrong)
-    assert (finding.severity, finding.subject) == ("wrong", "velocity")
-    assert [each.subject for each in check(wrong).findings if each.severity == "wrong"] == ["velocity"]
+    (doubt,) = quick_check(wrong)
+    assert (doubt.level, doubt.about) == ("wrong", "velocity")
+    assert [each.about for each in check(wrong).doubts if each.level == "wrong"] == ["velocity"]
     units = ["m/s"] * 3 + ["rad/s"] * 3 + ["deg/s"] * 12
-    assert (f"--unit v={','.join(units)};" if what == "deg/s" else "--sign v=1,1,1,1,1,1,1,1,-1,1,") in finding.remedy
-    corrected = mapping.corrected_by(finding.correction, log.joint_names, {})
+    assert (f"--unit v={','.join(units)};" if what == "deg/s" else "--sign v=1,1,1,1,1,1,1,1,-1,1,") in doubt.advice
+    corrected = mapping.corrected_by(doubt.correction, log.joint_names, {})
     right = import_recordings([tmp_path / "log.csv"], corrected, model=log.model)
     np.testing.assert_allclose(right.v, log.v, atol=1e-9)
-    assert not [each for each in quick_check(right) if each.severity == "wrong"]
+    assert not [each for each in quick_check(right) if each.level == "wrong"]
 
 
 def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
     names = [name for name in log.model.inputs if not name.endswith("_stands")]
     bare = replace(log, u=log.u[:, : len(names)], model=log.model.with_contacts([]), truth={})
-    (finding,) = [each for each in check(bare).findings if each.severity == "wrong"]
-    assert finding.subject == "base force"
-    assert finding.numbers["force"] == pytest.approx(17.2 * 9.81, rel=0.05)  # the robot without its load
+    (doubt,) = [each for each in check(bare).doubts if each.level == "wrong"]
+    assert doubt.about == "base force"
+    assert doubt.numbers["force"] == pytest.approx(17.2 * 9.81, rel=0.05)  # the robot without its load
     q, v, u = (torch.tensor(x) for x in (bare.q, bare.v, bare.u))
     falls = bare.model.dynamics(q, v, 0.0 * u).acceleration_map().offset.numpy()
-    assert not [each for each in check(replace(bare, a=falls)).findings if each.subject == "base force"]
+    assert not [each for each in check(replace(bare, a=falls)).doubts if each.about == "base force"]
     lifted = replace(log, u=np.hstack([bare.u, np.zeros((len(log), 4))]), truth={})
-    (carried,) = [each for each in check(lifted).findings if each.subject == "base force"]
-    assert (carried.severity, carried.numbers) == ("wrong", pytest.approx(finding.numbers, rel=1e-9))
-    assert "--feet" in carried.remedy
+    (carried,) = [each for each in check(lifted).doubts if each.about == "base force"]
+    assert (carried.level, carried.numbers) == ("wrong", pytest.approx(doubt.numbers, rel=1e-9))
+    assert "--feet" in carried.advice
 
 
 @pytest.mark.parametrize("push", ["unknown", "logged", "none"])
@@ -183,10 +171,10 @@ def test_a_base_that_drives_although_nothing_drives_it(push):
     known = (*[Actuation(np.eye(3, 2), ("x", "y"))] * driven, RigidBodies())
     log = Dataset(q=torch.stack(q).numpy(), v=v, u=force if driven else np.zeros((1000, 0)), a=a, time=time,
                   model=Model(robot, (), known))  # fmt: skip
-    found = [each for each in quick_check(log) if each.subject == "base force"]
+    found = [each for each in quick_check(log) if each.about == "base force"]
     assert len(found) == (push == "unknown")
     if found:
-        assert "--wheels" in found[0].remedy
+        assert "--wheels" in found[0].advice
         assert found[0].numbers["force"] == pytest.approx(np.median(np.linalg.norm(force, axis=1)), rel=0.05)
 
 
@@ -204,13 +192,13 @@ def test_the_order_of_quaternions_of_a_robot_that_stays_upright(order, shift):
     actual = "xyzw" if order == "wxyz" else "wxyz"
     true = Dataset(q=q, v=v, u=np.zeros((2000, 0)), a=np.gradient(v, time, axis=0), time=time,
                    model=Model(robot, (), (RigidBodies(),)))  # fmt: skip
-    assert not [each for each in quick_check(true) if each.subject == "base"]
+    assert not [each for each in quick_check(true) if each.about == "base"]
     turn = Rotation.from_quat(q[:, 3:])
     q[:, 3:] = np.roll(q[:, 3:], shift, axis=1)  # as read in the wrong order, with linear velocities in world axes
     v = np.hstack([Rotation.from_quat(q[:, 3:]).inv().apply(turn.apply(v[:, :3])), v[:, 3:]])
     stated = {"import": {"mapping": {"orientation": order, "axes": {"v": ["world", "body"]}}}}
-    (finding,) = [each for each in quick_check(replace(true, q=q, v=v, metadata=stated)) if each.subject == "base"]
-    assert (finding.severity, finding.correction) == ("wrong", {"orientation": {"q": (actual,)}})
+    (doubt,) = [each for each in quick_check(replace(true, q=q, v=v, metadata=stated)) if each.about == "base"]
+    assert (doubt.level, doubt.correction) == ("wrong", {"orientation": {"q": (actual,)}})
 
 
 def test_a_base_in_millimetres(log):
@@ -218,9 +206,9 @@ def test_a_base_in_millimetres(log):
     for values in (q, v, a):
         values[:, :3] *= 1000.0
     bare = replace(log, q=q, v=v, a=a, u=log.u[:, :12], model=log.model.with_contacts([]), truth={})
-    (finding,) = [each for each in check(bare).findings if each.subject == "base force"]
-    assert finding.severity == "wrong"
-    assert "--unit q=mm" in finding.remedy
+    (doubt,) = [each for each in check(bare).doubts if each.about == "base force"]
+    assert doubt.level == "wrong"
+    assert "--unit q=mm" in doubt.advice
 
 
 def test_what_needs_a_fixed_base_says_so(log):
@@ -265,33 +253,18 @@ def with_w_first(log: Dataset, world: np.ndarray) -> Dataset:
     return replace(log, q=q, v=v, a=np.gradient(v, log.time, axis=0), metadata=stated)
 
 
-def test_noise_of_poses_at_a_high_rate_is_no_mistake():
-    """Differences of successive poses are 0.6 m/s and 2 rad/s off here."""
-    assert not quick_check(flight()[0])
-
-
 def test_what_a_log_at_a_high_rate_means_is_named():
     log, world = flight()
-    (finding,) = quick_check(with_w_first(log, world))
-    assert (finding.severity, finding.correction) == ("wrong", {"orientation": {"q": ("wxyz",)}})
+    (doubt,) = quick_check(with_w_first(log, world))
+    assert (doubt.level, doubt.correction) == ("wrong", {"orientation": {"q": ("wxyz",)}})
     v = np.hstack([world, log.v[:, 3:]])
-    (finding,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0)))
-    assert (finding.severity, finding.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
+    (doubt,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0)))
+    assert (doubt.level, doubt.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
     stated = {"import": {"mapping": {"axes": {"v": "world"}}}}  # rates of the body, turned as if they were the world's
     v = np.hstack([log.v[:, :3], Rotation.from_quat(log.q[:, 3:7]).inv().apply(log.v[:, 3:].copy())])
-    (finding,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0), metadata=stated))
-    assert (finding.severity, finding.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
-    assert "angular velocities in the axes of the base" in finding.seen
-
-
-def test_a_log_that_begins_at_rest_is_compared_where_it_moves():
-    log, world = flight()
-    wrong = with_w_first(log, world)
-    rest = {name: np.repeat(getattr(wrong, name)[:1] * (name != "a") * (name != "v"), 2500, 0) for name in "qvua"}
-    time = np.arange(2500 + len(log)) / FLYING
-    rows = {name: np.vstack([rest[name], getattr(wrong, name)]) for name in "qvua"}
-    findings = quick_check(Dataset(**rows, time=time, model=log.model, metadata=wrong.metadata))
-    assert [each.correction for each in findings if each.severity == "wrong"] == [{"orientation": {"q": ("wxyz",)}}]
+    (doubt,) = quick_check(replace(log, v=v, a=np.gradient(v, log.time, axis=0), metadata=stated))
+    assert (doubt.level, doubt.correction) == ("wrong", {"axes": {"v": ("world", "body")}})
+    assert "angular velocities in the axes of the base" in doubt.what
 
 
 @pytest.mark.parametrize("speeds", [1.0, 60.0 / (2.0 * np.pi)])
@@ -310,14 +283,7 @@ def test_thrust_shows_the_unit_of_rotors_and_the_order_of_quaternions(w_first, s
     assert [each.correction for each in quick_check(read)] == ([stated] if stated else [])
 
 
-def test_forces_of_another_kind_are_something_to_look_at():
-    log, _ = flight()
-    (finding,) = quick_check(replace(log, u=2.0 * log.u))
-    assert (finding.subject, finding.severity) == ("base force", "look")
-    assert finding.numbers["force"] == pytest.approx(3.0 * 2.0 * 9.81, rel=0.1)
-
-
 def test_rows_that_were_left_out_are_no_jumps():
     log, _ = flight(noise=False)
-    (finding, *_) = check(log.rows(np.flatnonzero(np.arange(len(log)) % 800 < 50))).of("base")
-    assert finding.numbers["as recorded"] < 1e-4 * finding.numbers["speed"]  # across gaps a quarter
+    (doubt, *_) = check(log.rows(np.flatnonzero(np.arange(len(log)) % 800 < 50))).doubts.of("base")
+    assert doubt.numbers["as recorded"] < 1e-4 * doubt.numbers["speed"]  # across gaps a quarter

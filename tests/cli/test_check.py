@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from tests.checks.logs import arm, clean, column, late
 
-from forcegp import Dataset
+from forcegp import Dataset, Spring, Torques, fit, save_posterior
 from forcegp.data import resample
 
 
@@ -43,8 +43,8 @@ def test_defects_are_told_and_drawn_but_are_no_error(forcegp, folder):
     done = forcegp("check", "defects.h5", "--out", "look", "--json", folder=folder)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
-    assert told["severity"] == "wrong"
-    subjects = {item["subject"]: item for item in told["findings"] if item["severity"] != "ok"}
+    assert told["level"] == "wrong"
+    subjects = {item["about"]: item for item in told["doubts"] if item["level"] != "ok"}
     assert subjects["torque sign"]["joints"] == ["lift"]
     assert subjects["delay"]["numbers"]["delay"] == pytest.approx(0.02, abs=0.005)
     assert json.loads((folder / "look" / "check.json").read_text()) == told
@@ -93,11 +93,11 @@ REFUSALS = {
         "x.h5",
     ): "nothing to do: give --cutoff, --delay, --lag, --stance",
     ("import", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
-    ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100.0 Hz",
+    ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100 Hz",
     ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is 'x'; give seconds",
     ("import", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
     ("import", "noisy.h5", "--lag", "-0.1", "--out", "x.h5"): "an actuator acts after its command",
-    ("import", "noisy.h5", "--lag", "auto", "--delay", "auto", "--out", "x.h5"): "give one of them in s",
+    ("import", "noisy.h5", "--lag", "auto", "--out", "x.h5"): "this lag is that of thrusters",
     ("import", "noisy.h5", "--every", "0", "--out", "x.h5"): "--every 0 must be an integer of at least 1",
     ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("import", "none.h5", "--cutoff", "9", "--out", "x.h5"): "none.h5 does not exist",
@@ -118,3 +118,15 @@ def test_what_cannot_be_done_is_refused_in_one_line(forcegp, folder, words):
     assert not done.stdout
     assert not (folder / "x.h5").exists()
     assert [path.name for path in (folder / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_laws_of_a_saved_posterior_belong_to_the_torques_that_are_expected(forcegp, folder):
+    data = clean(1)
+    sprung = replace(data, u=data.u + 40.0 * data.q, truth={})
+    sprung.save(folder / "sprung.h5")
+    assert "0 wrong, 0 to look at" not in forcegp("check", "sprung.h5", folder=folder).stdout
+    found = fit(data.model.with_forces(Spring()), sprung, Torques())
+    save_posterior(found, folder / "springs")
+    done = forcegp("check", "sprung.h5", "--identified", "springs", "--strict", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "0 wrong, 0 to look at" in done.stdout, done.stdout

@@ -104,8 +104,8 @@ def test_preparation_while_importing_is_that_of_the_raw_dataset(forcegp, tmp_pat
     raw, found = (Dataset.load(tmp_path / f"{name}.h5") for name in ("raw", "prepared"))
     expected = Preparation(cutoff=30.0, delay=0.01, every=2, trim=0.1).apply(raw)
     for name in ("q", "v", "u", "a", "time", "episode"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected.dataset, name))
-    assert found.metadata["preparation"] == expected.dataset.metadata["preparation"]
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert found.metadata["preparation"] == expected.metadata["preparation"]
     refused = forcegp("import", "log.csv", *FLAGS, "--cutoff", 300, "--out", "x.h5", folder=tmp_path)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert not (tmp_path / "x.h5").exists()

@@ -1,13 +1,14 @@
 """`forcegp fit` looks at its data: one line of what would spoil the model, none for a clean log, and none if asked."""
 
-from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
-from tests.checks.corruptions import at, clean, moved, on_a_line, two_links, without_contacts
+from tests.checks.corruptions import at, clean, on_a_line, two_links
 from tests.checks.logs import column
 
 import forcegp as package
+from forcegp.doubts import Doubts, look
 from forcegp.errors import ContactWarning
 from forcegp.fit import fit
 
@@ -39,7 +40,6 @@ def folder(tmp_path_factory):
     column(at(data, "q", [1.0, 1.0]), "u", 1, np.negative).save(place / "sign.h5")
     line = on_a_line(0, seconds=5.0)
     line.save(place / "line.h5")
-    moved(line, (0.005, 0.0, 0.0)).save(place / "aside.h5")
     return place
 
 
@@ -59,24 +59,13 @@ def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
     assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)
 
 
-def test_a_missing_contact_is_said_once_by_fit_and_by_score(forcegp, folder):
-    done = forcegp("fit", "line.h5", *FIT, "--contact", "none", folder=folder)
-    assert done.returncode == 0, done.stderr
-    (line,) = looked(done.stderr)
-    assert "no contact is stated, but link 'link2' stays on a plane" in line
-    scored = forcegp("score", "run", "line.h5", "--every", 10, folder=folder)
-    assert scored.returncode == 0, scored.stderr
-    assert "no contact is stated" in scored.stderr
-
-
-def test_in_python_a_fit_warns_of_contacts_that_the_rows_contradict(folder):
+def test_in_python_a_fit_warns_of_contacts_that_the_rows_contradict(folder, monkeypatch):
+    doubt = look(about="contact", what="its force acts beside the point.")
+    monkeypatch.setattr(import_module("forcegp.fit.doubts"), "contact_doubts", lambda *_: Doubts([doubt]))
     data = package.Dataset.load(folder / "line.h5")
-    wrong = without_contacts(data)
-    assert wrong.model is not None
-    model = wrong.model.with_forces(package.JointFriction())
     few = package.inference.OptimizerOptions(iterations=1)
-    with pytest.warns(ContactWarning, match="no contact is stated"):
-        fit(model, replace(wrong, metadata={}), points=12, restarts=1, options=few)
+    with pytest.warns(ContactWarning, match="beside the point"):
+        fit(data.model.with_forces(package.JointFriction()), data, points=12, restarts=1, options=few)
 
 
 @pytest.mark.parametrize("columns", ["40", "80"])
@@ -95,7 +84,7 @@ def test_the_next_step_shows_what_the_fit_found(forcegp, folder):
     """forcegp check looks at the robot of its own options, and has none for contacts: there the remedy stands."""
     done = forcegp("fit", "clean.h5", *FIT, "--gravity", "0,0,0", folder=folder)
     assert "See forcegp check clean.h5 --gravity=0,0,0 (--no-checks" in " ".join(done.stderr.split())
-    done = forcegp("fit", "line.h5", *FIT, "--contact", "none", folder=folder)
+    done = forcegp("fit", "clean.h5", *FIT, "--contact", "link2@0,0,-0.3:plane:1,0,0,-0.07", folder=folder)
     said = " ".join(done.stderr.split())
     assert "warning: contact: " in said
     assert "See forcegp check" not in said

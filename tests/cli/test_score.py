@@ -60,7 +60,7 @@ def test_what_is_known_of_the_arm_comes_out(found):
 
 def test_the_folder_holds_the_page_the_numbers_and_the_model_from_all_rows(found, folder):
     page = (folder / "results" / "report.md").read_text()
-    assert "Preparation: cutoff None, order 4, every 2." in page
+    assert "Preparation: cutoff None, every 2." in page
     assert "the same 40 rows" in page
     assert re.search(r"^\| error of predicted motions \| \*\*[\w@:+-]+\*\* \| ", page, re.M)
     for name in found["models"]:
@@ -111,7 +111,7 @@ def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder)
     assert "--guard 0.01 s is shorter than two time constants of the filter (0.055 s)" in done.stderr
     assert re.search(r"given\s+\d+\.\d+", done.stdout)
     page = (folder / "raw" / "report.md").read_text()
-    assert "Preparation: cutoff 15.0, order 4, " in page
+    assert "Preparation: cutoff 15.0, " in page
     assert "every episode cut into 4 consecutive blocks of equal duration, block 2 held out" in page
     stored = json.loads((folder / "raw" / "results.json").read_text())
     assert stored["runs"]["given"][0]["motions"]["dt"] == pytest.approx(0.01), "at the full rate"

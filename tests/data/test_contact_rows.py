@@ -6,7 +6,7 @@ import torch
 
 from forcegp.data import Dataset, contact_rows, rows_in_contact
 from forcegp.errors import ContactError
-from forcegp.mechanics import Contact, ImplicitSurface, Plane
+from forcegp.mechanics import Contact, Plane
 from forcegp.simulation import KukaSurfaceConfig, QuadrupedConfig, simulate_kuka_surface, simulate_quadruped
 
 pytest.importorskip("pybullet")
@@ -52,14 +52,6 @@ def test_a_row_that_leaves_the_constraint_does_not_count():
     assert np.flatnonzero(before != after).tolist() == [50]
 
 
-def test_the_length_of_the_gradient_does_not_matter(hopping):
-    """Any function that vanishes on the surface describes it; a factor changes neither distances nor directions."""
-    (contact,) = hopping.model.contacts
-    scaled = Contact(contact.frame, contact.point, ImplicitSurface(lambda p: 100.0 * contact.surface.value(p)))
-    data = dataclasses.replace(hopping, model=hopping.model.with_contacts([scaled]), truth={})
-    np.testing.assert_array_equal(contact_rows(data), contact_rows(hopping))
-
-
 def test_a_surface_in_the_wrong_place_is_told(hopping):
     (contact,) = hopping.model.contacts
     wrong = Contact(contact.frame, contact.point, Plane((0.0, 0.0, 1.0), 0.5))
@@ -67,13 +59,6 @@ def test_a_surface_in_the_wrong_place_is_told(hopping):
     with pytest.raises(ContactError, match=r"contact 0 \(frame 'lbr_iiwa_link_7'\).*0\.445 m") as error:
         rows_in_contact(data)
     assert "leave this contact out" in str(error.value)
-
-
-def test_without_contacts_there_is_nothing_to_find(hopping):
-    for nothing, message in ((None, "no model"), (hopping.model.with_contacts([]), "without contacts")):
-        truth = {"a": hopping.truth["a"]}
-        with pytest.raises(ContactError, match=message):
-            contact_rows(dataclasses.replace(hopping, model=nothing, truth=truth))
 
 
 def test_every_contact_has_a_column_and_all_must_act(hopping):

@@ -42,7 +42,7 @@ def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
 
     def error(cutoff):
         """Rms of what the identified robot misses of the torques of another motion, without noise."""
-        prepared = Preparation(cutoff=cutoff, trim=1.0, every=15).apply(rows).dataset
+        prepared = Preparation(cutoff=cutoff, trim=1.0, every=15).apply(rows)
         found = fit(Model(ROBOT).with_forces(RigidBodies("all"), Viscous(), Stribeck(), Rotor()), prepared, Torques())
         return np.sqrt(np.square(motion_residuals(log(TEXT, 9), found.model)[0]).mean())
 
@@ -50,9 +50,9 @@ def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
 
 
 def test_preparations_take_it_and_report_why():
-    report = Preparation(cutoff="auto").apply(raw(3, 1e-4)).report
+    report = Preparation(cutoff="auto").apply(raw(3, 1e-4)).metadata["preparation"]
     assert "of held-out torques stay unexplained" in report["why"]["cutoff"]
-    alone = Preparation(cutoff="auto").apply(replace(raw(3, 1e-4), model=None)).report
+    alone = Preparation(cutoff="auto").apply(replace(raw(3, 1e-4), model=None)).metadata["preparation"]
     assert "held-out" not in alone["why"]["cutoff"]
 
 
@@ -60,8 +60,8 @@ def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
     """Where no torque acts, every cut-off explains all of it."""
     rows = raw(3, 1e-4)
     still = replace(rows, u=0.0 * rows.u)
-    passive, alone = (Preparation(cutoff="auto").apply(x).report for x in (still, replace(still, model=None)))
-    assert passive["cutoff"] == alone["cutoff"]
+    passive, alone = (Preparation(cutoff="auto").resolved(x) for x in (still, replace(still, model=None)))
+    assert passive.cutoff == alone.cutoff
     with pytest.raises(DatasetError, match="no torque acts"):
         held_out_cutoff(still, ROBOT, 6.0)
 
@@ -74,6 +74,6 @@ def test_short_logs_are_refused():
 @pytest.mark.parametrize("late", [0.0, 0.006])
 def test_stribeck_friction_is_no_delay(late):
     """With one smooth sign of the velocity, friction like this looked 20 ms late."""
-    rows = Preparation(cutoff=12.0, trim=0.5).apply(raw(4, 1e-5, late)).dataset
+    rows = Preparation(cutoff=12.0, trim=0.5).apply(raw(4, 1e-5, late))
     found = estimate_delay(rows)
     assert found.significant == pytest.approx(late, abs=1e-3)

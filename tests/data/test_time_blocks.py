@@ -33,8 +33,3 @@ def test_every_row_is_in_one_block_that_is_no_longer_than_said(count, seed, seco
 def test_a_length_that_is_none_is_refused(seconds):
     with pytest.raises(InvalidInput, match="must be positive and finite"):
         time_blocks(np.zeros(2), np.zeros(2, int), seconds)
-
-
-def test_columns_of_different_rows_are_refused():
-    with pytest.raises(InvalidInput, match="time has 3 rows and episode 2"):
-        time_blocks(np.zeros(3), np.zeros(2, int), 1.0)

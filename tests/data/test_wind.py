@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
-from forcegp.data import AirLaw, find_wind, with_wind
+from forcegp.data import AirLaw, find_wind
 from forcegp.data.wind import steady_forces
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_point
 from forcegp.posterior import load_posterior, observing, save_posterior
-from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 BODY = (
     '<robot name="drone"><link name="body"><inertial><mass value="1.2"/>'
@@ -89,14 +88,6 @@ def test_a_law_comes_back_from_plain_numbers():
     assert AirLaw.from_dict(law.to_dict()) == law
 
 
-@pytest.mark.nightly
-def test_the_mean_wind_of_a_simulated_flight_in_gusts():
-    dataset = simulate_quadrotor(QuadrotorConfig(seconds=10.0, seed=3, episodes=2, wind=6.0, lag=0.04))
-    _, found = find_wind(dataset)
-    for episode, wind in enumerate(dataset.metadata["wind"]):
-        assert np.linalg.norm(found[dataset.episode == episode].mean(0)[:2] - wind[:2]) < 1.5
-
-
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("case", ["no drag", "few rows", "out of order", "contact"])
 def test_nothing_is_found_where_rows_do_not_show_it(case, seed):
@@ -108,29 +99,6 @@ def test_nothing_is_found_where_rows_do_not_show_it(case, seed):
     if case == "contact":
         dataset = replace(dataset, model=dataset.model.with_contacts(fixed_point("body", (0.0, 0.0, 0.0))))
     assert find_wind(dataset) is None
-
-
-def test_wind_and_velocity_are_the_same_to_the_air():
-    """Features of a body in wind are those of one that moves against still air."""
-    dataset = flight([(3.0, -2.0, 1.0)], rows=500)
-    there = with_wind(dataset, np.broadcast_to((3.0, -2.0, 1.0), (500, 3)))
-    assert there.model.inputs[4:] == ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
-    windy = there.model.dynamics(*map(torch.tensor, (there.q, there.v, there.u)))
-    rotation = windy.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
-    v = dataset.v.copy()
-    v[:, :3] -= np.einsum("nji,j->ni", rotation, (3.0, -2.0, 1.0))
-    still = dataset.model.dynamics(*map(torch.tensor, (dataset.q, v, dataset.u)))
-    prior = AerodynamicForce()
-    torch.testing.assert_close(prior.features(windy)[0], prior.features(still)[0])
-    without = dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u)))
-    torch.testing.assert_close(AerodynamicForce(wind=(3.0, -2.0, 1.0)).features(without)[0], prior.features(still)[0])
-    # and it is no force
-    torch.testing.assert_close(
-        windy.Q_K, dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).Q_K
-    )
-    stored = Model.from_dict(there.model.to_dict())
-    assert stored.inputs == there.model.inputs
-    assert stored.held_inputs == (4, 5, 6)
 
 
 def pushed(forces, rows=120, seed=4, noise=0.0):

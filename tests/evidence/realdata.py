@@ -46,7 +46,7 @@ def multiarm(folder: Path, model: Model) -> Dataset:
     q = np.concatenate([np.stack([p[:, 0], p[:, 1] - p[:, 0]], axis=1) for p in pieces])
     time = np.concatenate([step * np.arange(len(p)) for p in pieces])
     episode = np.repeat(np.arange(len(pieces)), [len(p) for p in pieces])
-    return Preparation(cutoff=25.0, trim=100 * step).apply(dataset(model, time, q, np.zeros_like(q), episode)).dataset
+    return Preparation(cutoff=25.0, trim=100 * step).apply(dataset(model, time, q, np.zeros_like(q), episode))
 
 
 def dfki_system(folder: Path) -> Model:
@@ -65,7 +65,7 @@ def dfki(folder: Path, model: Model, *runs: int) -> Dataset:
         q, u = (np.stack([log[f"{name}1"], log[f"{name}2"]], axis=1) for name in ("pos_meas", "tau_meas"))
         parts.append((log["time"] - log["time"][0], q, u, np.full(len(log), run)))
     raw = dataset(model, *(np.concatenate(x) for x in zip(*parts, strict=True)))
-    return Preparation(cutoff=20.0, trim=0.12).apply(resample(raw, 0.002)).dataset
+    return Preparation(cutoff=20.0, trim=0.12).apply(resample(raw, 0.002))
 
 
 def panda_system(folder: Path) -> Model:
@@ -83,7 +83,7 @@ def panda(folder: Path, model: Model) -> tuple[Dataset, Dataset]:
     q, u = q.reshape(-1, 7), u.reshape(-1, 7)
     fresh = np.concatenate([[True], (np.diff(time) > 0.0) & (np.diff(q, axis=0) != 0.0).any(1)])
     raw = dataset(model, time[fresh] - time[0], q[fresh], u[fresh], np.zeros(fresh.sum(), int))
-    rows = Preparation(cutoff=5.0, every=20).apply(resample(raw, 0.001)).dataset
+    rows = Preparation(cutoff=5.0, every=20).apply(resample(raw, 0.001))
     block = rows.time[-1] / 5.0
     test = np.isin(np.minimum((rows.time / block).astype(int), 4), (2, 4))
     near = (abs(rows.time[:, None] - block * np.array([2, 3, 4])) <= 0.25).any(1)

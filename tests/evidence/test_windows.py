@@ -169,10 +169,10 @@ def test_logs_that_cannot_be_cut_into_windows_are_refused():
 
 
 def test_a_filtered_log_is_warned_of():
-    filtered = Preparation(cutoff=20.0).apply(sine(0.002 * np.arange(1000))).dataset
+    filtered = Preparation(cutoff=20.0).apply(sine(0.002 * np.arange(1000)))
     with pytest.warns(DataWarning, match="was filtered at 20 Hz"):
         Windows(0.1).windows(filtered)
-    kept = Preparation(trim=0.1).apply(sine(0.002 * np.arange(1000))).dataset
+    kept = Preparation(trim=0.1).apply(sine(0.002 * np.arange(1000)))
     assert len(Windows(0.1).windows(kept)) == 17
 
 

@@ -75,9 +75,12 @@ def test_rows_that_are_left_out_are_warned_of():
         arm_model(0).with_forces(JointForces(), noise=Noise(None, learn=True)),
         {"restarts": 1, "options": QUICK},
     )
-    with pytest.warns(DataWarning, match=r"of 200 rows lie 0\.083 s apart.*from which alone noise is learned"):
+    with pytest.warns(
+        DataWarning,
+        match=r"within 0\.083 s of .* of 200 rows lie further .*these alone teach the noise",
+    ):
         fit(model, filtered(), points=200, **quick)
-    with pytest.warns(DataWarning, match="so few that all are taken, and learned noise may be none"):
+    with pytest.warns(DataWarning, match="too few, so all are taken, and learned noise may be none"):
         few = fit(model, filtered(60), points=50, **quick)
     assert few.settings["points"] == 50
 

@@ -9,7 +9,7 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, JointFriction, Model, Robot, load_posterior, save_posterior
-from forcegp.data.motion_records import all_motions, recorded_motions
+from forcegp.data.views import all_motions, recorded_motions
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.evidence import Motions, Torques
 from forcegp.fit import fit as fit_model

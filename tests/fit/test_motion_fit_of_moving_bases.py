@@ -9,7 +9,7 @@ from tests.fit.test_motion_fit import refined
 from tests.posterior import floating_arm
 
 from forcegp import Dataset, JointFriction
-from forcegp.data.motion_records import all_motions, recorded_motions
+from forcegp.data.views import all_motions, recorded_motions
 from forcegp.fit import fit as fit_model
 from forcegp.fit.motion_fit import MotionFit
 from forcegp.fit.motion_unknowns import Unknowns

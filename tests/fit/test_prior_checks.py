@@ -12,7 +12,6 @@ from forcegp.errors import DataWarning, InvalidInput, UnknownFrame, UnknownJoint
 from forcegp.fit import fit as fit_model
 from forcegp.forces import (
     ContactFriction,
-    JointAccelerations,
     JointForces,
     JointFriction,
     PeriodicJointForces,
@@ -235,29 +234,3 @@ def test_no_residual_at_all_is_refused(data):
     exact = with_columns(data, a=data.model.dynamics(*states).acceleration_map().offset.numpy())
     with pytest.raises(InvalidInput, match="accelerations equal the mean"):
         fit(exact, JointFriction(), noise=Noise(0.1))
-
-
-@pytest.mark.parametrize("prior", [ContactFriction(), JointFriction(("lift",))], ids=["tool", "joint"])
-def test_known_forces_that_no_latent_can_carry_are_pointed_out(data, prior):
-    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
-    dynamics = data.model.dynamics(*states)
-    B, Q_K = prior.direction(dynamics).numpy(), dynamics.Q_K.numpy()
-    left, size = 0.0, 0.0
-    for H, b, force in zip(dynamics.H.numpy(), B, Q_K, strict=True):
-        weights, *_ = np.linalg.lstsq(H @ b, H @ force, rcond=1e-9)
-        left += np.sum((H @ force - H @ b @ weights) ** 2)
-        size += np.sum((H @ force) ** 2)
-    with pytest.warns(DataWarning, match="^without laws the unknown forces carry gravity") as caught:
-        fit(data, prior, mean=False)
-    assert len(caught) == 1
-    assert f"but {np.sqrt(left / size):.0%} of the acceleration that these cause" in str(caught[0].message)
-    assert "give the model its laws, or add a force on every joint" in str(caught[0].message)
-
-
-@pytest.mark.parametrize(
-    "prior", [JointForces(), (ContactFriction(), JointForces()), JointAccelerations()], ids=["joints", "sum", "all"]
-)
-def test_priors_that_act_on_every_joint_can_carry_the_known_forces(data, prior):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        fit(data, prior, mean=False)

@@ -462,7 +462,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Inducing": (functools.partial(_engine, forcegp.Inducing), lambda: {"points": 5, "tolerance": 0.02, "refine": 0}),
     "Preparation": (
         lambda **k: forcegp.Preparation(**k).apply(INPUTS.free),
-        lambda: {"cutoff": 20.0, "order": 2, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
+        lambda: {"cutoff": 20.0, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
     ),
     "ComputedTorque": (
         functools.partial(_control, forcegp.ComputedTorque, lambda: arm_model(0)),
@@ -532,7 +532,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ImportOptions": (
         forcegp.ImportOptions,
-        lambda: {"gap": None, "rate": "auto", "start": None, "end": None, "most_rows": 10},
+        lambda: {"gap": None, "rate": "auto", "start": None, "end": None},
     ),
     "KukaSurfaceConfig": (
         forcegp.KukaSurfaceConfig,

@@ -109,7 +109,6 @@ MORE = st.lists(
                 "--headerless",
                 "--unit",
                 "--sign",
-                "--max-rows",
                 "--step",
                 "--episode",
                 "--episodes",

@@ -50,13 +50,6 @@ class SourceConformance(ABC):
         assert all(values.ndim == 1 and values.dtype in (np.float64, np.int64) for values in found.values())
         return found
 
-    def test_a_log_of_too_many_rows_is_refused(self, source):
-        name = next(iter(self.expected()))
-        rows = len(source.read([name])[name])
-        assert len(source.read([name], most_rows=rows)[name]) == rows
-        with pytest.raises(FileFormatError, match=f"more than {rows - 1} rows"):
-            source.read([name], most_rows=rows - 1)
-
     def test_columns_are_there_once(self, source):
         columns = source.columns()
         assert len(set(columns)) == len(columns)

@@ -37,14 +37,6 @@ def test_an_order_names_the_columns_that_were_read():
     assert found.v is None  # which the log does not have
 
 
-def test_a_mapping_with_joints_of_its_own_order_keeps_it():
-    """The correction is in the order of the robot, columns and signs of the mapping in that of its joints."""
-    mapping = ColumnMapping(joints=("bend", "pan", "lift"), sign={"u": (1.0, 1.0, 1.0)})
-    found = mapping.corrected_by({"sign": {"u": (-1.0, 1.0, 1.0)}, "order": {"u": (0, 2, 1)}}, JOINTS, COLUMNS)
-    assert found.sign["u"] == (1.0, -1.0, 1.0)  # of pan
-    assert found.u == ("b", "a", "c")  # bend has the column of lift, pan its own, lift that of bend
-
-
 @pytest.mark.parametrize(
     "mapping",
     [

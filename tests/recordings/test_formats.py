@@ -99,13 +99,6 @@ class TestNumpyArchive(Tables):
         return arrays("")
 
 
-class TestCompressedNumpyArchiveColumnByColumn(TestNumpyArchive):
-    def write(self, folder):
-        data = {name: np.asfortranarray(values) for name, values in motion().items()}
-        np.savez_compressed(folder / "log.npz", **data)
-        return folder / "log.npz"
-
-
 class TestPartOfAnArchive(TestNumpyArchive):
     def write(self, folder):
         both = {"run1": np.zeros((3, 2)), "run2": motion()["q"]}
@@ -179,11 +172,6 @@ class TestRos2FolderOfSqlite(TestRos2Folder):
         return next(path.glob("*.db3"))
 
 
-class TestBareMcap(Bags):
-    def write(self, folder):
-        return next(write_bag2(folder / "log", motion()).glob("*.mcap"))
-
-
 class TestCompressedMcap(TestRos2Folder):
     def write(self, folder):
         return write_bag2(folder / "log", motion(), compressed="STORAGE")
@@ -213,14 +201,6 @@ def test_columns_of_several_topics_are_refused(tmp_path):
     source = open_source(write_bag2(tmp_path / "log", motion(10)))
     with pytest.raises(InvalidInput, match="topics /joint_states, /wrench"):
         source.read(["/joint_states:log_time", "/wrench:log_time"])
-
-
-def test_a_header_may_be_long(tmp_path):
-    columns = {f"a_long_name_of_column_{index}": np.arange(3.0) + index for index in range(3000)}
-    source = open_source(write_text(tmp_path / "log.csv", columns))
-    assert source.columns() == tuple(columns)
-    found = source.read(["a_long_name_of_column_2999"])
-    np.testing.assert_array_equal(found["a_long_name_of_column_2999"], [2999, 3000, 3001])
 
 
 def test_a_name_of_a_column_that_is_too_long_is_refused(tmp_path):

@@ -28,7 +28,6 @@ ARRAYS = ColumnMapping(time="time", q=("q",), v=("v",), u=("u",), joints=JOINTS)
 TOPIC = ColumnMapping(
     q=("/joint_states:position",), v=("/joint_states:velocity",), u=("/joint_states:effort",), joints=JOINTS
 )
-SIGNALS = ("q", "v", "u", "a", "time", "episode")
 
 
 def in_log(mapping):
@@ -96,17 +95,6 @@ def test_even_times_and_differences_are_those_of_another_spline(tmp_path, logged
     for name, values in expected.items():
         rounding = 1e-13 if name in logged else 1e-13 / STEP**2
         np.testing.assert_allclose(getattr(found, name), values, rtol=0, atol=rounding * np.abs(values).max())
-
-
-def test_resampling_brings_uneven_rows_near_the_motion(tmp_path):
-    data = motion(1000)
-    found = imported(write_text(tmp_path / "log.csv", table(uneven())), NAMES)
-    inner = slice(5, len(found) - 5)
-    offset = uneven()["time"][0]
-    exact = CubicSpline(data["time"], data["q"])(found.time + offset)
-    assert np.abs(found.q - exact)[inner].max() < 1e-7
-    np.testing.assert_allclose(np.diff(found.time), found.time[1], rtol=1e-9)
-    assert found.time[1] == pytest.approx(STEP, rel=0.01)
 
 
 def test_every_stamp_is_kept_if_told_so(tmp_path):
@@ -247,18 +235,6 @@ def test_files_side_by_side_are_one_recording(tmp_path):
         import_recordings(paths, mapping)
 
 
-def test_arrays_and_files_are_episodes(tmp_path):
-    data = motion()
-    both = np.hstack([data["q"], data["v"]])
-    np.savez(tmp_path / "log.npz", piece2=both[:100], piece10=both[100:], dt=STEP)
-    mapping = ColumnMapping(step=STEP, q=("[{0..1}]",), v=("[2]", "[3]"), u=("0",), joints=JOINTS, episodes="piece*")
-    found = imported(tmp_path / "log.npz", mapping)
-    np.testing.assert_array_equal(found.q, data["q"])
-    np.testing.assert_array_equal(found.episode, np.repeat([0, 1], 100))
-    paths = [write_text(tmp_path / f"{name}.csv", table(data)) for name in ("one", "two")]
-    assert import_recordings(paths, NAMES).episodes == (0, 1)
-
-
 def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
     data = motion()
     stamps = 1_700_000_000_123_456_789 + np.round(data["time"] * 1e9).astype(np.int64)
@@ -267,13 +243,3 @@ def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
     mapping = ColumnMapping(time="stamp", q=("q",), u=("u",), joints=("a",), unit={"time": ("ns",)})
     found = imported(tmp_path / "log.csv", mapping)
     np.testing.assert_array_equal(found.time, data["time"])
-
-
-def test_the_log_is_not_touched_and_its_digest_is_kept(tmp_path):
-    import hashlib
-
-    path = write_text(tmp_path / "log.csv", table(motion()))
-    before = path.read_bytes()
-    found = imported(path, NAMES)
-    assert path.read_bytes() == before
-    assert found.metadata["import"]["files"][0]["sha256"] == hashlib.sha256(before).hexdigest()

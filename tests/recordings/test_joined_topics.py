@@ -190,23 +190,6 @@ def test_angles_that_wrap_are_not_interpolated_across(tmp_path):
     assert off.max() < 3.0 / 70
 
 
-def test_commands_hold_where_rows_get_even_times(tmp_path, flight):
-    """Rows of the pose jitter; a command never comes before its stamp."""
-    time = flight.time + np.random.default_rng(1).uniform(-3e-4, 3e-4, len(flight))
-    stamps = nanoseconds(time).tolist()
-    rows = zip(stamps, flight.q, flight.v, strict=True)
-    messages = [("/odom", stamp + LATE, odometry(stamp, q, v)) for stamp, q, v in rows]
-    at = np.arange(-0.01, 1.2, 0.05)
-    messages += [("/rotors", int(nanoseconds(t)), commands([100.0 * k] * 4)) for k, t in enumerate(at)]
-    found, done = imported(written(tmp_path, messages), flight)
-    assert done["resampled_to_step"] == pytest.approx(1 / 240)
-    assert set(np.unique(found.u)) <= set(100.0 * np.arange(len(at)))
-    newest = 100.0 * (np.searchsorted(at, found.time + time[0] + 1e-9, side="right") - 1)
-    late = newest - found.u[:, 0]
-    assert (late >= 0).all()
-    assert (late > 0).mean() < 0.15  # rows up to one step behind a command
-
-
 def test_a_pause_of_a_topic_is_a_gap(tmp_path, flight):
     at = np.concatenate([np.arange(0, 0.4, 0.01), np.arange(0.7, 1.0, 0.01)])
     found, done = imported(bag_of(tmp_path, flight, at), flight, gap=0.05)

@@ -289,39 +289,6 @@ def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
     )
 
 
-MIDDLE = """<robot name="rail"><link name="rail"/><link name="cart"><inertial><mass value="1"/>
-<inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><axis xyz="1 0 0"/>
-<limit lower="-9" upper="9" effort="9" velocity="9"/></joint>
-<joint name="ball" type="spherical"><parent link="cart"/><child link="head"/></joint><link name="head"><inertial>
-<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="turn" type="continuous"><parent link="head"/><child link="tip"/><axis xyz="0 0 1"/></joint>
-<link name="tip"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/>
-</inertial></link></robot>"""
-
-
-@pytest.mark.parametrize("orientation", ["xyzw", "wxyz", "angles"])
-def test_turning_joints_stand_where_the_robot_has_them(tmp_path, orientation):
-    """Joints of one degree of freedom before and behind, named in another order in the log."""
-    model = Model(Robot.from_urdf_text(MIDDLE, base="fixed"))
-    assert model.robot.position_names == ("slide", "ball.qx", "ball.qy", "ball.qz", "ball.qw", "turn")
-    angle = np.random.default_rng(5).uniform(-0.5, 0.5, 3) * np.linspace(0, 1, 50)[:, None]
-    quaternion, slide, turned = (
-        Rotation.from_euler("xyz", angle).as_quat(),
-        np.linspace(0, 1, 50),
-        np.linspace(2, 3, 50),
-    )
-    middle = {"xyzw": quaternion, "wxyz": np.roll(quaternion, 1, axis=1), "angles": angle}[orientation]
-    table = {"time": np.arange(50) / 100, **{f"q{k}": q for k, q in enumerate([turned, *middle.T, slide])}}
-    mapping = ColumnMapping(
-        time="time", q=(f"q{{0..{len(table) - 2}}}",), u=("0",), joints=("turn", "slide"), orientation=orientation
-    )
-    mapping = replace(mapping, ned=True)  # no base: nothing to turn
-    found = import_recordings([write_text(tmp_path / "log.csv", table)], mapping, model=model)
-    expected = np.column_stack([slide, quaternion, turned])
-    np.testing.assert_allclose(found.q, expected, rtol=0, atol=1e-14)
-
-
 def walking_log(tmp_path, u: np.ndarray):
     """A log of a walker that has these columns of u, its dataset, and the mapping."""
     walk = simulate_quadruped(QuadrupedConfig(seconds=1.0, seed=2))
@@ -343,20 +310,6 @@ def test_flags_that_a_log_lacks_are_open(tmp_path):
     u = found.u
     np.testing.assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
     assert (u[:, 12:] == 0.0).all()
-
-
-def test_signs_and_scales_of_the_actuators_leave_flags_alone(tmp_path):
-    walk, mapping = walking_log(tmp_path, lambda walk: walk.u)
-    signs = (-1.0, *[1.0] * 11)
-    for change in ({"sign": {"u": (-1.0,)}}, {"sign": {"u": signs}}):
-        options = ImportOptions(stance="auto")
-        found = import_recordings([tmp_path / "walk.csv"], replace(mapping, **change),
-                                  model=walk.model, options=options)  # fmt: skip
-        u = found.u
-        assert found.metadata["import"]["open_switches"] == ()
-        np.testing.assert_array_equal(u[:, 12:], walk.u[:, 12:])
-        [values] = [x["u"] for x in change.values()]
-        np.testing.assert_allclose(u[:, :12], walk.u[:, :12] * np.array(values), rtol=1e-6)
 
 
 def test_a_wheel_may_turn_often(tmp_path):

@@ -45,7 +45,7 @@ def test_a_panda_whose_signals_lie_in_four_files(shared, tmp_path):
     paths = [folder / "raw" / f"{prefix}{name}.txt.gz" for name in names]
     raw = import_recordings(paths, mapping, model=Model(robot))
     assert raw.episodes == (0,)
-    data = Preparation(cutoff=5.0, every=20, trim=0.25).apply(raw).dataset
+    data = Preparation(cutoff=5.0, every=20, trim=0.25).apply(raw)
     q, v, a = (torch.tensor(values) for values in (data.q, data.v, data.a))
     residual = np.sqrt(np.square(robot.inverse_dynamics(q, v, a).numpy() - data.u).mean(axis=0))
     np.testing.assert_allclose(residual, [0.34, 0.62, 0.33, 0.59, 0.34, 0.19, 0.28], atol=0.03)

@@ -43,7 +43,7 @@ def test_of_a_good_model_nothing_is_said(friction):
 def test_a_search_that_did_not_end_is_named():
     data = arm_data(20, 0)
     posterior = fit(data.model.with_forces(JointForces()), data, restarts=1, options=OptimizerOptions(iterations=2))
-    (sentence,) = unfinished_search(posterior)
+    (sentence,) = map(str, unfinished_search(posterior))
     assert "did not converge (stopped at the limit of 2 iterations" in sentence
     assert about(scored(posterior, arm_data(20, 1)).warnings, "did not converge") == [sentence]
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, Dataset, Model, Robot, calibrated, fit
-from forcegp.data import estimate_thruster_lag, recorded_motions
-from forcegp.data.delay import lagged
+from forcegp.data import Lag, estimate_thruster_lag, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
@@ -31,7 +30,7 @@ def test():
 
 def acting(dataset, lag=0.06):
     """With the rotor speeds that act, from half a second on."""
-    late = np.stack([lagged(column, dataset.time, lag) for column in dataset.u.T], axis=1)
+    late = Lag(lag)(dataset.u, dataset.time)
     return replace(dataset, u=late).rows(np.arange(120, len(dataset)))
 
 

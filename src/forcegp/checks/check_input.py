@@ -1,4 +1,4 @@
-"""The log as every check sees it, and what a check found."""
+"""The log as every check sees it: mended, at even times, filtered, and as it is compared with the robot."""
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,20 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from forcegp.data import Dataset, Preparation, Prepared, preparation_report, resample, uniform_step
+from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.row_selection import consecutive, move_on
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
-from forcegp.data.successive_rows import (
-    FEW_JOINTS,
-    drop_outs,
-    few_stretches,
-    mended_rows,
-    running_width,
-    smoothed,
-    white_noise,
-)
+from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.forces import JointLaw
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -38,19 +30,25 @@ MOST_ROWS = 1000  # rows on which torques are compared: neighbouring rows hold t
 QUICK_ROWS = 300  # the same before a fit
 HALF_CUTOFF = COMPARED**2.5  # noise of an acceleration that is differenced twice, relative to that at the whole cut-off
 DEGREE = np.pi / 180.0
+FEW_JOINTS = 3  # of more joints, half as many rows
+STRETCHES, STRETCH_ROWS = 3, 400  # of a log that are looked at before a fit, where it is longer
+SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciPy's filters take half a second to import
+JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
+LEAST_JUMP = 0.02  # and by more than this share of its range
+FEWEST_DROPS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CheckInput:
-    """One log and, if known, its robot.
+    """One log and, if known, its robot with its known `laws` of joints.
 
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
-    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `automatic`: the cut-off is that
-    of the spectrum; `wraps` and `jumps` mark where (rows, nv) a position of `log` jumps by a turn, or by more than pi
-    otherwise, `dropped` where a signal is 0 because it was not measured (interpolated in `mended`, a log that is
-    otherwise as given). `compared_noise` (nv,) is the standard deviation of the noise of the acceleration in
-    `compared`, None where it is not known. `prepared` and `compared` are None where jumps forbid any derivative.
+    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `wraps` and `jumps` mark where
+    (rows, nv) a position of `log` jumps by a turn, or by more than pi otherwise, `dropped` where a signal is 0 because
+    it was not measured (interpolated in `mended`, a log that is otherwise as given). `compared_noise` (nv,) is the
+    standard deviation of the noise of the acceleration in `compared`, None where it is not known. `prepared` and
+    `compared` are None where jumps forbid any derivative.
     """
 
     log: Dataset
@@ -59,10 +57,10 @@ class CheckInput:
     wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
     robot: Robot | None = None
+    laws: tuple[JointLaw, ...] = ()
     contacts: int = 0
-    prepared: Prepared | None = None
+    prepared: Dataset | None = None
     compared: Dataset | None = None
-    automatic: bool = False
     dropped: Mapping[str, Bool[np.ndarray, "rows nv"]] = field(default_factory=dict)
     compared_noise: Float[np.ndarray, " nv"] | None = None
     most_rows: int = MOST_ROWS
@@ -71,7 +69,10 @@ class CheckInput:
     def as_recorded(cls, dataset: Dataset, model: Model | None, **more: Any) -> "CheckInput":
         """A log of which nothing is filtered, compared or mended, but for `more`."""
         model, nowhere = dataset.model if model is None else model, np.zeros(dataset.v.shape, dtype=bool)
-        known = {} if model is None else {"robot": model.robot, "contacts": len(model.contacts)}
+        known: dict[str, Any] = {}
+        if model is not None:
+            laws = tuple(law for law in model.laws if isinstance(law, JointLaw) and not law.learned)
+            known = {"robot": model.loaded_robot, "laws": laws, "contacts": len(model.contacts)}
         same = {"log": dataset, "even": dataset, "mended": dataset, "wraps": nowhere, "jumps": nowhere}
         return cls(**same | known | more)
 
@@ -100,7 +101,12 @@ class CheckInput:
     def price(self) -> Mapping[str, Any]:
         """What the filter of the check did, or that of an earlier preparation where this one filters nothing."""
         assert self.prepared is not None
-        return self.prepared.report if self.prepared.report["cutoff"] is not None else _earlier(self.log)
+        return preparation_report(self.prepared.metadata) if self.cutoff is not None else _earlier(self.log)
+
+    @property
+    def cutoff(self) -> float | None:
+        """Of the filter of the check [Hz]."""
+        return None if self.prepared is None else preparation_report(self.prepared.metadata)["cutoff"]
 
     @classmethod
     def of(cls, dataset: Dataset, model: Model | None, preparation: Preparation) -> "CheckInput":
@@ -110,21 +116,21 @@ class CheckInput:
         found = _mended(dataset)
         mended, jumps = found["mended"], found["jumps"]
         found["even"] = even = _even(_unwrapped(mended, found["wraps"]), jumps)
-        found["automatic"] = preparation.cutoff == "auto"
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
             chosen = replace(preparation, every=1, delay=0.0).resolved(even)
             trim = 0.0 if chosen.cutoff is None else min(1.0 / float(chosen.cutoff), LONGEST_TRIM * shortest)
             found["prepared"] = prepared = replace(chosen, trim=float(trim)).apply(even)
-            found["compared"] = prepared.dataset
+            found["compared"] = prepared
             applied = chosen.cutoff or _earlier(dataset).get("cutoff")
             first = even.time[even.episode == even.episode[0]]
             if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
                 lower = COMPARED * float(applied)
                 lowest = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest))
-                found["compared"] = lowest.rows(even)
+                with contextlib.suppress(DatasetError):  # too short for that
+                    found["compared"] = lowest.rows(even)
             # white noise as logged, or what the filter left
-            left = prepared.report.get("acceleration_noise", {}).get("after")
+            left = preparation_report(prepared.metadata).get("acceleration_noise", {}).get("after")
             seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF
             found["compared_noise"] = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
         return cls.as_recorded(dataset, model, **found)
@@ -138,27 +144,52 @@ class CheckInput:
         if dataset.time_ordered:
             found |= _mended(dataset)
             mended, jump = found["mended"], found["jumps"].any()
-            rows = mended if jump else smoothed(_unwrapped(mended, found["wraps"]))
+            rows, width = (mended, 1) if jump else _smoothed(_unwrapped(mended, found["wraps"]))
             found["compared"] = None if jump else rows
             if not jump:
-                seen = white_noise(mended, running_width(mended))
+                seen = white_noise(mended, width)
                 found["compared_noise"] = found["compared_noise"] if seen is None else np.nan_to_num(seen)
             with contextlib.suppress(InvalidInput):
-                found["even"] = _even(few_stretches(rows), found["jumps"])
+                found["even"] = _even(_few_stretches(rows), found["jumps"])
                 found["prepared"] = None if jump else Preparation().apply(found["even"])
         return cls.as_recorded(dataset, model, **found)
 
 
 def _mended(dataset: Dataset) -> dict[str, Any]:
-    """The log with its drop-outs interpolated, and where they are; rows after which an angle wraps, or jumps by pi."""
-    dropped = {name: drop_outs(dataset, name) for name in ("q", "v", "u", "a")}
-    mended = mended_rows(dataset, dropped)
+    """The log with straight lines over its drop-outs, and where they are; rows after which an angle wraps, or jumps."""
+    dropped, changed = {name: _drop_outs(dataset, name) for name in ("q", "v", "u", "a")}, dict[str, np.ndarray]()
+    for name, lost in dropped.items():
+        for joint in np.flatnonzero(lost.any(axis=0)):
+            values = changed.setdefault(name, getattr(dataset, name).copy())
+            gone = lost[:, joint]
+            values[gone, joint] = np.interp(np.flatnonzero(gone), np.flatnonzero(~gone), values[~gone, joint])
+    mended = replace(dataset, **changed, truth={}) if changed else dataset
     change = np.abs(np.diff(mended.q, axis=0, append=mended.q[-1:]))
     change[~consecutive(mended)] = 0.0
     angular = _angular(mended)
     wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & angular
     jumps = (change > np.pi) & angular & ~wraps
     return {"mended": mended, "dropped": dropped, "wraps": wraps, "jumps": jumps}
+
+
+def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
+    """Where a signal is exactly 0 between values far from 0: it was not measured, or lost on its way."""
+    values = getattr(dataset, name)
+    lost = np.zeros(values.shape, dtype=bool)
+    follows = consecutive(dataset)[:-1]
+    for joint in np.flatnonzero(((values == 0.0).sum(axis=0) >= FEWEST_DROPS) & (np.ptp(values, axis=0) > 0.0)):
+        x = values[:, joint]
+        steps = np.abs(np.diff(x))
+        usual = max(
+            JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max())
+        )
+        zeros = runs(x == 0.0)
+        zeros = zeros[(zeros[:, 0] > 0) & (zeros[:, 1] <= len(steps))]
+        into, out = zeros.T - 1  # the steps that lead into a run of zeros, and out of it
+        sudden = (steps[into] > usual) & (steps[out] > usual) & follows[into] & follows[out]
+        for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
+            lost[start:stop, joint] = True
+    return lost
 
 
 def _angular(dataset: Dataset) -> np.ndarray:
@@ -181,6 +212,30 @@ def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:
         own = dataset.episode == number
         q[own] = np.unwrap(q[own], axis=0)
     return replace(dataset, q=q, truth={})
+
+
+def _few_stretches(dataset: Dataset) -> Dataset:
+    """A few stretches of successive rows, evenly over the log, each an episode."""
+    length = STRETCH_ROWS if dataset.nv <= FEW_JOINTS else STRETCH_ROWS // 2
+    if len(dataset) <= STRETCHES * length:
+        return dataset
+    starts = np.linspace(0, len(dataset) - length, STRETCHES).astype(int)
+    rows = (starts[:, None] + np.arange(length)).ravel()
+    pieces = np.repeat(np.arange(STRETCHES), length)
+    _, numbers = np.unique(np.stack([pieces, dataset.episode[rows]]), axis=1, return_inverse=True)
+    return replace(dataset.rows(rows), episode=numbers.ravel())
+
+
+def _smoothed(dataset: Dataset) -> tuple[Dataset, int]:
+    """Running means of all signals within each episode, and their width: the equation of motion keeps holding."""
+    steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
+    width = int(min(SMOOTH_SECONDS / np.median(steps), SMOOTH_ROWS)) // 2 * 2 + 1 if len(steps) else 1
+    width = width if len(dataset) >= 10 * width else 1
+    inside = whole_windows(dataset, width)
+    if width < 3 or not len(inside):
+        return dataset, width
+    means = {name: window_means(getattr(dataset, name), inside, width) for name in ("q", "v", "u", "a")}
+    return replace(dataset.rows(inside + width // 2), **means, noise_std=None, truth={}), width
 
 
 def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import CheckInput, numbers_of
-from forcegp.data.findings import Finding, listed, look, ok
-from forcegp.data.successive_rows import white_noise
+from forcegp.data.views import white_noise
+from forcegp.doubts import Doubt, listed, look, ok
 from forcegp.errors import InvalidInput
 from forcegp.evidence.identifiability import base_parameters, excitation
 from forcegp.summary import plain
@@ -17,10 +17,9 @@ MUCH = 0.2  # noise relative to the spread of the signal from which a filter is 
 
 STATED_OFF = 3.0  # factor either way between stated and seen noise of the acceleration that is reported
 FAR_OFF = 10.0
-LARGE_TORQUE = 0.5  # noise times M, relative to the spread of the torque
 
 
-def stated_noise_findings(inputs: CheckInput) -> Iterator[Finding]:
+def stated_noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     """`noise_std` against the noise that the acceleration of successive rows shows."""
     log = inputs.log
     stated, seen = log.noise_level, white_noise(log)
@@ -33,20 +32,20 @@ def stated_noise_findings(inputs: CheckInput) -> Iterator[Finding]:
         return
     joint = int(off[np.argmax(np.abs(np.log(ratio[off])))])
     small = ratio[joint] > 1.0
-    yield Finding(
-        severity="wrong" if ratio[joint] > FAR_OFF else "look",
-        subject="noise_std",
-        seen=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
+    yield Doubt(
+        level="wrong" if ratio[joint] > FAR_OFF else "look",
+        about="noise_std",
+        what=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
         f"show noise of {seen[joint]:.3g}: {ratio[joint] if small else 1.0 / ratio[joint]:.3g} times as "
         f"{'much' if small else 'little'}.",
-        remedy="Learn it (forcegp fit --noise learned), or state what was measured."
+        do="Learn it (forcegp fit --noise learned), or state what was measured."
         + ("" if small else " Noise that a filter made smooth does not show between rows: then leave it."),
         joints=inputs.named(off),
         numbers={"stated": plain(stated), "seen": plain(seen)},
     )
 
 
-def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
+def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
     if inputs.prepared is None:
         return
@@ -54,19 +53,17 @@ def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
     cutoff = report.get("cutoff")
     measured = report.get("acceleration_noise", {})
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
-        yield ok(subject="noise", seen="the positions show no noise worth a filter.")
+        yield ok(about="noise", what="the positions show no noise worth a filter.")
         return
     before, after = (numbers_of(measured[when]) for when in ("before", "after"))
-    spread = np.std(inputs.prepared.dataset.a, axis=0)
-    why = "`cutoff` auto" if inputs.automatic else "as asked for"
-    if report is not inputs.prepared.report:
-        why = "when this dataset was prepared"
+    spread = np.std(inputs.prepared.a, axis=0)
     if np.isfinite(after).any():
+        when = " when this dataset was prepared" if inputs.cutoff is None else ""
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
         unit = "rad/s²" if inputs.rotates[worst] else "m/s²"
         yield ok(
-            subject="noise",
-            seen=f"a filter at {cutoff:.3g} Hz ({why}) takes the noise of the acceleration of "
+            about="noise",
+            what=f"a filter at {cutoff:.3g} Hz{when} takes the noise of the acceleration of "
             f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
             numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
         )
@@ -77,44 +74,21 @@ def noise_findings(inputs: CheckInput) -> Iterator[Finding]:
     # a log may hold better accelerations than differences
     if raw and (np.std(inputs.log.a, axis=0)[loud] > np.hypot(1.0, MUCH) * spread[loud]).any():
         yield look(
-            subject="noise",
-            seen=f"the acceleration in this dataset is not filtered: its noise is up to "
+            about="noise",
+            what=f"the acceleration in this dataset is not filtered: its noise is up to "
             f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
-            remedy=f"forcegp import DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
+            do=f"forcegp import DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
             joints=inputs.named(loud),
         )
-    yield from _in_torques(inputs, after)
     if len(left):
         names = inputs.named(left)
         yield look(
-            subject="noise",
-            seen=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
+            about="noise",
+            what=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
             f"{', '.join(names)}.",
-            remedy="Move faster, filter lower, or learn from torques instead of accelerations.",
+            do="Move faster, filter lower, or learn from torques instead of accelerations.",
             joints=names,
         )
-
-
-def _in_torques(inputs: CheckInput, after: np.ndarray) -> Iterator[Finding]:
-    """Noise of the acceleration that is as large as the torques when multiplied by M."""
-    assert inputs.prepared is not None
-    noise = torque_noise(inputs, after)
-    if noise is None or inputs.contacts:
-        return
-    spread = np.std(inputs.prepared.dataset.u, axis=0)
-    with np.errstate(invalid="ignore"):
-        loud = np.flatnonzero((noise > LARGE_TORQUE * spread) & (spread > 0.0))
-    if not len(loud):
-        return
-    text = ", ".join(f"{inputs.names[k]} {noise[k]:.2g} of {spread[k]:.2g}" for k in loud)
-    yield look(
-        subject="noise",
-        seen=f"even filtered, the noise of the acceleration is worth more than half of a torque: {text} Nm or N.",
-        remedy="Filter lower for anything that compares torques (identification by torques); a likelihood of "
-        "accelerations bears it.",
-        joints=inputs.named(loud),
-        numbers={"noise": plain(noise[loud]), "torque": plain(spread[loud])},
-    )
 
 
 def torque_noise(inputs: CheckInput, noise: np.ndarray) -> np.ndarray | None:
@@ -130,15 +104,14 @@ WELL = 100.0  # condition number up to which identification is commonly called w
 BADLY = 1000.0
 HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
 FEWEST_CHANGES = 2
-HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
 STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
 
 
-def excitation_findings(inputs: CheckInput) -> Iterator[Finding]:
+def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     """Joints that hardly move or never turn back, and how well base parameters are determined."""
     if inputs.prepared is None:
         return
-    rows = inputs.prepared.dataset
+    rows = inputs.prepared
     still, one_way, motions = [], [], []
     for joint, name in enumerate(inputs.names):
         v = rows.v[:, joint]
@@ -160,40 +133,11 @@ def excitation_findings(inputs: CheckInput) -> Iterator[Finding]:
     ):
         if joints:
             about = {"joints": tuple(joints), "numbers": {"joints": motions}}
-            yield look(subject="excitation", seen=f"{listed(joints)} {what}", remedy=remedy, **about)
-    yield from _held(inputs, still)
+            yield look(about="excitation", what=f"{listed(joints)} {what}", do=remedy, **about)
     yield from _base_parameters(inputs)
 
 
-def _held(inputs: CheckInput, still: list[str]) -> Iterator[Finding]:
-    """Joints that stand still in whole stretches although they move in others."""
-    assert inputs.prepared is not None
-    rows = inputs.prepared.dataset
-    if len(rows.episodes) < 2:
-        return
-    spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
-    for joint, name in enumerate(inputs.names):
-        held = np.flatnonzero(
-            (spans[:, joint] < HELD * spans[:, joint].max()) & (spans.max(axis=1) > 5.0 * spans[:, joint])
-        )
-        if name in still or not len(held) or len(held) > len(spans) // 2:
-            continue
-        first = int(held[0])
-        unit = "rad" if inputs.rotates[joint] else "m"
-        begin = float(rows.time[rows.episode == rows.episodes[first]][0])
-        yield look(
-            subject="held joint",
-            seen=f"{name} stays within {spans[first, joint]:.2g} {unit} in {len(held)} of {len(spans)} stretches "
-            f"while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); elsewhere it "
-            f"moves {spans[:, joint].max():.2g}.",
-            remedy="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
-            "(`locked`).",
-            joints=(name,),
-            numbers={"stretches": held.tolist(), "range": float(spans[first, joint])},
-        )
-
-
-def _base_parameters(inputs: CheckInput) -> Iterator[Finding]:
+def _base_parameters(inputs: CheckInput) -> Iterator[Doubt]:
     if inputs.robot is None:
         return
     rows = inputs.rows()
@@ -215,4 +159,4 @@ def _base_parameters(inputs: CheckInput) -> Iterator[Finding]:
             "URDF's values where the data are not informative."
         )
     kind = look if remedy else ok
-    yield kind(subject="excitation", seen=size_and_quality, remedy=remedy, numbers=numbers)
+    yield kind(about="excitation", what=size_and_quality, do=remedy, numbers=numbers)

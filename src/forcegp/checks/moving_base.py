@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.data import Dataset, thruster_columns
+from forcegp.data import Dataset, estimate_stance, thruster_columns
 from forcegp.data.configurations import in_base
-from forcegp.data.findings import Finding, import_flags, look, ok, wrong
-from forcegp.data.row_selection import consecutive
-from forcegp.data.successive_rows import whole_windows
+from forcegp.data.views import consecutive, whole_windows
+from forcegp.doubts import Doubt, look, ok, wrong
+from forcegp.errors import ContactError
 from forcegp.model import Model
 from forcegp.robots.manifold import Group, difference, pose
 
@@ -30,16 +30,11 @@ SURE = 20.0
 TINY = 1e-24
 MOST_ROWS = 2000
 MOST_WINDOW_ROWS, MOST_FORCES = 20_000, 4_000
-WINDOW, MOST_TURN = 0.1, 0.5
-"""Seconds over which motion is averaged, and rad, since rates are averaged as vectors."""
-CARRIED = 0.5
-"""Of the weight: a larger force in half of the rows carries the robot."""
-LEAST = 0.01
-"""Of the speed: a smaller error is that of rounding."""
-THOUSANDS = 10.0
-"""Times the weight: a larger force is one of lengths in mm."""
-GAP = 1.5
-"""Times the usual time of so many rows: a longer one has a gap."""
+WINDOW, MOST_TURN = 0.1, 0.5  # seconds over which motion is averaged, and rad, since rates are averaged as vectors
+CARRIED = 0.5  # of the weight: a larger force in half of the rows carries the robot
+LEAST = 0.01  # of the speed: a smaller error is that of rounding
+THOUSANDS = 10.0  # times the weight: a larger force is one of lengths in mm
+GAP = 1.5  # times the usual time of so many rows: a longer one has a gap
 RPM = 2.0 * np.pi / 60.0
 IMU = {"axes": {"a": ("imu",)}}
 
@@ -82,10 +77,10 @@ class _Windows:
         return torch.tensor(values[self.rows.ravel()])
 
 
-def base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """What is seen of the bases of a log."""
     if not dataset.time_ordered or consecutive(dataset).sum() < 10:
-        yield look(subject="base", seen="too few successive rows to compare positions and velocities of the base.")
+        yield look(about="base", what="too few successive rows to compare positions and velocities of the base.")
         return
     for group in model.robot.layout.groups:
         own = np.arange(dataset.nv)[group.rows]
@@ -100,25 +95,25 @@ def base_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         specific = _rms(change - windows.mean(measured))
         if error > 2.0 * size and specific < CLEARLY * error:
             yield wrong(
-                subject="base acceleration",
-                seen=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
+                about="base acceleration",
+                what=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
                 f"velocity it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}.",
-                remedy=f"forcegp import {import_flags(IMU)}; or differentiate v.",
+                do="Differentiate v.",
                 correction=IMU,
                 numbers={"error": error, "specific": specific, "size": size},
             )
         elif error > 2.0 * size:  # noise of the velocities alone makes both large
             yield look(
-                subject="base acceleration",
-                seen=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
+                about="base acceleration",
+                what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
                 f"which itself is {size:.2g}.",
-                remedy="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
+                do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
                 "an accelerometer; differentiate v, or add gravity to what an IMU measures.",
                 numbers={"error": error, "size": size},
             )
 
 
-def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
+def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """A base that no foot, wheel, thruster or known force of the model moves, although it does not fall or drives."""
     robot, groups = model.robot, model.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
@@ -150,10 +145,10 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
         needed = size(robot.mass * a[:, group.rows][:, :linear].cpu())
         if found > CARRIED * needed:
             yield look(
-                subject="base force",
-                seen=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
+                about="base force",
+                what=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
                 f"(its acceleration takes {needed:.3g} N); masses found from this log would be wrong.",
-                remedy="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
+                do="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
                 "For the arm alone, record it while the base stands, and leave out --base and the columns of the base.",
                 numbers={"force": found, "needed": needed},
             )
@@ -175,7 +170,7 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
             f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, no foot "
             f"that stands and no thruster {weighs}."
         )
-        yield wrong(subject="base force", seen=seen, remedy=remedy, numbers=numbers)
+        yield wrong(about="base force", what=seen, do=remedy, numbers=numbers)
         return
     seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
     still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
@@ -193,10 +188,10 @@ def carried_findings(dataset: Dataset, model: Model) -> Iterator[Finding]:
     for what, (rotation, speeds, stated) in readings.items():
         left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
         if left < CLEARLY * min(found, weight):
-            kind, correction, remedy = wrong, stated, f"forcegp import {import_flags(stated)}."
+            kind, correction, remedy = wrong, stated, ""
             numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
             break
-    yield kind(subject="base force", seen=f"{seen}.", remedy=remedy, correction=correction, numbers=numbers)
+    yield kind(about="base force", what=f"{seen}.", do=remedy, correction=correction, numbers=numbers)
 
 
 def _stated_axes(dataset: Dataset) -> tuple[str, str]:
@@ -217,7 +212,7 @@ def _stated_order(dataset: Dataset) -> str:
 
 def _of_velocity(
     windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: tuple[str, str], order: str
-) -> Iterator[Finding]:
+) -> Iterator[Doubt]:
     whole = list(range(v.shape[1]))
     angular = [free > 2 for free in group.motion.free]
     parts = {"linear ": [k for k in whole if not angular[k]], "angular ": [k for k in whole if angular[k]]}
@@ -260,29 +255,25 @@ def _of_velocity(
         axes = tuple(found.get(name, now) for name, now in zip(parts, stated, strict=True))
         correction["axes"] = {"v": axes[:1] if len(set(axes)) == 1 else axes}
     reading = " and ".join(meant)
-    remedy = (
-        f"forcegp import {import_flags(correction)}. A Dataset has x, y, z, w and velocities R^T p' and w of the base."
-    )
     numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
     if reading:
         yield wrong(
-            subject="base",
-            seen=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
+            about="base",
+            what=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
             f"{recorded:.2g}, of a speed of {speed:.2g}.",
-            remedy=remedy,
             correction=correction,
             numbers=numbers,
         )
     elif recorded > CLEARLY * speed and speed > 0.0:
         yield look(
-            subject="base",
-            seen=f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of "
+            about="base",
+            what=f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of "
             f"{speed:.2g}.",
-            remedy="Check units and time stamps, and that v is linear, then angular velocity in the axes of the base.",
+            do="Check units and time stamps, and that v is linear, then angular velocity in the axes of the base.",
             numbers=numbers,
         )
     else:
-        yield ok(subject="base", seen=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
+        yield ok(about="base", what=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
 
 
 def _in_world(group: Group, q: Tensor, v: Tensor) -> Tensor:
@@ -313,3 +304,74 @@ def _explained(error: Tensor, difference: Tensor) -> bool:
 
 def _rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())
+
+
+MOST_FLAGS = 4000
+FEW, RARE, RESTING = 0.05, 0.002, 0.02
+"""Shares of rows of stance that the motion contradicts and that are wrong, or worth a look; the same of swing."""
+
+
+def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
+    """Contacts that contradict each other; flags that are no flags, or that `estimate_stance` contradicts."""
+    if not model.contacts:
+        return
+    every = -(-len(dataset) // MOST_FLAGS)
+    dataset = dataset.rows(slice(None, None, every))
+    try:
+        model.check_states(*(torch.tensor(x, device=model.robot.device) for x in (dataset.q, dataset.v, dataset.u)))
+    except ContactError as error:
+        counted = f" (rows are counted in every {every}. one)" if every > 1 else ""
+        yield wrong(about="contacts", what=f"{error}{counted}")
+    names = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
+    if not names:
+        return
+    found = estimate_stance(dataset, model)
+    for k, name in enumerate(found.names):
+        logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
+        frame = next(contact.frame for contact in model.contacts if contact.switch == name)
+        stands = logged > 0.5
+        odd = int(((logged != 0.0) & (logged != 1.0)).sum())
+        if odd:
+            yield wrong(
+                about="contact flag",
+                what=f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1.",
+                do="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
+                numbers={"rows": odd},
+            )
+        lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), ~stands & (shown == 1.0)
+        sliding, rests = (float(x.sum() / max(y.sum(), 1)) for x, y in ((lifted, stands), (resting, ~stands)))
+        numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "resting while free": rests}
+        numbers |= {"limit": float(found.slow[k]), "open": float(np.isnan(shown).mean())}
+        kind, seen, remedy = ok, f"{name!r} agrees with motion and forces.", ""
+        if sliding > RARE:
+            row = int(np.flatnonzero(lifted)[speed[lifted].argmax()])
+            kind = wrong if sliding > FEW else look
+            seen = (
+                f"{name!r} holds {frame!r} in rows in which it moves or bears nothing: {sliding:.1%} of them, row "
+                f"{every * row} with {speed[row]:.2g} m/s and {found.force[row, k]:.2g} N."
+            )
+            remedy = (
+                "Set the flag to 0 where the foot slides or is lifted (forcegp import --stance auto finds such rows), "
+                "and compare its time with that of the joints; a wrong foot point or joint offset shows the same."
+            )
+        elif rests > RESTING:
+            row = every * int(np.flatnonzero(resting)[0])
+            kind, remedy = look, "A foot at rest may stand: compare the flag with contact forces or heights."
+            seen = f"{name!r} is 0 in rows of which {rests:.0%} show {frame!r} at rest, row {row} for example."
+        if kind is not ok or not odd:
+            yield kind(about="contact flag", what=seen, do=remedy, numbers=numbers)
+
+
+def unmeasured_base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
+    """A base whose columns hold one number while joints move: nobody measured it."""
+    for group in model.robot.layout.groups:
+        others = np.delete(np.arange(dataset.nv), np.arange(group.rows.start, group.rows.stop))
+        still = not np.ptp(dataset.q[:, group.places], axis=0).any() and not dataset.v[:, group.rows].any()
+        moves = not len(others) or np.ptp(dataset.v[:, others], axis=0).any()
+        if still and moves and len(dataset) > 1:
+            yield wrong(
+                about="base",
+                what=f"{group.name!r} stands still in all {len(dataset)} rows to the last digit: it was not measured.",
+                do="Record its pose by motion capture or a state estimator (position and quaternion), and its "
+                "velocity. Without, learn joint friction on a stand: base='fixed'.",
+            )

@@ -1,67 +1,31 @@
-"""`check`: one log against itself and its robot, as a list of findings that a person acts on."""
+"""`check`: one log against itself and its robot, as a list of doubts that a person acts on."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput, numbers_of
-from forcegp.checks.excitation import excitation_findings, noise_findings, stated_noise_findings, torque_noise
-from forcegp.checks.hypotheses import Hypothesis, best_hypothesis
-from forcegp.checks.motion import motion_findings, sampling_findings
-from forcegp.checks.moving_base import base_findings, carried_findings
-from forcegp.checks.parameters import parameter_findings
-from forcegp.checks.signals import signal_findings
-from forcegp.checks.stance import gravity_findings, stance_findings, unmeasured_base_findings
-from forcegp.checks.torque_findings import not_compared, torque_findings
+from forcegp.checks.excitation import excitation_doubts, noise_doubts, stated_noise_doubts, torque_noise
+from forcegp.checks.moving_base import (
+    base_doubts,
+    carried_doubts,
+    stance_doubts,
+    unmeasured_base_doubts,
+)
+from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
+from forcegp.checks.torque_doubts import Hypothesis, best_hypothesis, not_compared, torque_doubts
+from forcegp.checks.torques import parameter_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
+from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.findings import SEVERITIES, Finding, Severity, import_flags, listed, look, worst
+from forcegp.doubts import LEVELS, Doubt, Doubts
 from forcegp.errors import InvalidInput, require_type
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
-from forcegp.summary import listed as shortened
-
-
-def robot_findings(robot: Robot) -> Iterator[Finding]:
-    """Moving links without inertia, equal inertias, centres of mass and radii of gyration beyond the robot's reach."""
-    moving = [robot.link(name) for name in robot.link_names if robot.link(name).joint is not None]
-    heavy = [link for link in moving if link.mass > 0.0]
-    # the distances between joints, and the largest of a centre of mass from its joint [m]
-    origins = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in robot.layout.bodies)
-    centers = [float(np.linalg.norm(robot.link(name).center_of_mass)) for name in robot.link_names]
-    reach = origins + max(centers, default=0.0) if origins > 0.0 else 0.0
-    children = {joint.child for joint in robot.layout.bodies}
-    alone = [link.name for link in moving if link.mass == 0.0 and link.name in children]
-    if alone:
-        yield look(
-            subject="URDF",
-            seen=f"{listed(alone)} move with a joint of their own but have no mass.",
-            remedy="Add their <inertial>, or expect their inertia to be missing.",
-        )
-    shapes = {(link.mass, link.inertia) for link in heavy}
-    if len(heavy) > 2 and len(shapes) == 1:
-        yield look(
-            subject="URDF",
-            seen=f"all {len(heavy)} moving links have the same mass and inertia ({heavy[0].mass:g} kg): a placeholder.",
-            remedy="Use the manufacturer's URDF, or identify the inertias (forcegp fit --forces bodies).",
-        )
-    for link in heavy:
-        gyration = float(np.sqrt(np.linalg.eigvalsh(np.array(link.inertia)).max() / link.mass))
-        center = float(np.linalg.norm(link.center_of_mass))
-        if reach > 0.0 and (gyration > reach or center > 2.0 * reach):
-            yield look(
-                subject="URDF",
-                seen=f"link {link.name} has a radius of gyration of {gyration:.3g} m and its centre of mass "
-                f"{center:.3g} m from its joint; the whole robot reaches about {reach:.3g} m.",
-                remedy="Check the units of this link (kg, m, kg m²).",
-                numbers={"gyration": gyration, "center": center, "reach": reach},
-            )
-
 
 BEFORE_A_FIT = frozenset(
     ("contact", "noise_std", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
@@ -72,31 +36,19 @@ BEFORE_A_FIT = frozenset(
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class CheckReport(Summary):
-    """The findings, worst first, and what they rest on.
+    """The doubts, worst first, and what they rest on.
 
     `inputs` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
     with the errors corrected that were found (None without a robot, or with contacts).
     """
 
-    findings: tuple[Finding, ...]
+    doubts: Doubts
     inputs: CheckInput
     comparison: Hypothesis | None
 
     def facts(self) -> dict[str, object]:
-        """The subjects of the findings, by severity."""
-        return {
-            each: shortened(finding.subject for finding in self.findings if finding.severity == each)
-            for each in ("wrong", "look", "ok")
-        }
-
-    @property
-    def severity(self) -> Severity:
-        """That of the worst finding."""
-        return worst(self.findings)
-
-    def of(self, subject: str) -> tuple[Finding, ...]:
-        """The findings on one subject."""
-        return tuple(finding for finding in self.findings if finding.subject == subject)
+        """The subjects of the doubts, by level."""
+        return {level: self.doubts.at(level).subjects or "none" for level in reversed(LEVELS)}
 
     def per_joint(self) -> list[dict[str, Any]]:
         """What was measured of every joint; None where it is not known.
@@ -110,7 +62,8 @@ class CheckReport(Summary):
         if self.comparison is not None:
             fit = self.comparison.fit
             columns["unexplained"] = plain(fit.unexplained)
-            columns["residual"] = plain(np.std(self.comparison.rows.u - fit.predicted, axis=0))
+            predicted = fit.at(self.comparison.robot, self.comparison.tau, self.comparison.rows)
+            columns["residual"] = plain(np.std(self.comparison.rows.u - predicted, axis=0))
             columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
         report = {} if self.inputs.prepared is None else self.inputs.price
         noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
@@ -120,14 +73,14 @@ class CheckReport(Summary):
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON: severity, counts, numbers of every joint, findings."""
-        counts = {severity: sum(each.severity == severity for each in self.findings) for severity in SEVERITIES}
+        """Plain JSON: level, counts, numbers of every joint, doubts."""
+        counts = {level: len(self.doubts.at(level)) for level in LEVELS}
         return {
-            "severity": self.severity,
+            "level": self.doubts.level,
             "counts": counts,
             "cutoff": None if self.inputs.prepared is None else self.inputs.price.get("cutoff"),
             "joints": self.per_joint(),
-            "findings": [finding.to_dict() for finding in self.findings],
+            "doubts": [doubt.to_dict() for doubt in self.doubts],
         }
 
 
@@ -149,17 +102,15 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
         require_rows("dataset", dataset, robot.joint_names, robot.name)
         if robot.layout.groups:  # torques and filters are not looked at
             inputs = CheckInput.as_recorded(dataset, model)
-            return CheckReport(findings=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
+            return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
     inputs = CheckInput.of(dataset, model, preparation)
-    findings, comparison = _findings(inputs, model)
-    if inputs.robot is not None:
-        findings += robot_findings(inputs.robot)
+    doubts, comparison = _doubts(inputs, model)
     if inputs.prepared is not None:
-        findings += [*excitation_findings(inputs), *noise_findings(inputs)]
-    return CheckReport(findings=_sorted(findings), inputs=inputs, comparison=comparison)
+        doubts += [*excitation_doubts(inputs), *noise_doubts(inputs)]
+    return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)
 
 
-def quick_check(dataset: Dataset, model: Model | None = None) -> tuple[Finding, ...]:
+def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     """What of `check` is cheap enough before every fit, worst first: only what would make the fit wrong.
 
     From a few stretches of the log and without a filter, so that it takes a tenth of a second; rows out of order and
@@ -169,76 +120,53 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> tuple[Finding, 
     if model is not None:
         require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
         if model.robot.layout.groups:
-            return tuple(each for each in _of_base(dataset, model) if each.severity != "ok")
-    findings, _ = _findings(CheckInput.quick(dataset, model), model)
-    said = [each for each in findings if each.severity == "look" and each.subject in BEFORE_A_FIT]
-    if dataset.nv > 1:  # friction of one joint can look like a delay
-        said = [each for each in said if each.subject != "delay" or len(each.joints) > 1]
-    return _sorted([*said, *(each for each in findings if each.severity == "wrong")])
+            return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
+    doubts, _ = _doubts(CheckInput.quick(dataset, model), model)
+    said = [each for each in doubts if each.level == "look" and each.about in BEFORE_A_FIT]
+    if dataset.nv == 1:  # friction of one joint can look like a delay
+        said = [each for each in said if each.about != "delay"]
+    return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
-def _findings(inputs: CheckInput, model: Model | None) -> tuple[list[Finding], Hypothesis | None]:
+def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Hypothesis | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
-    findings = [*signal_findings(inputs), *stated_noise_findings(inputs)]
+    doubts = [*signal_doubts(inputs), *stated_noise_doubts(inputs)]
     if inputs.log.time_ordered:
-        findings = [*sampling_findings(inputs), *findings, *motion_findings(inputs)]
+        doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
     contacts = contact_doubts(inputs.mended, model)
-    findings += [*contacts, *(stance_findings(inputs.log, model) if model is not None else ())]
+    doubts += [*contacts, *(stance_doubts(inputs.log, model) if model is not None else ())]
     comparison = None
     if inputs.compared is None:
-        return findings, None
+        return doubts, None
     if inputs.robot is None or inputs.contacts:
-        return [*findings, not_compared(inputs)], None
+        return [*doubts, not_compared(inputs)], None
     if inputs.log.u.any() and not contacts:
         comparison, corrections = best_hypothesis(inputs)
-        compared = list(torque_findings(inputs, comparison))
+        compared = list(torque_doubts(inputs, comparison))
         noise = inputs.compared_noise
-        if noise is not None and ("torque unit", "wrong") not in {(each.subject, each.severity) for each in compared}:
-            numbers = parameter_findings(comparison.robot, comparison.rows, noise)
-            compared = [each for each in compared if not numbers or each.subject != "torque unit"] + numbers
-        findings += [*corrections, *compared]
-    return findings, comparison
+        if noise is not None and ("torque unit", "wrong") not in {(each.about, each.level) for each in compared}:
+            numbers = parameter_doubts(comparison.robot, comparison.without_laws(comparison.rows), noise)
+            compared = [each for each in compared if not numbers or each.about != "torque unit"] + numbers
+        doubts += [*corrections, *compared]
+    return doubts, comparison
 
 
-def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = None) -> tuple[Finding, ...]:
+def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = None) -> Doubts:
     """What is seen of a base that moves, of the joints and of what holds it; torques are not looked at."""
-    unmeasured = list(unmeasured_base_findings(dataset, model))
+    unmeasured = list(unmeasured_base_doubts(dataset, model))
     of_joints = list(_of_single_joints(dataset, model.robot, preparation))
-    of_base = unmeasured or list(base_findings(dataset, model))
-    if not unmeasured and worst(of_base) != "wrong":  # forces in wrong axes show nothing
-        of_base += carried_findings(dataset, model)
-    flags = stance_findings(dataset, model) if worst(of_joints) != "wrong" else ()  # wrong v contradict any flag
-    return _sorted([*of_base, *of_joints, *gravity_findings(dataset, model), *flags])
+    of_base = unmeasured or list(base_doubts(dataset, model))
+    if not unmeasured and Doubts(of_base).level != "wrong":  # forces in wrong axes show nothing
+        of_base += carried_doubts(dataset, model)
+    flags = stance_doubts(dataset, model) if Doubts(of_joints).level != "wrong" else ()  # wrong v contradict any flag
+    return Doubts([*of_base, *of_joints, *flags])
 
 
-def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Finding]:
+def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Doubt]:
     """Whether q, v and a of the joints of one degree of freedom belong together; quick where there is no filter."""
-    rows = robot.space.single_rows
-    if not rows or not dataset.time_ordered:
+    if not robot.space.single_rows or not dataset.time_ordered:
         return
-    places = [robot.position_names.index(name) for name in robot.single_joint_names]
-    each = {name: unit_of_each(name, dataset.units[name], dataset.nv) for name in ("q", "v", "u", "a")}
-    alone = Dataset(
-        q=dataset.q[:, places], v=dataset.v[:, rows], a=dataset.a[:, rows], u=np.zeros((len(dataset), len(rows))),
-        time=dataset.time, episode=dataset.episode, joint_names=robot.single_joint_names, metadata=dataset.metadata,
-        units={name: tuple(units[row] for row in rows) for name, units in each.items()} | {"time": "s"},
-    )  # fmt: skip
+    alone = replace(dataset, model=None, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
     with contextlib.suppress(InvalidInput):  # too short
         inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
-        for finding in motion_findings(inputs):  # gaps may be rows whose feet are not known
-            yield _for_all_columns(finding, rows, {"unit": each["v"], "sign": (1.0,) * dataset.nv})
-
-
-def _for_all_columns(finding: Finding, rows: list[int], columns: Mapping[str, Sequence[Any]]) -> Finding:
-    """The finding with a correction for the joints in these rows as one for all columns, those of the base as now."""
-    correction: dict[str, dict[str, tuple[Any, ...]]] = {}
-    for what, of_signal in finding.correction.items():
-        for signal, own in of_signal.items():
-            whole = dict(enumerate(columns[what])) | dict(zip(rows, own * (len(rows) // len(own)), strict=True))
-            correction[what] = {signal: tuple(whole.values())}
-    remedy = finding.remedy.replace(import_flags(finding.correction) or " ", import_flags(correction) or " ")
-    return replace(finding, remedy=remedy, correction=correction)
-
-
-def _sorted(findings: list[Finding]) -> tuple[Finding, ...]:
-    return tuple(sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity)))
+        yield from motion_doubts(inputs, robot.space.single_rows)  # gaps may be rows whose feet are not known

@@ -1,16 +1,19 @@
-"""Does each channel carry a signal: constant and frozen channels, saturation, limits, resolution."""
+"""Does each channel carry a signal, are the rows even in time, and do q, v and a belong to each other."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import CheckInput
-from forcegp.data import Dataset
+from forcegp.checks.check_input import DEGREE, GAP, CheckInput
+from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.dataset_fields import unit_of_each
-from forcegp.data.findings import Finding, listed, look, wrong
-from forcegp.data.row_selection import consecutive
-from forcegp.data.successive_rows import runs
+from forcegp.data.delay import lowest
+from forcegp.data.filters import JITTER
+from forcegp.data.views import consecutive, runs
+from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
@@ -21,24 +24,17 @@ FROZEN_ROWS = 10
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
 CLIPPED_ROWS = 10
-TOLERANCE = 0.01  # of the range between limits, by which a position may exceed them: calibration
-COARSE = {
-    "q": 1e-3,
-    "v": 1e-2,
-    "u": 1e-2,
-}  # of the range, below which steps are no finding; positions are differentiated twice
 
 
-def signal_findings(inputs: CheckInput) -> list[Finding]:
-    """Constant, frozen and clipped channels, limits of the URDF, angles that wrap or jump, coarse resolution."""
+def signal_doubts(inputs: CheckInput) -> list[Doubt]:
+    """Constant, frozen and clipped channels, angles that wrap or jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
     clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
-    found = [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
-    return [*found, *_limits(inputs), *_resolution(inputs)]
+    return [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
 
 
-def _leaps(inputs: CheckInput) -> Iterator[Finding]:
+def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
     for places, how, remedy in (
         (inputs.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
         (inputs.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
@@ -48,16 +44,16 @@ def _leaps(inputs: CheckInput) -> Iterator[Finding]:
             row, joint = (int(index) for index in np.argwhere(places)[0])
             name = inputs.names[joint]
             yield wrong(
-                subject="jumps",
-                seen=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
+                about="jumps",
+                what=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
                 f"({int(places.sum())} times in all).",
-                remedy=remedy,
+                do=remedy,
                 joints=inputs.named(np.flatnonzero(places.any(axis=0))),
                 numbers={"row": row, "count": int(places.sum())},
             )
 
 
-def _dropped(inputs: CheckInput) -> Iterator[Finding]:
+def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
     """Rows of a signal that were lost and read 0."""
     lost = {name: rows for name, rows in inputs.dropped.items() if rows.any()}
     if not lost:
@@ -66,17 +62,17 @@ def _dropped(inputs: CheckInput) -> Iterator[Finding]:
     first = int(np.flatnonzero(rows)[0])
     joints = np.logical_or.reduce([each.any(axis=0) for each in lost.values()])
     yield wrong(
-        subject="drop-outs",
-        seen=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
+        about="drop-outs",
+        what=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
         f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
         f"{inputs.log.time[first]:.3f} s.",
-        remedy="They were not measured: leave these rows out, and look at the logger.",
+        do="They were not measured: leave these rows out, and look at the logger.",
         joints=inputs.named(np.flatnonzero(joints)),
         numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
     )
 
 
-def _constant(inputs: CheckInput) -> Iterator[Finding]:
+def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
     rests = still(log, "v") & still(log, "q")
     for name, quantity in QUANTITY.items():
@@ -92,11 +88,11 @@ def _constant(inputs: CheckInput) -> Iterator[Finding]:
             remedy = "Right for a passive mechanism; else the torque columns are missing."
         if passive and len(dead) == log.nv:
             seen = "no torque was logged at all (every u is 0)."
-        yield Finding(
-            severity="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
-            subject="constant channel",
-            seen=seen,
-            remedy=remedy,
+        yield Doubt(
+            level="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
+            about="constant channel",
+            what=seen,
+            do=remedy,
             joints=names,
             numbers={"quantity": name},
         )
@@ -108,7 +104,7 @@ def still(log: Dataset, name: str) -> np.ndarray:
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
-def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Finding]:
+def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
     values = getattr(log, name)[:, joint]
@@ -138,18 +134,18 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Finding]:
     start, length = longest
     if not length or values[start] in (values.min(), values.max()):
         return
-    yield Finding(
-        severity="look" if name == "u" and values[start] == 0.0 else "wrong",
-        subject="frozen channel",
-        seen=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
+    yield Doubt(
+        level="look" if name == "u" and values[start] == 0.0 else "wrong",
+        about="frozen channel",
+        what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-        remedy="Leave this stretch out, and look at the logger.",
+        do="Leave this stretch out, and look at the logger.",
         joints=(inputs.names[joint],),
         numbers={"quantity": name, "row": start, "seconds": length * step},
     )
 
 
-def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
+def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
     log = inputs.log
     speed = np.abs(log.v[:, joint])
@@ -167,70 +163,211 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Finding]:
         length = stop - start
         if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
             yield wrong(
-                subject="saturation",
-                seen=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
+                about="saturation",
+                what=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
                 f"{at} rows of motion; the longest stretch, {length} rows, begins at row {start} at "
                 f"{log.time[start]:.3f} s.",
-                remedy="The robot received another torque than the log states, or the sensor is at its end: leave "
+                do="The robot received another torque than the log states, or the sensor is at its end: leave "
                 "these stretches out, or move more gently.",
                 joints=(inputs.names[joint],),
                 numbers={"value": sign * extreme, "rows": at, "row": start},
             )
 
 
-def _limits(inputs: CheckInput) -> Iterator[Finding]:
-    """Positions, velocities and torques beyond the limits of the URDF, the worst joint of each first."""
-    if inputs.robot is None:
+LOST = 1.8  # median steps at which at least one sample is missing
+MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
+LITTLE_LOST = 1e-4  # share that every logger loses
+OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
+
+
+def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
+    """Rate and duration; jitter; lost samples and gaps; repeated rows."""
+    log = inputs.log
+    steps = np.diff(log.time)[consecutive(log)[:-1]]
+    if not len(steps):
         return
-    log, joints = inputs.log, inputs.robot.joints
-    lower = np.array([-np.inf if joint.type == "continuous" else joint.lower for joint in joints])
-    upper = np.array([np.inf if joint.type == "continuous" else joint.upper for joint in joints])
-    bounds = {"q": (lower, upper)}
-    for name, limit in (("v", "velocity_limit"), ("u", "effort_limit")):
-        size = np.array([getattr(joint, limit) for joint in joints], dtype=float)
-        size[~(size > 0.0)] = np.inf  # a limit of 0 is a placeholder
-        bounds[name] = (-size, size)
-    for name, (low, high) in bounds.items():
-        values = getattr(log, name)
-        span = np.where(np.isfinite(high - low), high - low, 1.0)
-        excess = np.maximum(values - high, low - values) / span - TOLERANCE
-        if not (excess > 0.0).any():
-            continue
-        row, joint = (int(index) for index in np.unravel_index(np.argmax(excess), excess.shape))
-        beyond = inputs.named(np.flatnonzero((excess > 0.0).any(axis=0)))
-        others = f" (also {listed(tuple(k for k in beyond if k != inputs.names[joint]))})" if len(beyond) > 1 else ""
-        unit = unit_of_each(name, log.units[name], log.nv)[joint]
+    median = float(np.median(steps))
+    count = len(log.episodes)
+    each = f"{count} episodes" if count > 1 else "one episode"
+    seconds = float(steps.sum())
+    yield ok(
+        about="sampling",
+        what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
+        numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
+    )
+    yield from _lost(inputs, steps, median)
+    regular = steps[steps < LOST * median]
+    spread = float(np.abs(regular - median).max()) / median
+    if spread > JITTER:
         yield look(
-            subject="limits",
-            seen=f"the {QUANTITY[name]} of {inputs.names[joint]} is {values[row, joint]:.4g} {unit} at row {row} "
-            f"({log.time[row]:.3f} s), beyond [{low[joint]:g}, {high[joint]:g}] of the URDF{others}; "
-            f"{int((excess > 0.0).any(axis=1).sum())} rows are.",
-            remedy="Check units, sign and zero of this joint against the URDF; if they are right, the URDF's limit "
-            "is not that of your robot, which does no harm here.",
-            joints=beyond,
-            numbers={"quantity": name, "row": row, "value": float(values[row, joint])},
+            about="jitter",
+            what=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
+            f"median {1e3 * median:.3g} ms.",
+            do="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
+            "(forcegp import does).",
+            numbers={"relative_deviation": spread},
         )
+    yield from _repeated(inputs)
 
 
-def _resolution(inputs: CheckInput) -> Iterator[Finding]:
-    """Channels with few different values, and how coarse they are against their range."""
-    for name, quantity in QUANTITY.items():
-        quantized, quanta = [], {}
-        for joint, label in enumerate(inputs.names):
-            values = np.unique(getattr(inputs.log, name)[:, joint])
-            if len(values) < 3 or len(values) > 0.2 * len(inputs.log):
-                continue
-            steps = np.diff(values)
-            quantum = float(np.median(steps[steps > 1e-9 * np.ptp(values)]))
-            if quantum < COARSE[name] * np.ptp(values):
-                continue
-            quantized.append(f"{label} {quantum:.3g} ({100.0 * quantum / np.ptp(values):.2g} % of its range)")
-            quanta[label] = quantum
-        if quantized:
-            yield look(
-                subject="resolution",
-                seen=f"the {quantity} was logged in coarse steps: {', '.join(quantized)}.",
-                remedy="Log more digits, or expect noise from this.",
-                joints=tuple(quanta),
-                numbers={"quantity": name, "quantum": quanta},
-            )
+def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Doubt]:
+    log = inputs.log
+    long = steps > LOST * median
+    if not long.any():
+        return
+    first_rows = np.flatnonzero(consecutive(log))
+    worst = int(first_rows[np.argmax(steps)])
+    lost = float((steps[long] - median).sum())
+    share = lost / float(steps.sum())
+    gaps = int((steps > GAP * median).sum())
+    yield Doubt(
+        level="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
+        about="lost samples",
+        what=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
+        f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
+        + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
+        do=""
+        if share <= LITTLE_LOST and not gaps
+        else "A derivative across a gap is no acceleration: split the log there (forcegp import does), and look "
+        "why the logger loses samples.",
+        numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
+    )
+
+
+def _repeated(inputs: CheckInput) -> Iterator[Doubt]:
+    """Rows in which every position is that of the row before although velocities show that the robot moves."""
+    log = inputs.log
+    follows = consecutive(log)[:-1]
+    same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
+    speed = np.abs(log.v).max(axis=1)[1:]
+    moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
+    share = float((same & moves).sum() / max(1, (moves & follows).sum()))
+    if share < OFTEN_REPEATED:
+        return
+    row = int(np.flatnonzero(same & moves)[0]) + 1
+    yield look(
+        about="repeated rows",
+        what=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
+        f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",
+        do="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
+        numbers={"share": share, "row": row},
+    )
+
+
+RPM = np.pi / 30.0
+FACTORS: dict[float, tuple[str, str | None]] = {
+    1.0 / DEGREE: ("deg/s where q is in rad, or q in rad where v is in deg/s", "deg/s"),
+    DEGREE: ("rad/s where q is in degrees", None),
+    1.0 / RPM: ("rpm where q is in rad", "rpm"),
+    1000.0: ("mrad/s", "mrad/s"),
+    0.001: ("per millisecond", None),
+    0.5 / np.pi: ("turns per second where q is in rad", "rev/s"),
+}
+"""Ratios of v to dq/dt, what explains each, and the unit that `forcegp import --unit v=` takes where q is in rad."""
+
+CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
+UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
+FEW = 0.05  # share below which a factor is meant seriously
+TINY_SPEED = 1e-20  # of the mean square velocity of all joints
+SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
+LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
+
+
+def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> list[Doubt]:
+    """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, of all joints or of some."""
+    if inputs.prepared is None:
+        return []
+    even = inputs.even
+    if inputs.cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
+        even = low_pass(even, float(inputs.cutoff), signals=("q", "v", "a"))
+    joints = range(even.nv) if joints is None else joints
+    pieces = [even.select_episodes([number]) for number in even.episodes]
+    found: list[Doubt] = []
+    for name, source in (("v", "q"), ("a", "v")):
+        if name == "a" and any(doubt.level != "ok" for doubt in found):
+            break  # of wrong velocities nothing better can come
+        compared = ((joint, _compared(pieces, name, source, joint)) for joint in joints)
+        fits = {joint: fit for joint, fit in compared if fit is not None}
+        found += _differences(inputs, name, source, fits, len(joints))
+        if not found and fits and name == "v":
+            error = max(unexplained for _, _, unexplained in fits.values())
+            seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
+            found.append(ok(about="velocity", what=seen, numbers={"unexplained": error}))
+    return found
+
+
+def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tuple[float, float, float] | None:
+    """Factor, delay [s] and unexplained share of `name` against the derivative of `source`; None without motion."""
+    left, right = [], []
+    for rows in pieces:
+        inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
+        if inner.sum() < 3:
+            continue
+        left.append(CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None]))
+        right.append(differentiate(getattr(rows, source)[:, [joint]], rows.time)[inner, 0])
+    if not left:
+        return None
+    values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
+    power = np.square(values).sum(axis=1)
+    sizes = [float(np.square(getattr(rows, name)).mean()) for rows in pieces]
+    least = TINY_SPEED * max(*sizes, float(np.square(slopes).mean())) * len(slopes)
+    if not np.square(slopes).sum() > least or not power.min() > least:
+        return None  # a joint that stands still
+    factor = values @ slopes / np.square(slopes).sum()
+    unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
+    best = int(np.argmin(unexplained))
+    return float(factor[best]), lowest(unexplained, SHIFTS), float(max(0.0, unexplained[best]))
+
+
+def _differences(
+    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]], count: int
+) -> Iterator[Doubt]:
+    """One doubt for all joints in which v or a differs from the derivative in the same way."""
+    step = float(np.median(np.diff(inputs.even.time)))
+    groups: dict[tuple[str, float], list[int]] = {}
+    for joint, (factor, shift, left) in fits.items():
+        late = np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4)
+        sort = "sign" if factor < 0.0 else "factor" if abs(factor - 1.0) > CLOSE else "late" if late else ""
+        kind = "other" if left > UNEXPLAINED else sort if left < FEW else ""
+        known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
+        if kind:
+            groups.setdefault((kind, known if kind == "factor" else 0.0), []).append(joint)
+    what = "velocity" if name == "v" else "acceleration"
+    for (kind, known), joints in groups.items():
+        factor, shift, unexplained = fits[joints[0]]
+        named, every = inputs.named(joints), len(joints) == count > 2
+        one = f"the {what} of {'all joints' if every else listed(named)} is"
+        guess, unit = FACTORS.get(known, ("", None)) if name == "v" else ("", None)
+        level: Level = "wrong"
+        if kind == "other":
+            level = "look" if name == "a" else "wrong"
+            seen = f"{one} not d{source}/dt: {100.0 * unexplained:.0f} % of its power is something else."
+            remedy = f"Check which column {name} was read from; or leave it out, so that it is computed from {source}."
+        elif kind == "sign":
+            seen = f"{one} of the opposite sign of d{source}/dt (factor {factor:.3g})."
+            remedy = f"Turn the sign of {name} or of {source} for this joint, whichever is wrong."
+        elif kind == "factor":
+            level = "wrong" if abs(factor - 1.0) > 4 * CLOSE else "look"
+            seen = f"{one} {factor:.4g} times d{source}/dt{guess and f': {name} looks like {guess}'}."
+            remedy = f"Convert {name} or {source} to SI units, or remove the gear ratio."
+        else:
+            level, size = "look", f"{1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'}"
+            seen = f"{one} logged {size} than d{source}/dt: {abs(shift) / step:.1f} time steps."
+            remedy = f"The robot filtered it: compute {name} from positions (forcegp import --cutoff auto)."
+        factors = [fits[joint][0] for joint in joints]
+        if max(factors) - min(factors) >= CLOSE * abs(factor):
+            seen += f" Factors: {', '.join(f'{each:.3g}' for each in factors)}."
+        correction: dict[str, Any] = {}
+        if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
+            correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
+        elif level == "wrong" and unit is not None and len(joints) == count:
+            now = unit_of_each("v", inputs.log.units["v"], inputs.log.nv)
+            units = [unit if joint in fits else own for joint, own in enumerate(now)]
+            correction = {"unit": {"v": tuple(units[:1] if len(set(units)) == 1 else units)}}
+        each = [
+            {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
+            for f, s, left in (fits[joint] for joint in joints)
+        ]
+        numbers = each[0] if len(each) == 1 else {"each": each}
+        told = {"about": what, "what": seen, "do": remedy, "joints": named, "numbers": numbers}
+        yield Doubt(level=level, **told, correction=correction)

@@ -25,7 +25,8 @@ from forcegp.cli.import_log import stance_text
 from forcegp.cli.log_options import ColumnOptions, FilterOptions, with_delay_that_shows
 from forcegp.cli.payload import DRY, LAWS, payload_dict, with_payload
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
-from forcegp.cli.terminal import Terminal, facts, findings_table
+from forcegp.cli.terminal import Terminal, doubts_table, facts
+from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 from forcegp.scores.tables import number
 
@@ -89,7 +90,7 @@ class Auto(Command):
         dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
         corrected = self._command(mapping)
         if mistakes and not self.correct:
-            terminal.show(findings_table(mistakes, terminal.worded), "Run:")
+            terminal.show(doubts_table(Doubts(mistakes), terminal.worded), "Run:")
             terminal.command(corrected)
             raise DatasetError(
                 f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
@@ -97,12 +98,11 @@ class Auto(Command):
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
-        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
-        if wrong and not self.accept:
-            terminal.show(findings_table(wrong, terminal.worded))
+        bad = report.doubts.at("wrong")
+        if bad and not self.accept:
+            terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(
-                f"something is wrong with the log ({', '.join(each.subject for each in wrong)}); correct it, or "
-                "add --accept to continue."
+                f"something is wrong with the log ({bad.subjects}); correct it, or add --accept to continue."
             )
         self.out.mkdir(parents=True, exist_ok=True)
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
@@ -133,7 +133,7 @@ class Auto(Command):
             "out": str(self.out),
             "seconds": sum(each["seconds"] for each in done["recordings"]),
             "import": done,
-            "mistakes": [finding.to_dict() for finding in mistakes],
+            "mistakes": [doubt.to_dict() for doubt in mistakes],
             "check": report.to_dict(),
             "preparation": settings,
             "payload": None if payload is None else payload_dict(payload, False),
@@ -154,9 +154,9 @@ class Auto(Command):
 
     def _imported(
         self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping
-    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[forcegp.checks.Finding]]:
+    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[Doubt]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
-        mistakes: list[forcegp.checks.Finding] = []
+        mistakes: list[Doubt] = []
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress:
@@ -164,15 +164,8 @@ class Auto(Command):
                     dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
-                mistakes.append(
-                    forcegp.checks.Finding(
-                        severity="wrong",
-                        subject=f"unit of {error.quantity}",
-                        seen=str(error).partition(" Is ")[0],
-                        remedy=f"forcegp import {forcegp.checks.import_flags(correction)}",
-                        correction=correction,
-                    )
-                )
+                what = str(error).partition(" Is ")[0]
+                mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction=correction))
                 mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
                 continue
             done = dict(dataset.metadata["import"])
@@ -181,7 +174,7 @@ class Auto(Command):
                     dataset = forcegp.data.estimate_stance(dataset).filled(dataset)
                 except DatasetError as error:  # of a mistake, perhaps
                     undecided = error
-            found = [finding for finding in forcegp.checks.quick_check(dataset) if finding.correction]
+            found = [doubt for doubt in forcegp.checks.quick_check(dataset) if doubt.correction]
             if not found and undecided is not None:
                 raise undecided
             if not found:
@@ -203,20 +196,19 @@ class Auto(Command):
         """Rows to learn from, the same at the full rate, and what was done."""
         first = replace(wanted, every=1, stance="log")
         try:
-            chosen = first.apply(raw)
+            numbers = first.resolved(raw)
         except DatasetError as error:
             if self.filter.lag != "auto" or wanted.lag != "auto":
                 raise
             terminal.note(f"rotors are taken to follow at once: {error}")
-            chosen = replace(first, lag=0.0).apply(raw)
-        numbers = chosen.preparation
+            numbers = replace(first, lag=0.0).resolved(raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         numbers = replace(numbers, trim=max(self.filter.trim, period), stance=wanted.stance)
         every = numbers.thinning(raw) if self.filter.every is None else wanted.every
         rows = replace(numbers, every=every).apply(raw)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
-            rows.dataset.save(temporary)
-        return rows.dataset, numbers.apply(raw).dataset, {**rows.report, "why": chosen.report["why"]}
+            rows.save(temporary)
+        return rows, numbers.apply(raw), dict(rows.metadata["preparation"])
 
     def _scored(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model
@@ -322,7 +314,7 @@ def answer_lines(
     seconds = content["seconds"]
     rate = (len(dataset) - len(dataset.episodes)) / seconds
     # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
-    flags = ((forcegp.checks.import_flags(each["correction"]), each["subject"]) for each in content["mistakes"])
+    flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late = prepared["delay"][0]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"

@@ -15,7 +15,7 @@ from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Command, unless_given
 from forcegp.cli.log_options import CutoffOptions
 from forcegp.cli.robot_options import RobotOptions
-from forcegp.cli.terminal import Terminal, columns, findings_table, shown
+from forcegp.cli.terminal import Terminal, columns, doubts_table, shown
 from forcegp.errors import DatasetError
 
 
@@ -23,7 +23,7 @@ from forcegp.errors import DatasetError
 class Check(Command):
     """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
 
-    Each finding is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
+    Each doubt is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
 
     For example:
       forcegp check log.h5 --robot arm.urdf
@@ -33,7 +33,7 @@ class Check(Command):
     log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The dataset to check (HDF5)."""
     out: Annotated[Path | None, unless_given("FOLDER", "no plots", Path)] = None
-    """Also draw torques and spectra into this folder, with the findings as check.json."""
+    """Also draw torques and spectra into this folder, with the doubts as check.json."""
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
     robot: RobotOptions = RobotOptions()
@@ -54,25 +54,24 @@ class Check(Command):
                 write_json(folder / "check.json", content)
             terminal.note(f"plots: {self.out}")
         terminal.show(*_shown(terminal, self.log, report))
-        wrong = [finding for finding in report.findings if finding.severity == "wrong"]
+        wrong = report.doubts.at("wrong")
         if self.strict and wrong:
-            what = ", ".join(dict.fromkeys(finding.subject for finding in wrong))
             raise DatasetError(
-                f"{self.log}: {len(wrong)} findings are wrong ({what}); without --strict this is no error."
+                f"{self.log}: {len(wrong)} things are wrong ({wrong.subjects}); without --strict this is no error."
             )
         return content
 
 
 def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
-    """One paragraph per finding, worst first, and the numbers of every joint."""
+    """One paragraph per doubt, worst first, and the numbers of every joint."""
     from rich.text import Text
 
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
-    findings = findings_table(report.findings, terminal.worded)
+    doubts = doubts_table(report.doubts, terminal.worded)
     measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
-    return [heading, findings, _numbers(report, content)] if measured else [heading, findings]
+    return [heading, doubts, _numbers(report, content)] if measured else [heading, doubts]
 
 
 def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:

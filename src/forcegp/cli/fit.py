@@ -6,7 +6,7 @@ import math
 import shlex
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,16 +33,23 @@ from forcegp.cli.command import (
     unless_given,
     values_of,
 )
-from forcegp.cli.robot_options import CONTACTS, SYSTEM_FILE, RobotOptions, SearchOptions, forces_of, parse_contacts
+from forcegp.cli.robot_options import (
+    CONTACTS,
+    SYSTEM_FILE,
+    RobotOptions,
+    SearchOptions,
+    forces_of,
+    identified_system,
+    parse_contacts,
+)
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
+from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
 NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
 HARDLY_ANY = 0.2
 """Share below which something is wrong with the contact, rather than the tool in the air."""
-MOST = 3
-"""Findings whose text is shown; the others by their subject."""
 USUAL_FORCES = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic"
 LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torques:both"
 
@@ -147,7 +154,7 @@ class Fit(Command):
         for note in [*forces_of(given), *notes, *found]:
             terminal.note(note)
         for doubt in forcegp.scores.unfinished_search(posterior):
-            terminal.warn(doubt)
+            terminal.warn(str(doubt))
         terminal.show(*tables)
         return {"run": str(self.out), "data": str(self.log), **summary, "settings": dict(posterior.settings)}
 
@@ -180,10 +187,11 @@ class Fit(Command):
             looked_at = (replace(dataset, model=None), None) if without else (dataset, model)
             found = forcegp.checks.quick_check(*looked_at)
             of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
-            used = [each for each in found if each.subject not in of_accelerations]
+            used = Doubts(each for each in found if each.about not in of_accelerations)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
                 see = f"See {shlex.join(['forcegp', 'check', str(self.log), *self.words(*options_of(RobotOptions))])}"
-                terminal.warn(findings_in_one_line(used, used[0].remedy.rstrip(".") if self.contact else see))
+                see = used[0].advice.rstrip(".") if self.contact else see
+                terminal.warn(f"{used.in_one_line()}. {see} (--no-checks does not look)")
         warnings.simplefilter("ignore", ContactWarning)
 
     def _rows(self, dataset: forcegp.Dataset, model: forcegp.Model) -> tuple[forcegp.Dataset, str | None]:
@@ -226,9 +234,7 @@ class Fit(Command):
 
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
     """The numbers that were found, and robot and known forces with them: for --identified, and as a URDF."""
-    estimates, known = posterior.estimates, posterior.model.known
-    unloaded = tuple(law for law in known.laws if not isinstance(law, forcegp.Payload))
-    known = replace(known, robot=known.loaded_robot, forces=unloaded)
+    estimates, known = posterior.estimates, identified_system(posterior.model)
     write_json(folder / "estimates.json", estimates.to_dict())
     write_text(folder / SYSTEM_FILE, known.to_json() + "\n")
     if estimates.by_body:  # a URDF has no place for intervals
@@ -236,14 +242,6 @@ def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> N
         note = f"of each body's ten inertial directions the log holds nothing of: {held}"
         known = known.with_robot(known.robot.with_note(note))
     known.to_urdf(folder / f"{name}.urdf")
-
-
-def findings_in_one_line(findings: Sequence[forcegp.checks.Finding], following: str) -> str:
-    """The worst findings, the subjects of the others, and what to do next."""
-    shown = [f"{each.subject}: {each.seen.rstrip('.')}" for each in findings[:MOST]]
-    more = dict.fromkeys(each.subject for each in findings[MOST:])
-    others = [f"further {', '.join(more)}"] if more else []
-    return f"{'; '.join([*shown, *others])}. {following} (--no-checks does not look)"
 
 
 def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> dict[str, Any]:

@@ -74,8 +74,8 @@ class Import(Command):
         if not preparation.changes_nothing:
             with terminal.progress("preparing"):
                 prepared = preparation.apply(raw)
-            dataset = prepared.dataset
-            done |= {"rows": len(dataset), "preparation": prepared.report}
+            dataset = prepared
+            done |= {"rows": len(dataset), "preparation": prepared.metadata["preparation"]}
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:
             dataset.save(temporary)
             if self.write_mapping is not None and mapping is not None:
@@ -139,15 +139,15 @@ def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:
     return f"{out}: rows: {done['rows']}, episodes: {len(done['episodes'])} ({seconds:.4g} s); {how}"
 
 
-def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.data.Prepared) -> Any:
+def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.Dataset) -> Any:
     """What was done, and the noise of every joint before and after; what the filter removed is in the report."""
-    report = prepared.report
+    report = prepared.metadata["preparation"]
     before, after = report["rows"]
     values = {"rows": f"{before} -> {after}"}
     if "sample_rate" in report:
         values["sample rate"] = " -> ".join(f"{rate:.4g} Hz" for rate in report["sample_rate"])
     cutoff = report["cutoff"]
-    filtered = "none" if cutoff is None else f"{cutoff:.3g} Hz, order {report['order']}, forwards and backwards"
+    filtered = "none" if cutoff is None else f"{cutoff:.3g} Hz, order 4, forwards and backwards"
     values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
     for name in ("delay", "lag"):
         seconds, why = report[name], report["why"].get(name)

@@ -61,7 +61,7 @@ class Monitor(Command):
         self.require_free(self.out)
         posterior = forcegp.load_posterior(self.model)
         log = _dataset(self.log, posterior)
-        dt = forcegp.data.filtering.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
+        dt = forcegp.data.filters.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
         motions = list(_motions(log, self.log, dt))
         if other is not None:
             known = [each[1:] for each in _motions(_dataset(other, posterior), other, dt)]
@@ -115,7 +115,7 @@ def _motions(dataset: forcegp.Dataset, path: Path, dt: float) -> Iterator[tuple[
     """time, q, v and u of every episode. Raises InvalidInput for other time steps."""
     for number in dataset.episodes:
         at = dataset.episode == number
-        step = forcegp.data.filtering.uniform_step(dataset.time[at], f"episode {number} of {path}")
+        step = forcegp.data.filters.uniform_step(dataset.time[at], f"episode {number} of {path}")
         if abs(step - dt) > 0.01 * dt:
             raise InvalidInput(
                 f"{path} has steps of {step:.4g} s and the log of {dt:.4g} s; import both at one --rate."

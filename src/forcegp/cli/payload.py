@@ -91,9 +91,9 @@ class Payload(Command):
         with terminal.progress(f"preparing {path}"):
             raw = replace(dataset, model=model)
             prepared = with_delay_that_shows(terminal, self.filter.preparation(), raw).apply(raw)
-        why = prepared.report["why"]
+        why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
-        return model, prepared.dataset
+        return model, prepared
 
 
 def with_payload(

@@ -133,6 +133,10 @@ class RobotOptions(RobotFileOptions):
         path = place / SYSTEM_FILE if place.is_dir() else place
         if (place / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
             require_unchanged(place, "fit again")
+        if path != place and not path.exists() and (place / "model.json").exists():
+            from forcegp.posterior import load_posterior  # that of `save_posterior`
+
+            return identified_system(load_posterior(place).model)
         if path.is_fifo():  # to open it would wait for a writer for ever
             raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp fit` wrote.")
         try:
@@ -142,6 +146,13 @@ class RobotOptions(RobotFileOptions):
                 f"{path}: cannot be read ({error}); give a folder that `forcegp fit` wrote."
             ) from None
         return forcegp.Model.from_json(text)
+
+
+def identified_system(model: forcegp.Model) -> forcegp.Model:
+    """What a fit knows of robot and laws, without what the robot carried."""
+    known = model.known
+    unloaded = tuple(law for law in known.laws if not isinstance(law, forcegp.Payload))
+    return replace(known, robot=known.loaded_robot, forces=unloaded)
 
 
 def forces_of(model: forcegp.Model) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.data
 import forcegp.posterior
 import forcegp.report
 import forcegp.scores
@@ -183,11 +183,11 @@ class Score(Command):
         preparation = preparation.resolved(raw)
         if self.filter.every is None:
             preparation = replace(preparation, every=preparation.thinning(raw))
-        rows = preparation.apply(raw).dataset
-        recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw).dataset
+        rows = preparation.apply(raw)
+        recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw)
         if preparation.cutoff is not None and (self.split or "auto").startswith(("blocks", "auto")):
             # a filter mixes what lies on both sides of a border
-            memory = 1.0 / (math.pi * float(preparation.cutoff) * math.sin(0.5 * math.pi / preparation.order))
+            memory = 2.0 * forcegp.data.LowPass(float(preparation.cutoff)).time_constant
             if self.guard < memory:
                 terminal.warn(
                     f"--guard {self.guard:g} s is shorter than two time constants of the filter ({memory:.2g} s), so "

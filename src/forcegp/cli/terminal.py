@@ -13,12 +13,11 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import forcegp
-import forcegp.checks
-
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.table import Table
+
+    from forcegp.doubts import Doubts
 
 _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
@@ -200,7 +199,7 @@ NONE = "–"
 
 
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
-"""Of findings by their severity."""
+"""Of doubts by their level."""
 PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
@@ -249,19 +248,19 @@ def columns(
     return table
 
 
-def findings_table(findings: Sequence[forcegp.checks.Finding], worded: Callable[[str], str]) -> Table:
-    """One paragraph per finding: how bad it is, what was seen, and below it what to do, `worded` for the command."""
+def doubts_table(doubts: Doubts, worded: Callable[[str], str]) -> Table:
+    """One paragraph per doubt: how bad it is, what was seen, and below it what to do, `worded` for the command."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table.grid(padding=(0, 1))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for finding in findings:
-        text = Text(f"{finding.subject}: ", style="bold").append(worded(finding.seen), style="not bold")
-        table.add_row(Text(finding.severity, style=COLORS[finding.severity]), text)
-        if finding.remedy:
-            table.add_row("", Text(f"→ {worded(finding.remedy)}", style="dim"))
+    for doubt in doubts:
+        text = Text(f"{doubt.about}: ", style="bold").append(worded(doubt.what), style="not bold")
+        table.add_row(Text(doubt.level, style=COLORS[doubt.level]), text)
+        if doubt.advice:
+            table.add_row("", Text(f"→ {worded(doubt.advice)}", style="dim"))
     return table
 
 

@@ -24,7 +24,7 @@ from forcegp.atomic_files import atomic_file
 from forcegp.control.tracking import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
-from forcegp.data.row_selection import farthest_point_sampling
+from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.evidence.identifiability import base_parameters, torque_regressor
 from forcegp.inference.cholesky_update import with_only

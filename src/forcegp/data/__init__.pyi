@@ -1,23 +1,25 @@
-from .row_selection import (
-    time_blocks as time_blocks, farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
-    repeated_rows as repeated_rows, require_disjoint as require_disjoint,
-)
-from .contact_evidence import (
-    contact_rows as contact_rows, rows_in_contact as rows_in_contact, contact_doubts as contact_doubts,
+from .contacts import (
+    contact_doubts as contact_doubts, contact_rows as contact_rows, rows_in_contact as rows_in_contact,
 )
 from .dataset import Dataset as Dataset
-from .memory import with_memory as with_memory
-from .delay import Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints
-from .filtering import (
-    differentiate as differentiate, differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass
-    as low_pass, low_pass_gain as low_pass_gain, resample as resample, uniform_step as uniform_step, zero_phase_low_pass
-    as zero_phase_low_pass,
-)
 from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
+from .delay import (
+    Delay as Delay, estimate_delay as estimate_delay, estimate_thruster_lag as estimate_thruster_lag,
+    thruster_columns as thruster_columns, torques_of_joints as torques_of_joints,
+)
+from .filters import (
+    Filter as Filter, Lag as Lag, Later as Later, LowPass as LowPass, Mean as Mean, differentiate as differentiate,
+    differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass as low_pass,
+    resample as resample, uniform_step as uniform_step,
+)
 from .hdf5 import is_dataset as is_dataset
-from .motion_records import RecordedMotions as RecordedMotions, recorded_motions as recorded_motions
-from .preparation import Preparation as Preparation, Prepared as Prepared, preparation_report as preparation_report
+from .preparation import Preparation as Preparation, preparation_report as preparation_report
 from .spectrum import MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum
 from .stance import Stance as Stance, estimate_stance as estimate_stance
-from .thruster_lag import estimate_thruster_lag as estimate_thruster_lag, thruster_columns as thruster_columns
+from .views import (
+    RecordedMotions as RecordedMotions, Select as Select, evenly as evenly, farthest as farthest,
+    farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
+    recorded_motions as recorded_motions, repeated_rows as repeated_rows, require_disjoint as require_disjoint,
+    time_blocks as time_blocks, with_memory as with_memory,
+)
 from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind

@@ -17,10 +17,8 @@ from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError
 from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 
-LEAST_LENGTH = 0.7
-"""Of a filtered quaternion: below it the turn is faster than what the filter passes."""
-LARGEST_TURN = 0.5 * np.pi
-"""Between two rows: beyond it the log does not show which way a body has turned."""
+LEAST_LENGTH = 0.7  # of a filtered quaternion: below it the turn is faster than what the filter passes
+LARGEST_TURN = 0.5 * np.pi  # between two rows: beyond it the log does not show which way a body has turned
 
 Positions = Float[np.ndarray, "rows nq"]
 

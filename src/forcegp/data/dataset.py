@@ -23,13 +23,7 @@ from forcegp.data.dataset_fields import (
     validated_units,
 )
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.errors import (
-    DatasetError,
-    FileFormatError,
-    InvalidInput,
-    require_type,
-    usable_arguments,
-)
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
 from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
@@ -240,10 +234,7 @@ def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.nda
 
 
 def _truth(
-    given: Mapping[str, object],
-    joint_names: tuple[str, ...],
-    rows: int,
-    model: forcegp.model.Model | None,
+    given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model | None
 ) -> FrozenDict:
     def known(name: str) -> bool:  # or `Q_U.tool`, `force.tool-friction`, with a name that a file can carry
         ends = (name[len(kind) :] for kind in TRUTH_KINDS if name.startswith(kind))
@@ -278,43 +269,36 @@ def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:
 
 
 def _check_time(time: np.ndarray, episode: np.ndarray, ordered: bool) -> None:
-    if ordered:
-        row = _first_disorder(time, episode)
-        if row is not None:
-            raise DatasetError(
-                f"time does not increase at row {row} (episode {episode[row]}, time {time[row]} s). "
-                "Sort the rows, drop repeated time stamps, or number a new recording as a new episode."
-            )
-        return
-    order = np.lexsort((time, episode))
+    order = np.arange(len(time)) if ordered else np.lexsort((time, episode))
     row = _first_disorder(time[order], episode[order])
-    if row is not None:
-        raise DatasetError(
-            f"time {time[order][row]} s occurs twice in episode {episode[order][row]}; drop the repeated rows."
-        )
+    if row is None:
+        return
+    at, number = time[order][row], episode[order][row]
+    if not ordered:
+        raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
+    raise DatasetError(
+        f"time does not increase at row {row} (episode {number}, time {at} s). "
+        "Sort the rows, drop repeated time stamps, or number a new recording as a new episode."
+    )
 
 
 def _row_numbers(index: slice | Sequence[int] | np.ndarray, rows: int) -> np.ndarray:
-    if isinstance(index, slice):
-        chosen = np.arange(rows)[index]
-    else:
-        given = np.asarray(index)
-        if given.dtype == bool and given.shape == (rows,):
-            chosen = np.flatnonzero(given)
-        elif given.ndim == 1 and (given.dtype.kind in "iu" or given.size == 0):
-            wrong = given[(given < -rows) | (given >= rows)]
-            if wrong.size:
-                raise InvalidInput(f"row {wrong[0]} does not exist; this Dataset has {rows} rows, 0 to {rows - 1}.")
-            chosen = given.astype(np.intp) % rows
-        else:
-            raise InvalidInput(
-                f"rows are chosen by a slice, {rows} booleans or a list of integers; "
-                f"given: {given.dtype} of shape {given.shape}."
-            )
-    if chosen.size == 0:
+    given = np.arange(rows)[index] if isinstance(index, slice) else np.asarray(index)
+    if given.dtype == bool and given.shape == (rows,):
+        given = np.flatnonzero(given)
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+        raise InvalidInput(
+            f"rows are chosen by a slice, {rows} booleans or a list of integers; "
+            f"given: {given.dtype} of shape {given.shape}."
+        )
+    if given.size == 0:
         raise InvalidInput("no rows selected; a Dataset has at least one row.")
-    if np.unique(chosen).size != chosen.size:
-        values, counts = np.unique(chosen, return_counts=True)
+    wrong = given[(given < -rows) | (given >= rows)]
+    if wrong.size:
+        raise InvalidInput(f"row {wrong[0]} does not exist; this Dataset has {rows} rows, 0 to {rows - 1}.")
+    chosen = given.astype(np.intp) % rows
+    values, counts = np.unique(chosen, return_counts=True)
+    if counts.max() > 1:
         raise InvalidInput(f"row {values[counts > 1][0]} is selected more than once; select each row once.")
     return chosen
 

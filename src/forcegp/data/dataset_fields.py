@@ -33,32 +33,21 @@ class FrozenDict(dict[str, Any]):
 def frozen_json(metadata: Mapping[str, Any]) -> FrozenDict:
     """A mapping frozen at every level (lists become tuples). Raises DatasetError for what JSON does not have."""
     try:
-        _require_text_keys(metadata)
-        plain = json.loads(json.dumps(metadata, allow_nan=False))
+        frozen = _freeze(json.loads(json.dumps(metadata, allow_nan=False)))
+        if frozen != _freeze(metadata):  # json.dumps turns the key 1 into "1" without a word
+            raise TypeError("a key is not text")
     except (TypeError, ValueError) as error:
         raise DatasetError(
             f"metadata cannot be written as JSON: {error}. "
             "Allowed: text, finite numbers, True, False, None, and lists or mappings of them."
         ) from error
-    return _freeze(plain)
-
-
-def _require_text_keys(value: object) -> None:
-    """json.dumps turns the key 1 into "1" without a word; the file would then differ from what was given."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            if not isinstance(key, str):
-                raise TypeError(f"key {key!r} is not text")
-            _require_text_keys(item)
-    elif isinstance(value, list | tuple):
-        for item in value:
-            _require_text_keys(item)
+    return frozen
 
 
 def _freeze(value: Any) -> Any:
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return FrozenDict({key: _freeze(item) for key, item in value.items()})
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return tuple(_freeze(item) for item in value)
     return value
 
@@ -107,14 +96,9 @@ def _read_only(values: np.ndarray) -> np.ndarray:
     return values
 
 
-ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}
-"""Units of a revolute or continuous joint."""
-
-TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}
-"""Units of a prismatic joint."""
-
-REVOLUTE_UNITS = FrozenDict({**ROTATION, "time": "s"})
-"""Units of a robot whose joints all rotate."""
+ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a revolute or continuous joint
+TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # units of a prismatic joint
+REVOLUTE_UNITS = FrozenDict({**ROTATION, "time": "s"})  # units of a robot whose joints all rotate
 
 
 def units_for(robot: forcegp.robots.Robot) -> FrozenDict:

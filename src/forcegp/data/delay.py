@@ -1,37 +1,35 @@
-"""How late torques are: logged later than they act (a delay), or acting later than they are commanded (a lag).
+"""How late forces are: torques that are logged later than they act (a delay), thrusters that act later (a lag).
 
-Of both, the number of seconds is taken at which inverse dynamics fits the torques best.
+Of both, the number of seconds is taken at which inverse dynamics fits best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+import forcegp.forces
 import forcegp.robots
 from forcegp.data.dataset import Dataset, require_rows
-from forcegp.data.filtering import episodes_in_order
+from forcegp.data.filters import Lag, episodes_in_order
+from forcegp.data.views import in_blocks
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.forces.columns import law_columns, usual_columns
+from forcegp.robots.manifold import Group
 
 LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s
-STEPS = 100
-"""Shifts that are tried to either side."""
-
+STEPS = 100  # shifts that are tried to either side
 BLOCKS = 8
 TINY = 1e-12
 MOST_ROWS = 5_000
-SIGNIFICANT = 3.0
-"""Standard deviations by which a delay must differ from zero to be used."""
-
-FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0
-"""Of dry friction, relative to the root mean square velocity."""
-
+SIGNIFICANT = 3.0  # standard deviations by which a delay must differ from zero to be used
+FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0  # of dry friction, relative to the root mean square velocity
 ROWS_PER_PARAMETER = 3
 
 WORTH = 0.98
@@ -40,13 +38,11 @@ WORTH = 0.98
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delay:
-    """Delay or lag of the torque and the motion [s], with standard deviations [s]; NaN where the log shows none.
+    """Delay of the torque behind the motion [s], with standard deviations [s]; NaN where the log shows none.
 
-    `kind` is "delay" or "lag".
     `common` is the one delay that suits all joints best: what a bus or a filter does to all of them alike. `seconds`
     (nv,) is that of each joint alone; where friction makes up most of a torque it can be a property of the friction.
-    `residual` (2, nv) is the share of the torque's variance that inverse dynamics leaves unexplained, without a shift
-    and at the joint's own best one; `remains` what the common delay leaves of what was unexplained, as the geometric
+    `remains` is what the common delay leaves of what was unexplained, as the geometric
     mean over the joints.
     """
 
@@ -54,9 +50,7 @@ class Delay:
     common_std: float
     seconds: Float[np.ndarray, " nv"]
     std: Float[np.ndarray, " nv"]
-    residual: Float[np.ndarray, "2 nv"]
     remains: float
-    kind: str = "delay"
 
     def _showing(self, seconds: float) -> np.ndarray:
         """Delays of the joints that show this one, to within three standard deviations or a half of it."""
@@ -85,7 +79,7 @@ class Delay:
     def reason(self) -> str:
         """The common delay and what became of it, for people."""
         if not np.isfinite(self.common):
-            return f"the torques show no common {self.kind}"
+            return "the torques show no common delay"
         size, used = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms", self.significant
         if used == self.common:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
@@ -96,12 +90,7 @@ class Delay:
         return f"{size}, but not more than three standard deviations in most joints: none is assumed"
 
 
-def estimate_delay(
-    dataset: Dataset,
-    robot: forcegp.robots.Robot | None = None,
-    *,
-    kind: Literal["delay", "lag"] = "delay",
-) -> Delay:
+def estimate_delay(dataset: Dataset, robot: forcegp.robots.Robot | None = None) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to .2 s to either side, u is fitted by least squares to what rigid bodies with friction
@@ -114,57 +103,58 @@ def estimate_delay(
     out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and the bootstrap for general
     stationary observations").
 
-    `kind="lag"` finds the time constant T of an actuator of first order instead: u(t) acts with T u_a' + u_a = u.
-
     Filter first: q, v, u and a must be those of one filter. Raises InvalidInput without a robot, or with contacts,
     whose forces are not known; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
-    near = _estimated(dataset, robot, USUAL_DELAY, kind)
-    open_ones = np.isnan(near.seconds) & np.isfinite(near.residual[0])
+    near = _estimated(dataset, robot, USUAL_DELAY)
+    open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
     if not (open_ones.any() or at_end):
         return near
     try:
-        far = _estimated(dataset, robot, LARGEST_DELAY, kind)
+        far = _estimated(dataset, robot, LARGEST_DELAY)
     except DatasetError:  # too short for that
         return near
     if at_end:
         return far
-    parts = {
-        name: np.where(open_ones, getattr(far, name), getattr(near, name)) for name in ("seconds", "std", "residual")
-    }
+    parts = {name: np.where(open_ones, getattr(far, name), getattr(near, name)) for name in ("seconds", "std")}
     return replace(near, **parts)
 
 
-def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float, kind: str) -> Delay:
-    parts = _Shifts(dataset, largest, kind)
-    zero = int(np.argmin(np.abs(parts.shifts)))
-    features = torque_columns(robot, dataset.rows(parts.rows))
-    nv = dataset.nv
-    profiles = np.full((nv, BLOCKS + 1, len(parts.shifts)), np.nan)  # of all rows, and of all but one block
-    residual = np.full((2, nv), np.nan)
-    for joint in range(nv):
-        shifted = parts.torque(dataset.u[:, joint])  # (shifts, rows)
+def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -> Delay:
+    thin, shifts = max(1, -(-len(dataset) // MOST_ROWS)), np.linspace(-largest, largest, 2 * STEPS + 1)
+    episodes = []
+    for number, part, _ in episodes_in_order(dataset):
+        inner = (part.time >= part.time[0] + largest) & (part.time <= part.time[-1] - largest)
+        own = np.flatnonzero(dataset.episode == number)
+        episodes.append((own, own[inner][::thin]))
+    compared = np.concatenate([inner for _, inner in episodes])
+    if len(compared) < 10 * BLOCKS:
+        raise DatasetError(
+            f"{len(compared)} rows lie more than {largest} s from the ends of their episodes; a delay needs at "
+            f"least {10 * BLOCKS}. Record longer, or give the delay in s."
+        )
+    features = torque_columns(robot, dataset.rows(compared))
+    profiles = np.full((dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
+    for joint in range(dataset.nv):
+        splines = [(CubicSpline(dataset.time[own], dataset.u[own, joint]), dataset.time[at]) for own, at in episodes]
+        shifted = np.concatenate([spline(at + shifts[:, None]) for spline, at in splines], axis=1)
         spread = np.square(shifted - shifted.mean(axis=1, keepdims=True)).sum(axis=1)
-        if not spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():
-            continue  # a torque that does not change has no delay
-        profiles[joint] = least_squares(_orthonormal(features[joint]), shifted.T)
-        residual[:, joint] = profiles[joint, 0, zero] / spread[zero], profiles[joint, 0].min() / spread[zero]
-    seconds = np.array([[lowest(profile, parts.shifts) for profile in own] for own in profiles])
+        if spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():  # else it has no delay
+            profiles[joint] = least_squares(_orthonormal(features[joint]), shifted.T)
+    seconds = np.array([[lowest(profile, shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
-    finite = profiles[np.isfinite(residual[0])]
+    finite = profiles[np.isfinite(profiles[:, 0, 0])]
     likelihoods = np.log(finite + TINY * finite.max(initial=0.0)).sum(axis=0)
-    common = np.array([lowest(profile, parts.shifts) for profile in likelihoods])
-    likelihood = likelihoods[0]
+    common = np.array([lowest(profile, shifts) for profile in likelihoods])
+    gained = likelihoods[0].min() - likelihoods[0, STEPS]
     return Delay(
         common=float(common[0]),
         common_std=float(jackknife(common[None, 1:])[0]),
         seconds=seconds[:, 0],
         std=jackknife(seconds[:, 1:]),
-        residual=residual,
-        remains=float(np.exp((likelihood.min() - likelihood[zero]) / max(len(finite), 1))),
-        kind=kind,
+        remains=float(np.exp(gained / max(len(finite), 1))),
     )
 
 
@@ -188,75 +178,8 @@ def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
     return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
 
 
-def delayed(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"], seconds: float) -> np.ndarray:
-    """`values` at `time + seconds`, by a cubic spline; the values at the ends hold beyond them."""
-    if seconds == 0.0:
-        return values
-    return CubicSpline(time, values)(np.clip(time + seconds, time[0], time[-1]))
-
-
-def lagged(values: Float[np.ndarray, " rows"], time: Float[np.ndarray, " rows"], seconds: float) -> np.ndarray:
-    """What an actuator of first order with that time constant makes of `values`, at rest with the first of them.
-
-    By Tustin's rule (trapezoids), exact for values that are linear between equal steps of time up to the square of
-    step over time constant.
-    """
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if seconds <= 0.25 * step:
-        return values
-    ratio = 2.0 * seconds / step
-    moved = lfilter([1.0, 1.0], [1.0 + ratio, 1.0 - ratio], values - values[0])
-    return np.asarray(moved) + values[0]
-
-
-def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
-    """The dataset with each actuator's force taken so many seconds later, after a lag [s] where one is given."""
-    u = dataset.u.copy()
-    for number, rows, _ in episodes_in_order(dataset):
-        for joint, shift in enumerate(seconds):
-            acting = lagged(rows.u[:, joint], rows.time, lags[joint] if len(lags) else 0.0)
-            u[dataset.episode == number, joint] = delayed(acting, rows.time, shift)
-    return replace(dataset, u=u, truth={})
-
-
-class _Shifts:
-    """The rows that are compared, and how to shift a torque against them."""
-
-    def __init__(self, dataset: Dataset, largest: float, kind: str) -> None:
-        thin = max(1, -(-len(dataset) // MOST_ROWS))
-        rows, self.episodes = [np.zeros(0, int)], []
-        for number, part, _ in episodes_in_order(dataset):
-            own = np.flatnonzero(dataset.episode == number)
-            inner = (part.time >= part.time[0] + largest) & (part.time <= part.time[-1] - largest)
-            rows.append(own[inner][::thin])
-            self.episodes.append((own, part.time, dataset.time[rows[-1]]))
-        self.rows = np.concatenate(rows)
-        if len(self.rows) < 10 * BLOCKS:
-            raise DatasetError(
-                f"{len(self.rows)} rows lie more than {largest} s from the ends of their episodes; a delay needs at "
-                f"least {10 * BLOCKS}. Record longer, or give the delay in s."
-            )
-        first, count = (0.0, STEPS + 1) if kind == "lag" else (-largest, 2 * STEPS + 1)
-        self.kind, self.shifts = kind, np.linspace(first, largest, count)
-
-    def torque(self, u: np.ndarray) -> np.ndarray:
-        """(shifts, rows) torque at the rows' times plus each shift, or after each lag."""
-        parts = []
-        for own, time, at in self.episodes:
-            if self.kind == "lag":
-                rows = np.searchsorted(time, at)
-                parts.append(np.stack([lagged(u[own], time, lag)[rows] for lag in self.shifts]))
-            elif len(at):
-                parts.append(CubicSpline(time, u[own])(at + self.shifts[:, None]))
-        return np.concatenate(parts, axis=1)
-
-
 def torque_columns(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
     """What the torque of each joint may be made of, except for its parameters; with the laws of the dataset's model."""
-    import torch  # half a second, which only delays should cost
-
-    from forcegp.forces.columns import law_columns, usual_columns
-
     q, v, a = (torch.tensor(getattr(dataset, name), device=robot.device) for name in ("q", "v", "a"))
     with torch.no_grad():
         if len(dataset) > ROWS_PER_PARAMETER * 10 * robot.nv:
@@ -324,3 +247,107 @@ def torques_of_joints(dataset: Dataset) -> bool:
     """Whether u has one torque per degree of freedom."""
     model = dataset.model
     return model is None or (model.actuators == model.robot.joint_names and model.actuation.matrix is None)
+
+
+FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
+TRIED = np.linspace(0.0, 0.3, 31)  # s
+THRUST_SETTLED = 0.5  # s, of an episode, after which nothing depends on how it began
+
+
+def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
+    """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
+
+    For every T, the force that the base's acceleration needs is fitted by least squares to what thrusters, air and
+    joints can do: each thruster, its speed times the velocity (Mahony et al. 2012), velocity, its square, rates, their
+    products, attitude, thrust times velocity, and the torque regressor of bodies that joints move beside the base.
+    With such bodies only forces count, no torques: a load on an arm changes inertias far more than the mass, which
+    looked like a lag (72 ms of none). All columns lose their slow part first, for wind is slow and controllers answer
+    it, which made lags up to a third too short. The best T has the least sum of log residuals, by a parabola; its
+    deviation comes from leaving out each eighth of the time (block jackknife, as in `estimate_delay`), and from half a
+    step of time, by which a command that holds until the next row is later than one that does not. Raises InvalidInput
+    without `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag
+    below .3 s.
+    """
+    found = thruster_columns(dataset.model)
+    if dataset.model is None or not found:
+        raise InvalidInput("this lag is that of thrusters: give a model with Thrusters and base='floating'.")
+    columns, powers, group = list(found), np.array(list(found.values())), dataset.model.robot.layout.groups[0]
+    episodes = [
+        part for _, part, _ in episodes_in_order(dataset) if part.time[-1] - part.time[0] > 2.0 * THRUST_SETTLED
+    ]
+    if sum(map(len, episodes)) < 1000:
+        raise DatasetError(
+            "the recording is too short for the lag of thrusters; record 1,000 rows or more, or give the lag in s."
+        )
+    forces, moved = (
+        np.concatenate([_fast(values, part.time) for values, part in zip(each, episodes, strict=True)])
+        for each in zip(*(_base_forces(part, group) for part in episodes), strict=True)
+    )
+    misfits = []
+    for seconds in TRIED:
+        causes = [_causes(part, columns, powers, group, float(seconds)) for part in episodes]
+        X = np.concatenate([_fast(own, part.time) for own, part in zip(causes, episodes, strict=True)])
+        if moved.shape[1] == 0:
+            misfits.append(_misfits(X, forces))
+        else:  # each force has columns of its own
+            own = zip(np.split(moved, 3, axis=1), forces[:, :3].T, strict=True)
+            misfits.append(sum(_misfits(np.hstack([X, more]), force[:, None]) for more, force in own))
+    lags = np.array([lowest(profile, TRIED) if np.argmin(profile) else 0.0 for profile in np.array(misfits).T])
+    if not np.isfinite(lags).all():
+        raise DatasetError("the recording shows no lag of the thrusters below .3 s; give the lag in s, or 0.")
+    half = 0.5 * float(np.median(np.diff(episodes[0].time)))
+    return float(lags[0]), float(np.hypot(jackknife(lags[None, 1:])[0], half))
+
+
+def thruster_columns(model: forcegp.Model | None) -> dict[int, int]:
+    """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
+    groups = () if model is None else model.robot.layout.groups
+    if model is None or not groups or groups[0].kind != "floating":
+        return {}
+    matrix = model.actuation.matrix
+    pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))
+    kind = forcegp.forces.Thrusters
+    thrusters = [force for force in model.forces if isinstance(force, kind)]
+    named = {model.inputs.index(name): force.power for force in thrusters for name in force.names}
+    return {**{int(column): 1 for column in pushes}, **named}
+
+
+def _causes(
+    part: Dataset, columns: list[int], powers: np.ndarray, group: Group, seconds: float
+) -> Float[np.ndarray, "rows causes"]:
+    late = Lag(seconds)(part.u[:, columns], part.time)
+    thrust = np.where(powers == 2, late * np.abs(late), late)
+    v, w = part.v[:, group.rows][:, :3], part.v[:, group.rows][:, 3:]
+    axes = Rotation.from_quat(part.q[:, group.places][:, group.motion.turn]).as_matrix().reshape(-1, 9)
+    fast = np.linalg.norm(v, axis=1, keepdims=True)
+    spinning = np.where(powers == 2, late, np.sqrt(np.abs(late)))[..., None] * v[:, None]
+    turning = [np.cross(w, v), w[:, [1, 2, 0]] * w[:, [2, 0, 1]]]
+    parts = [thrust, thrust.sum(1, keepdims=True) * v, v, fast * v, w, *turning, axes, spinning.reshape(len(v), -1)]
+    return np.concatenate(parts, axis=1)
+
+
+def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:
+    """Forces (rows, 6) that accelerate the base, and for each of the first three k columns of bodies beside it."""
+    assert part.model is not None
+    robot = part.model.robot
+
+    def found(q: Tensor, v: Tensor, _: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        at = robot.kinematics(q, v)
+        base = at.mass_matrix()[:, group.rows, group.rows] @ a[:, group.rows, None]
+        a[:, group.rows] = 0.0  # what is fitted explains nothing
+        regressor = at.torque_regressor(a)[:, group.rows, group.bodies.stop :][:, :3]
+        return base[..., 0], regressor.flatten(1)
+
+    forces, moved = in_blocks(part, found, robot.device)
+    return forces, moved
+
+
+def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:
+    """Without what a low pass of first order leaves, where that has settled."""
+    return (values - Lag(FAST)(values, time))[time - time[0] > THRUST_SETTLED]
+
+
+def _misfits(X: Float[np.ndarray, "rows causes"], target: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " parts"]:
+    """Sums of log residuals of all rows, and without each block."""
+    left = least_squares(X / (np.linalg.norm(X, axis=0) + 1e-300), target)
+    return np.log(np.maximum(left, 1e-300)).sum(axis=1)

@@ -6,6 +6,7 @@ Nothing in the file is executed: numbers, texts and JSON only, no pickles, no li
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,7 @@ def read_fields(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path} is not a file; give the path of a dataset written by forcegp (.h5).")
     try:
         with h5py.File(path, "r") as file:
-            _check_header(path, file)
-            return _read(path, file)
+            return _Reader(path, file).fields()
     except FileFormatError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
@@ -83,93 +83,74 @@ def read_fields(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path} {kind}: {error}. Write it again, or convert the log to a Dataset.") from error
 
 
-def _check_header(path: Path, file: h5py.File) -> None:
-    kind = file.attrs.get("format")
-    if kind != FORMAT:
-        raise FileFormatError(
-            f"{path} is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
+@dataclass
+class _Reader:
+    path: Path
+    file: h5py.File
+
+    def require(self, fits: bool, problem: str) -> None:
+        if not fits:
+            raise FileFormatError(f"{self.path}{problem}")
+
+    def fields(self) -> dict[str, Any]:
+        file, required = self.file, (*COLUMNS, "joint_names", "metadata")
+        kind, version = file.attrs.get("format"), file.attrs.get("format_version")
+        ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
+        self.require(kind == FORMAT, f" {ours}")
+        self.require(
+            isinstance(version, int | np.integer) and version == VERSION,
+            f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}. Use what wrote it "
+            f"({file.attrs.get('written_by')!r}), or convert the log again.",
         )
-    version = file.attrs.get("format_version")
-    if not isinstance(version, int | np.integer) or version != VERSION:
-        raise FileFormatError(
-            f"{path} has format version {version!r}; this forcegp ({__version__}) reads {VERSION}. Use what wrote it "
-            f"({file.attrs.get('written_by')!r}), or convert the log again."
-        )
+        missing = [name for name in required if name not in file]
+        self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
+        values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}
+        values["units"] = {name: self.units(name) for name in ("q", "v", "u", "a", "time")}
+        values["joint_names"] = tuple(self.texts("joint_names"))
+        values["metadata"] = json.loads(self.text("metadata"))
+        self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
+        values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
+        truth = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
+        self.require("truth" not in file or isinstance(truth, h5py.Group), ": 'truth' must be a group in this file.")
+        names = list(truth) if isinstance(truth, h5py.Group) else []
+        values["truth"] = {name: self.array(f"truth/{name}") for name in names}
+        values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
+        values["model"] = None
+        if "model" in file:
+            try:
+                values["model"] = forcegp.Model.from_json(self.text("model"))
+            except ForceGPError as error:
+                raise FileFormatError(f"{self.path}: its robot or contacts cannot be used: {error}") from error
+        return values
 
+    def stored(self, name: str) -> h5py.Dataset:
+        """The HDF5 dataset of that name, which must lie inside this very file."""
+        found = self.file[name] if isinstance(self.file.get(name, getlink=True), h5py.HardLink) else None
+        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+            raise FileFormatError(
+                f"{self.path}: {name!r} must be a dataset stored in this file, not a group or a link elsewhere."
+            )
+        return found
 
-def _read(path: Path, file: h5py.File) -> dict[str, Any]:
-    required = (*COLUMNS, "joint_names", "metadata")
-    missing = [name for name in required if name not in file]
-    if missing:
-        raise FileFormatError(f"{path} has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
-    values: dict[str, Any] = {name: _array(path, file, name) for name in COLUMNS}
-    values["units"] = {name: _units(path, file, name) for name in ("q", "v", "u", "a", "time")}
-    values["joint_names"] = tuple(_texts(path, file, "joint_names"))
-    metadata = json.loads(_text(path, file, "metadata"))
-    if not isinstance(metadata, dict):
-        raise FileFormatError(f"{path}: 'metadata' must be a JSON object; it is {type(metadata).__name__}.")
-    values["metadata"] = metadata
-    values["noise_std"] = _array(path, file, "noise_std") if "noise_std" in file else None
-    values["truth"] = {name: _array(path, file, f"truth/{name}") for name in _truth_names(path, file)}
-    values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
-    values["model"] = _model(path, _text(path, file, "model")) if "model" in file else None
-    return values
+    def array(self, name: str) -> np.ndarray:
+        stored = self.stored(name)
+        self.require(stored.dtype.kind in "fiu", f": {name!r} must hold numbers; it holds {stored.dtype}.")
+        held = stored.size * stored.dtype.itemsize <= _LARGEST_COMPRESSION * stored.id.get_storage_size()
+        self.require(held, f": {name!r} claims the shape {stored.shape}, but the file does not hold that much.")
+        return stored[()]
 
+    def texts(self, name: str) -> list[str]:
+        stored = self.stored(name)
+        text = h5py.check_string_dtype(stored.dtype) is not None
+        self.require(text, f": {name!r} must hold text; it holds {stored.dtype}.")
+        return np.atleast_1d(stored.asstr()[()]).ravel().tolist()
 
-def _truth_names(path: Path, file: h5py.File) -> list[str]:
-    if "truth" not in file:
-        return []
-    group = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
-    if not isinstance(group, h5py.Group):
-        raise FileFormatError(f"{path}: 'truth' must be a group in this file.")
-    return list(group)
+    def text(self, name: str) -> str:
+        texts = self.texts(name)
+        self.require(len(texts) == 1, f": {name!r} must hold one text; it holds {len(texts)}.")
+        return texts[0]
 
-
-def _stored(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """The HDF5 dataset of that name, which must lie inside this very file."""
-    link = file.get(name, getlink=True)
-    found = file[name] if isinstance(link, h5py.HardLink) else None
-    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-        raise FileFormatError(
-            f"{path}: {name!r} must be a dataset stored in this file, not a group or a link elsewhere."
-        )
-    return found
-
-
-def _array(path: Path, file: h5py.File, name: str) -> np.ndarray:
-    stored = _stored(path, file, name)
-    if stored.dtype.kind not in "fiu":
-        raise FileFormatError(f"{path}: {name!r} must hold numbers; it holds {stored.dtype}.")
-    if stored.size * stored.dtype.itemsize > _LARGEST_COMPRESSION * stored.id.get_storage_size():
-        raise FileFormatError(
-            f"{path}: {name!r} claims the shape {stored.shape}, but the file does not hold that much."
-        )
-    return stored[()]
-
-
-def _texts(path: Path, file: h5py.File, name: str) -> list[str]:
-    stored = _stored(path, file, name)
-    if h5py.check_string_dtype(stored.dtype) is None:
-        raise FileFormatError(f"{path}: {name!r} must hold text; it holds {stored.dtype}.")
-    return np.atleast_1d(stored.asstr()[()]).ravel().tolist()
-
-
-def _text(path: Path, file: h5py.File, name: str) -> str:
-    texts = _texts(path, file, name)
-    if len(texts) != 1:
-        raise FileFormatError(f"{path}: {name!r} must hold one text; it holds {len(texts)}.")
-    return texts[0]
-
-
-def _units(path: Path, file: h5py.File, name: str) -> str | tuple[str, ...]:
-    units = file[name].attrs.get("units")
-    if units is None:
-        raise FileFormatError(f"{path}: {name!r} has no attribute 'units'.")
-    return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))
-
-
-def _model(path: Path, text: str) -> Any:
-    try:
-        return forcegp.Model.from_json(text)
-    except ForceGPError as error:
-        raise FileFormatError(f"{path}: its robot or contacts cannot be used: {error}") from error
+    def units(self, name: str) -> str | tuple[str, ...]:
+        units: Any = self.file[name].attrs.get("units")
+        self.require(units is not None, f": {name!r} has no attribute 'units'.")
+        return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))

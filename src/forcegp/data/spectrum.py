@@ -10,7 +10,6 @@ docs/how-to/checking.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,32 +19,26 @@ from jaxtyping import Float
 import forcegp.robots
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import estimate_delay, shifted, torque_columns
-from forcegp.data.filtering import (
+from forcegp.data.delay import estimate_delay, torque_columns
+from forcegp.data.filters import (
+    Filter,
+    LowPass,
     Signal,
     differentiated,
     episodes_in_order,
     low_pass,
+    shifted,
     uniform_step,
-    zero_phase_low_pass,
 )
 from forcegp.errors import DatasetError
 
 SEGMENT = 4.0  # s
 FEWEST_ROWS = 64
 BANDS_PER_OCTAVE = 6
-FLOOR_BAND = (1.2, 5.0)
-"""Where the floor is read, in multiples of the knee."""
-
-CUTOFF_BAND = 3.0
-"""The cut-off is at most so many times the knee."""
-
-HIGHEST = 0.8
-"""Of half the sample rate: above it a filter is not worth its name."""
-
-MOTION_SHARE = 0.99
-"""Of the power of the signal: the knee is sought above the frequency below which so much of it lies."""
-
+FLOOR_BAND = (1.2, 5.0)  # where the floor is read, in multiples of the knee
+CUTOFF_BAND = 3.0  # the cut-off is at most so many times the knee
+HIGHEST = 0.8  # of half the sample rate: above it a filter is not worth its name
+MOTION_SHARE = 0.99  # of the power of the signal: the knee is sought above the frequency below which so much of it lies
 LEAST_RISE = 10.0
 """Noise that deserves a filter rises above the knee, in the differentiated signal, by this factor at least."""
 
@@ -82,15 +75,14 @@ class MotionSpectrum:
         noise = np.where(below, np.minimum(self.density, self.floor), self.density)
         return np.where(np.isfinite(self.floor), noise, np.nan)
 
-    def acceleration_noise(self, gain: Callable[[np.ndarray], np.ndarray] | None = None) -> Float[np.ndarray, " nv"]:
+    def acceleration_noise(self, behind: Filter | None = None) -> Float[np.ndarray, " nv"]:
         """Standard deviation of the noise that central differences make of `source` [rad/s^2 or m/s^2]; NaN if unknown.
 
-        `gain` is that of the filter before them, at frequencies in Hz. Central differences have the gain
-        `sin(2 pi f h) / h` per derivative.
+        `behind` is the filter before them. Central differences have the gain `sin(2 pi f h) / h` per derivative.
         """
         response = (np.sin(2.0 * np.pi * self.frequency * self.step) / self.step) ** (2 * _derivatives(self.source))
-        if gain is not None:
-            response = response * gain(self.frequency) ** 2
+        if behind is not None:
+            response = response * np.abs(behind.gain(self.frequency, 1.0 / self.step)) ** 2
         return np.sqrt((self.noise_density * response[:, None]).sum(axis=0) * (self.frequency[1] - self.frequency[0]))
 
 
@@ -200,7 +192,7 @@ SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that fi
 
 
 def held_out_cutoff(
-    dataset: Dataset, robot: forcegp.robots.Robot, cutoff: float, source: Literal["q", "v"] = "q", order: int = 4
+    dataset: Dataset, robot: forcegp.robots.Robot, cutoff: float, source: Literal["q", "v"] = "q"
 ) -> tuple[float, dict[float, float]]:
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
@@ -210,18 +202,18 @@ def held_out_cutoff(
     and both its torque and the measured one then pass the lowest, which takes the noise (parallel filtering; Gautier,
     "Dynamic identification of robots with power model", ICRA 1997).
 
-    Shares are geometric means over the joints, in time that was held out and below the lowest cut-off. `source` and
-    `order` are those of `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
+    Shares are geometric means over the joints, in time that was held out and below the lowest cut-off. `source` is
+    that of `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
     """
-    best, shares = _judged(dataset, robot, cutoff, source, order)
+    best, shares = _judged(dataset, robot, cutoff, source)
     if best in (min(shares), max(shares)):  # the best may lie beyond
-        best, more = _judged(dataset, robot, best, source, order)
+        best, more = _judged(dataset, robot, best, source)
         shares = shares | more
     return best, dict(sorted(shares.items()))
 
 
 def _judged(
-    dataset: Dataset, robot: forcegp.robots.Robot, cutoff: float, source: Literal["q", "v"], order: int
+    dataset: Dataset, robot: forcegp.robots.Robot, cutoff: float, source: Literal["q", "v"]
 ) -> tuple[float, dict[float, float]]:
     columns = 10 * robot.nv + 10
     rows = int(min(MOST_ROWS, MOST_NUMBERS / (robot.nv * columns)))
@@ -235,7 +227,7 @@ def _judged(
     signals: tuple[Signal, ...] = ("q", "u") if source == "q" else ("q", "v", "u")
 
     def behind(frequency: float) -> Dataset:
-        return differentiated(low_pass(log, frequency, order=order, signals=signals), source)
+        return differentiated(low_pass(log, frequency, signals=signals), source)
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), robot).common)  # the best guess, sure or not
     log = shifted(log, np.full(log.nv, delay))
@@ -247,9 +239,8 @@ def _judged(
     sharp = torque_columns(robot, behind(tried[-1]))
 
     def judged(values: Float[np.ndarray, "rows columns"]) -> np.ndarray:
-        parts = [
-            zero_phase_low_pass(values[log.episode == number], 1.0 / step, tried[0], order) for number in log.episodes
-        ]
+        own = [log.episode == number for number in log.episodes]
+        parts = [LowPass(tried[0])(values[rows], log.time[rows]) for rows in own]
         return np.concatenate(parts)[inner]
 
     measured, shares = judged(log.u), np.empty((len(tried), log.nv))

@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 from warnings import warn
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 import forcegp.mechanics
-from forcegp.data.contact_residual import tensors
 from forcegp.data.dataset import Dataset
+from forcegp.data.filters import Mean
+from forcegp.data.views import in_blocks
 from forcegp.errors import ContactError, DatasetError, DataWarning
 
 WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
@@ -34,12 +35,8 @@ of all that they carry: nothing, and surely bearing."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
 to which its absence decides."""
-TILTS = 0.05
-"""rad by which a foot held flat leans away from the median of its stretch of stance."""
 FEW = 10
-MANY_OPEN = 0.25
-"""Share of open rows that more than changes of stance leave."""
-CHUNK = 4000
+MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,13 +108,11 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     4. Where nothing but these contacts holds a base against gravity: rows in which none of them stands although
        something bears a fifth of the weight are open, and rows in which one stands although nothing does. Filters and
        averages move feet in stance as short as their memory (a hop recorded at 50 Hz), and motion alone calls it swing.
-    5. Rows in which a foot held flat leans by .05 rad from the median of its stretch of stance are open.
 
     Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
     up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
     the median at rest, of rows weighted by their force. Forces decide nothing where moving feet show more than these
-    40 %. Raises ContactError without contacts that have a switch, DatasetError for a robot in a plane
-    that falls and has no gravity there.
+    40 %. Raises ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
     names = () if model is None else tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))
@@ -126,8 +121,6 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
             "no contact of the model has a switch, so there is no stance to find; give one, for example "
             "fixed_point('foot', switch='foot_stands')."
         )
-    if (fall := missing_gravity(dataset, model)) is not None:
-        raise DatasetError(f"{fall[0]}, so forces show no stance: {fall[1]}")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked = _motion_and_force(dataset, model, names)
@@ -137,8 +130,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
         smooth = np.empty_like(own)
         for rows, width in zip(episodes, widths, strict=True):
-            smooth[rows] = _averaged(own[rows], width)
-            force[rows, k] = np.linalg.norm(_averaged(needed[rows], width), axis=1)
+            smooth[rows] = Mean(width)(own[rows])
+            force[rows, k] = np.linalg.norm(Mean(width)(needed[rows]), axis=1)
         speed[:, k] = np.linalg.norm(smooth, axis=1)
         noise[k] = max(_noise(smooth, episodes, [times * width for width in widths]) for times in (1, 2))
     slow = np.maximum(SLOW, DEVIATIONS * noise)
@@ -156,10 +149,9 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         weight = float(gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
-        falls = np.linalg.norm(_averaged(whole[rows], width), axis=1) < FALLS * weight
+        falls = np.linalg.norm(Mean(width)(whole[rows]), axis=1) < FALLS * weight
         stands = (flags[rows] == 1.0).any(axis=1)
         flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
-    flags[tilting(dataset, model, names, flags)] = np.nan
     return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
 
 
@@ -169,43 +161,17 @@ def _motion_and_force(
     """A v of the contacts of every switch, and the force that the rows ask of them."""
     of = [[k for k, contact in enumerate(model.contacts) if contact.switch == name] for name in names]
     places = [model.inputs.index(name) for name in names]
-    motion: list[list[np.ndarray]] = [[] for _ in names]
-    asked: list[list[np.ndarray]] = [[] for _ in names]
-    for first in range(0, len(dataset), CHUNK):
-        q, v, u, a = (x.to(model.robot.device) for x in tensors(dataset.rows(slice(first, first + CHUNK))))
+
+    def found(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         u[:, places] = 1.0
-        with torch.no_grad():
-            found = model.dynamics(q, v, u)
-            white = found.inverse_lower @ (found.M @ a[..., None] - found.Q_K[..., None])
-            forces = found.normals * (found.pseudo_inverse.mT @ white)
-            rates = (found.A @ v[..., None])[..., 0]
-        for k, rows in enumerate(of):
-            motion[k].append(rates[:, rows].cpu().numpy())
-            asked[k].append(forces[:, rows].sum(1).cpu().numpy())
-    return [np.concatenate(own) for own in motion], [np.concatenate(own) for own in asked]
+        dynamics = model.dynamics(q, v, u)
+        white = dynamics.inverse_lower @ (dynamics.M @ a[..., None] - dynamics.Q_K[..., None])
+        forces = dynamics.normals * (dynamics.pseudo_inverse.mT @ white)
+        rates = (dynamics.A @ v[..., None])[..., 0]
+        return *(rates[:, rows] for rows in of), *(forces[:, rows].sum(1) for rows in of)
 
-
-def tilting(
-    dataset: Dataset, model: forcegp.Model, names: tuple[str, ...], flags: np.ndarray
-) -> Bool[np.ndarray, "rows switches"]:
-    """Where feet that are held flat lean, as a heel that turns, although these flags (rows, switches) are 1."""
-    found, g = np.zeros(flags.shape, bool), model.robot.gravity
-    held = {(c.frame, c.switch): {x.point for x in model.contacts if x.frame == c.frame} for c in model.contacts}
-    for (frame, switch), points in held.items():
-        if switch is None or len(points) < 3 or not g.any():
-            continue
-        k = names.index(switch)
-        pose = model.robot.kinematics(torch.tensor(dataset.q, device=g.device)).frame_pose(frame)
-        # turns about gravity may be drift of an estimator
-        down = (pose[..., :3, :3].mT @ (g / g.norm())).cpu().numpy()
-        order = np.lexsort((dataset.time, dataset.episode))
-        number, stands = dataset.episode[order], flags[order, k] == 1.0
-        ends = np.flatnonzero((np.diff(number) != 0) | (np.diff(stands) != 0)) + 1
-        for rows in np.split(order, ends):
-            if flags[rows[0], k] == 1.0:
-                away = np.linalg.norm(down[rows] - np.median(down[rows], axis=0), axis=1)
-                found[rows, k] |= away > TILTS
-    return found
+    both = in_blocks(dataset, found, model.robot.device)
+    return both[: len(names)], both[len(names) :]
 
 
 def _width(time: Float[np.ndarray, " rows"]) -> int:
@@ -224,14 +190,6 @@ def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], stri
         return 0.0
     each = np.quantile(np.abs(np.concatenate(differences)), 0.25, axis=0) / (QUARTER * 20.0**0.5)
     return float(np.linalg.norm(each))
-
-
-def _averaged(values: Float[np.ndarray, "rows m"], width: int) -> Float[np.ndarray, "rows m"]:
-    """Means over windows of so many rows, which are shorter at the ends."""
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    rows: Int[np.ndarray, " rows"] = np.arange(len(values))
-    first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
-    return (total[last] - total[first]) / (last - first)[:, None]
 
 
 def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
@@ -264,36 +222,3 @@ def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
             near = np.searchsorted(at, time).clip(1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), int)
             out[np.minimum(np.abs(time - at[near - 1]), np.abs(time - at[near])) <= EDGE] = np.nan
     return filled
-
-
-EARTH, NEAR, OFTEN = 9.81, 0.5, 0.1
-"""m/s^2: of free fall, and about it; share of the rows in which a robot falls so."""
-ALONG = 0.05
-"""Of a unit vector: parts below this are none."""
-
-
-def missing_gravity(dataset: Dataset, model: forcegp.Model) -> tuple[str, str] | None:
-    """What shows that a robot in a plane falls in it although its gravity has no part there, and the remedy."""
-    robot = model.robot
-    if robot.base != "planar" or robot.gravity[:2].any():
-        return None
-    q, v, a = (torch.tensor(x, device=robot.device) for x in (dataset.q, dataset.v, dataset.a))
-    force = robot.kinematics(q, v).inverse_dynamics(a)[:, :2].cpu().numpy() / robot.mass  # in the axes of the base
-    c, s = dataset.q[:, 2], dataset.q[:, 3]
-    motion = np.stack([c * force[:, 0] - s * force[:, 1], s * force[:, 0] + c * force[:, 1]], 1)
-    near = abs(np.linalg.norm(motion, axis=1) - EARTH) < NEAR
-    if not near.any():
-        return None
-    fall = np.median(motion[near], axis=0)
-    often, size = (np.linalg.norm(motion - fall, axis=1) < NEAR).mean(), np.linalg.norm(fall)
-    if often < OFTEN or abs(size - EARTH) > NEAR:
-        return None
-    direction = fall / size
-    direction = np.where(abs(direction) < ALONG, 0.0, direction)
-    x, y = EARTH * direction / np.linalg.norm(direction)
-    return (
-        f"in {often:.0%} of the rows the robot falls at ({fall[0]:.3g}, {fall[1]:.3g}) m/s^2 in its plane, in which it "
-        "has no gravity",
-        f"forcegp import --robot FILE --base planar --gravity={x + 0.0:.4g},{y + 0.0:.4g},0 reads it with gravity, as "
-        f"Robot.from_urdf(..., gravity=({x + 0.0:.4g}, {y + 0.0:.4g}, 0)) does.",
-    )

@@ -7,21 +7,21 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.filtering import episodes_in_order, sums_before
+from forcegp.data.filters import episodes_in_order, sums_before
+from forcegp.data.views import in_blocks
 
 SECONDS = 0.3  # s: rows that lie this far apart count 1/e for each other's wind
 MOST_ROWS, FEWEST_ROWS = 3000, 400
 STRONGEST, SURE = 40.0, 2.0  # m/s: a wind beyond, or a standard deviation beyond, is none that was found
 APART = 0.5  # s, between rows that count as independent of each other
 STEP = 0.05  # m/s, of derivatives
-BLOCK = 4096  # rows
 LIKELIER = 3.0  # forces of episodes a priori, over what one cause adds
 MOVING = 12  # causes that vanish with the velocity
 
@@ -165,17 +165,14 @@ class _Forces:
     def of(cls, dataset: Dataset) -> _Forces:
         assert dataset.model is not None, "forces need a model"
         robot = dataset.model.robot
-        group, parts = robot.layout.groups[0], []
-        for start in range(0, len(dataset), BLOCK):
-            block = slice(start, start + BLOCK)
-            q, v, u, a = (
-                torch.tensor(x[block], device=robot.device) for x in (dataset.q, dataset.v, dataset.u, dataset.a)
-            )
-            with torch.no_grad():
-                dynamics = dataset.model.dynamics(q, v, u)
-                Q_U = (dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K
-                parts.append((Q_U[:, group.rows], dynamics.state.delivered[:, group.rows]))
-        wrench, delivered = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
+        model, group = dataset.model, robot.layout.groups[0]
+
+        def found(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+            dynamics = model.dynamics(q, v, u)
+            missing = (dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K
+            return missing[:, group.rows], dynamics.state.delivered[:, group.rows]
+
+        wrench, delivered = in_blocks(dataset, found, robot.device)
         places = dataset.q[:, group.places]
         rotation = Rotation.from_quat(places[:, group.motion.turn]).as_matrix()
         return cls(wrench, dataset.v[:, group.rows], delivered, rotation, places[:, 2:3])

@@ -17,9 +17,9 @@ from scipy.special import beta
 
 from forcegp.data.configurations import as_vectors, chart_acceleration, space_of, switches
 from forcegp.data.dataset import Dataset
-from forcegp.data.filtering import episodes_in_order, require_no_turns
+from forcegp.data.filters import episodes_in_order, require_no_turns
 from forcegp.data.preparation import preparation_report
-from forcegp.data.row_selection import farthest_point_sampling
+from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.evidence.evidence import Evidence
 from forcegp.robots.arguments import whole_number

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset import require_rows
-from forcegp.data.memory import with_memory
+from forcegp.data.views import with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows
 from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.fit.checks import check_forces, refuse_what_looks_alike, warn_of_contacts
+from forcegp.fit.doubts import check_forces, refuse_what_looks_alike, warn_of_contacts
 from forcegp.fit.joint import (
     CHANGE,
     MOST_ROUNDS,
@@ -369,7 +369,7 @@ class _Functions:
         likelihood = MarginalLikelihood(model, training)
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)
-        check_forces(likelihood, dataset.model)
+        check_forces(likelihood)
         require_memory_to_learn(likelihood)
         described = described_rows(rows, dataset) | {"noise": noise.to_dict()}
         # before the search: a force of one's own may fail there

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.data.motion_records import RecordedMotions, recorded_motions
+from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.training_data import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions

@@ -30,7 +30,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.data.motion_records import RecordedMotions, all_motions
+from forcegp.data.views import RecordedMotions, all_motions
 from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError
 from forcegp.evidence.least_squares import correlation_time
 from forcegp.fit.motion_unknowns import SCALES, Unknowns

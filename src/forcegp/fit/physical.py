@@ -4,7 +4,7 @@ Torque is linear in the parameters of bodies and in most coefficients, so a few 
 (`forcegp.evidence.least_squares`). What is minimised is chosen by the evidence: `Torques`, `Accelerations`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, evenly
+from forcegp.doubts import Doubt, Doubts
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import thickened
@@ -21,9 +22,8 @@ from forcegp.evidence.identifiability import BaseParameters, parameter_names
 from forcegp.evidence.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.payload_link import most_likely, possible_links
-from forcegp.fit.base_doubts import warn_of_what_holds_it_up
+from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
 from forcegp.fit.equations import Equations
-from forcegp.fit.payload_doubts import warn_of_no_body, warn_of_offsets
 from forcegp.forces import Payload, RigidBodies
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -73,7 +73,7 @@ def fit_physical(
     robot, thick = thickened(model.robot) if _estimates_bodies(model) else (model.robot, ())
     model = replace(model, robot=robot)
     most = rows_at_most(robot) if rows is None else rows
-    logs = [log.rows(np.unique(np.linspace(0, len(log) - 1, min(most, len(log))).astype(int))) for log in logs]
+    logs = [log.rows(evenly(log, most)) for log in logs]
     typical = typical_sizes(model, logs)
     model = with_payloads_placed(model, logs, typical)
     space = ParameterSpace(model, typical)
@@ -114,10 +114,11 @@ def fit_physical(
             fit = search(white, start=fit.x, robust=robust, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    _warn_of_payloads(space, fit, equations.windows is not None)
+    doubts = list(_doubts_of_payloads(space, fit, equations.windows is not None))
     estimates = _estimates(space, fit, equations, evidence, thick)
     if not robot.space.is_vector_space:
-        warn_of_what_holds_it_up(model, found, equations.parts[0], residual[: len(logs[0])])
+        doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
+    Doubts(doubts).warn(stacklevel=4)
     level = model.noise
     if level is None or level.learn or level.acceleration is None:
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
@@ -284,7 +285,7 @@ def _without_payloads(
     return r, np.delete(np.asarray(jacobian), of_payloads, axis=-1)
 
 
-def _warn_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> None:
+def _doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iterator[Doubt]:
     for body, each in enumerate(space.carried):
         if each.payload is None:
             continue
@@ -292,13 +293,13 @@ def _warn_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> None:
         slope = space.number_slopes(fit.x)[column, own]
         laws = [type(space.model.laws[term.law]).__name__ for term in space.terms for _ in term.size]
         offsets = np.array([law == "Offset" for law in laws], dtype=bool)
-        warn_of_offsets(fit, offsets, slope, own)
+        yield from doubts_of_offsets(fit, offsets, slope, own)
         if averaged:  # noise of single rows hides what is left
             number = len(space.carried)
             one = np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
             slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
             link = getattr(space.model.laws[each.payload], "link", "")
-            warn_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
+            yield from doubts_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
 
 
 STRETCHES_LEFT_OUT = 4

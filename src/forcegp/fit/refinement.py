@@ -83,10 +83,14 @@ def independent_rows(rows: Dataset) -> Dataset:
             kept.append(row)
     if len(kept) > WARNED_OF * len(rows):
         return rows.rows(np.array(kept))
-    alike = f"{len(kept)} of {len(rows)} rows lie {seconds:.2g} s apart, which the filter of the log makes alike"
     few = len(kept) < FEWEST_INDEPENDENT
-    what = "so few that all are taken, and learned noise may be none" if few else "from which alone noise is learned"
-    warnings.warn(f"{alike}: {what}; give a longer log, or `noise` if it is known", DataWarning, stacklevel=4)
+    what = "too few, so all are taken, and learned noise may be none" if few else "and these alone teach the noise"
+    warnings.warn(
+        f"the filter of the log makes rows alike that lie within {seconds:.2g} s of each other: {len(kept)} of "
+        f"{len(rows)} rows lie further apart, {what}; give a longer log, or `noise` if it is known",
+        DataWarning,
+        stacklevel=4,
+    )
     return rows if few else rows.rows(np.array(kept))
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_wind
-from forcegp.data.filtering import episodes_in_order, sums_before
+from forcegp.data.filters import episodes_in_order, sums_before
 from forcegp.data.wind import steady_forces
 from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench

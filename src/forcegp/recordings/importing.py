@@ -1,32 +1,28 @@
-"""`import_recordings`: from log files to one dataset, whatever their format."""
+"""`import_recordings`: from log files to one dataset; which reader reads which file, and files side by side."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from typing_extensions import override
 
 import forcegp.mechanics
 from forcegp.atomic_files import file_digest
-from forcegp.data import Dataset
-from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
-from forcegp.recordings.array_file import ArrayFile
-from forcegp.recordings.episode_rows import Stamps, episode_rows, read_stamps
-from forcegp.recordings.formats import SideBySide, open_source
-from forcegp.recordings.joined_topics import on_one_clock
+from forcegp.data import Dataset, is_dataset
+from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
+from forcegp.recordings.arrays import ArrayFile, HDF5Arrays, NumpyArchive, matlab_file
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
-from forcegp.recordings.reading import (
-    RawRecording,
-    read_recording,
-    require_plausible_positions,
-)
+from forcegp.recordings.recording import Recording, read_recording
+from forcegp.recordings.ros_bag import RosBag
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
-from forcegp.recordings.source import MOST_ROWS, Source
+from forcegp.recordings.source import Columns, Source
+from forcegp.recordings.tables import DelimitedText, ParquetFile
 
-ROUND_RATE = 1e-3
-"""A median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz."""
+ROUND_RATE = 1e-3  # a median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz
 
 Progress = Callable[[int, int, str], None]
 
@@ -44,7 +40,6 @@ class ImportOptions:
     start, end: seconds from the first row of each episode that are kept.
     unwrap: add whole turns to positions of turning joints where they jump by more than half a turn.
     beyond_limits: accept positions beyond the limits of the URDF.
-    most_rows: of one recording.
     stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of
         what was done names them: `Preparation(stance="auto")` has to find them. "log" refuses such logs.
 
@@ -57,7 +52,6 @@ class ImportOptions:
     end: float | None = None
     unwrap: bool = False
     beyond_limits: bool = False
-    most_rows: int = MOST_ROWS
     stance: Literal["log", "auto"] = "log"
 
     @usable_arguments("ImportOptions")
@@ -70,8 +64,6 @@ class ImportOptions:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
         if self.stance not in ("log", "auto"):
             raise InvalidInput(f"stance is {self.stance!r}; allowed: 'log' or 'auto'.")
-        if self.most_rows < 1:
-            raise InvalidInput(f"max-rows is {self.most_rows}; it must be at least 1.")
 
 
 def import_recordings(
@@ -100,9 +92,7 @@ def import_recordings(
         wheels = {robot.layout.bodies[robot.frame(each.frame)[0]].name for each in rolling}
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
-    joined = [on_one_clock(source, signal_plan(mapping, source, model, **lacks)) for _, source in sources]
-    sources = [(label, source) for (label, _), (source, _) in zip(sources, joined, strict=True)]
-    plans = [plan for _, plan in joined]
+    plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):
@@ -112,25 +102,21 @@ def import_recordings(
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         report(index, len(sources), f"reading {label}")
-        found = read_recording(source, own, label, unwrap=options.unwrap, most_rows=options.most_rows)
-        if not options.beyond_limits:
-            require_plausible_positions(found, own, robot, own.joints if "q" in mapping.unit else wheels)
-        recordings.append(found)
-    stamps = [read_stamps(item, options.gap, options.start, options.end) for item in recordings]
-    step = _even_step(stamps, options)
-    done = _what_was_done(mapping, plan, recordings, stamps, step, options, sources)
+        believed = own.joints if "q" in mapping.unit else wheels
+        recordings.append(read_recording(source, own, label, options, robot, believed))
+    step = _even_step(recordings, options)
+    done = _what_was_done(mapping, plan, recordings, step, options, sources)
     pieces: list[dict[str, np.ndarray]] = []
-    for recording, own, each in zip(recordings, stamps, plans, strict=True):
-        for stretch in own.stretches:
-            rows = stretch.rows
+    for recording in recordings:
+        for number, rows in recording.stretches:
             for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
                 for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
                     raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
-            piece = episode_rows(recording, rows, each.layout, step)
+            piece = recording.rows(rows, step)
             count, stamp = len(piece["time"]), recording.begin + float(recording.time[rows[0]])
             pieces.append(piece | {"episode": np.full(count, len(pieces))})
-            told = {"recording": recording.label, "number": stretch.number, "row": int(rows[0]), "begin": stamp}
+            told = {"recording": recording.label, "number": number, "row": int(rows[0]), "begin": stamp}
             done["episodes"].append(told | {"rows": count})
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
@@ -164,9 +150,9 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
     return found
 
 
-def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None:
+def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float | None:
     """The step of even times that all episodes get, or None if every stamp stays."""
-    median = float(np.median([own.step for own in stamps]))
+    median = float(np.median([own.step for own in recordings]))
     if not isinstance(options.rate, str):
         if options.rate < 0.9 / median:
             warnings.warn(
@@ -176,8 +162,8 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
                 stacklevel=3,
             )
         return 1.0 / options.rate
-    alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in stamps)
-    if options.rate == "log" or (alike and all(own.even for own in stamps)):
+    alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in recordings)
+    if options.rate == "log" or (alike and all(own.even for own in recordings)):
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
@@ -186,8 +172,7 @@ def _even_step(stamps: Sequence[Stamps], options: ImportOptions) -> float | None
 def _what_was_done(
     mapping: ColumnMapping,
     plan: SignalPlan,
-    recordings: Sequence[RawRecording],
-    stamps: Sequence[Stamps],
+    recordings: Sequence[Recording],
     step: float | None,
     options: ImportOptions,
     sources: Sequence[tuple[str, Source]],
@@ -212,15 +197,15 @@ def _what_was_done(
             {
                 "name": recording.label,
                 "rows": len(recording.time),
-                "seconds": float(sum(np.ptp(recording.time[x.rows]) for x in own.stretches)),
-                "median_step": own.step,
-                "largest_deviation_of_a_step": own.worst,
-                "repeated_stamps_dropped": own.repeated,
-                "gaps": list(own.gaps),
-                "rows_in_stretches_too_short": own.dropped_rows,
-                "notes": [*recording.source.notes(), *recording.notes],
+                "seconds": float(sum(np.ptp(recording.time[rows]) for _, rows in recording.stretches)),
+                "median_step": recording.step,
+                "largest_deviation_of_a_step": recording.worst,
+                "repeated_stamps_dropped": recording.repeated,
+                "gaps": list(recording.gaps),
+                "rows_in_stretches_too_short": recording.dropped,
+                "notes": list(recording.notes),
             }
-            for recording, own in zip(recordings, stamps, strict=True)
+            for recording in recordings
         ],
         "resampled_to_step": step,
         "unwrapped": options.unwrap,
@@ -228,3 +213,121 @@ def _what_was_done(
         "end": options.end,
         "episodes": [],
     }
+
+
+class SideBySide(Source):
+    """The columns of several tables of equally many rows, called `STEM:name` with the file name up to its first dot.
+
+    A stem by itself stands for all columns of its file. Raises InvalidInput for two files of one stem.
+    """
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        super().__init__(Path(", ".join(str(source.path) for source in sources)))
+        self.sources = {source.path.name.split(".")[0]: source for source in sources}
+        if len(self.sources) < len(sources):
+            raise InvalidInput(f"{self.path}: two files have the same name up to the first dot; rename one.")
+
+    @cached_property
+    def _owners(self) -> Mapping[str, tuple[Source, str]]:
+        return {
+            f"{name}:{column}": (source, column) for name, source in self.sources.items() for column in source.columns()
+        }
+
+    @override
+    def columns(self) -> tuple[str, ...]:
+        return tuple(self._owners)
+
+    @property
+    @override
+    def vectors(self) -> Mapping[str, tuple[str, ...]]:
+        """The vectors of each file, and the stem of each for all of its columns."""
+        found = {}
+        for name, source in self.sources.items():
+            found[name] = tuple(f"{name}:{column}" for column in source.columns())
+            for vector, elements in source.vectors.items():
+                found[f"{name}:{vector}"] = tuple(f"{name}:{element}" for element in elements)
+        return found
+
+    @override
+    def files(self) -> tuple[Path, ...]:
+        return tuple(file for source in self.sources.values() for file in source.files())
+
+    @override
+    def notes(self) -> tuple[str, ...]:
+        return tuple(note for source in self.sources.values() for note in source.notes())
+
+    @override
+    def table(self, names: Sequence[str]) -> Columns:
+        own: dict[Source, dict[str, str]] = {}
+        for name in names:
+            source, column = self._owners[name]
+            own.setdefault(source, {})[name] = column
+        read = {source: source.read(list(columns.values())) for source, columns in own.items()}
+        rows = {source.path.name: len(next(iter(columns.values()))) for source, columns in read.items()}
+        if len(set(rows.values())) > 1:
+            listed = ", ".join(f"{name} {count}" for name, count in rows.items())
+            raise FileFormatError(f"files side by side must have equally many rows; these have: {listed}.")
+        return {name: read[source][column] for name, (source, column) in self._owners.items() if name in names}
+
+
+TEXT = (".csv", ".tsv", ".txt", ".dat")
+ARRAYS: dict[str, Callable[..., ArrayFile]] = {
+    ".npz": NumpyArchive,
+    ".mat": matlab_file,
+    ".h5": HDF5Arrays,
+    ".hdf5": HDF5Arrays,
+}
+TABLES: dict[str, Callable[[Path], Source]] = {
+    ".parquet": ParquetFile,
+    ".pq": ParquetFile,
+    ".bag": RosBag,
+    ".mcap": RosBag,
+    ".db3": RosBag,
+}
+"""A new format is a subclass of `Source`, and an entry here (or in `ARRAYS`) with its extension."""
+
+READABLE = ", ".join([*(f"{name}[.gz]" for name in TEXT), *TABLES, *ARRAYS]) + ", folders of ROS 2 bags"
+PICKLES = {".pkl", ".pickle", ".npy", ".pt", ".pth", ".joblib"}
+
+
+def open_source(
+    path: Path, *, headerless: int | None = None, delimiter: str | None = None, within: str | None = None
+) -> Source:
+    """The reader for a log, chosen by its extension or, for a folder, by what is in it.
+
+    Parameters: `headerless` and `delimiter` as for `DelimitedText`, `within` as for `ArrayFile`.
+    Raises FileFormatError for what cannot be read, InvalidInput for parameters that mean nothing to the format.
+    """
+    kind = _kind(path)
+    if kind not in TEXT and (headerless or delimiter):
+        raise InvalidInput(f"`headerless` and `delimiter` mean nothing to {path}; they are for text files.")
+    if kind not in ARRAYS and within is not None:
+        raise InvalidInput(f"`episodes` means nothing to {path}; it is for {', '.join(ARRAYS)} files.")
+    if kind in TEXT:
+        return DelimitedText(path, headerless=headerless, delimiter=delimiter)
+    if kind in ARRAYS:
+        if kind != ".npz" and is_dataset(path):
+            raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
+        return ARRAYS[kind](path, within=within)
+    return RosBag(path) if kind == "ros2" else TABLES[kind](path)
+
+
+def _kind(path: Path) -> str:
+    """The extension without .gz, or "ros2"."""
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return "ros2"
+        raise FileFormatError(f"{path} is a folder, but no ROS 2 bag (metadata.yaml); give the files in it.")
+    if not path.is_file():
+        raise FileFormatError(f"{path} does not exist; give the path of a log.")
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    kind = suffixes[-1] if suffixes else ""
+    if kind == ".gz" and suffixes[-2:-1] and suffixes[-2] in TEXT:
+        kind = suffixes[-2]
+    if kind in PICKLES:
+        raise FileFormatError(f"{path} may hold Python objects, and reading those runs code; save arrays as .npz.")
+    if kind not in (*TEXT, *ARRAYS, *TABLES):
+        raise FileFormatError(f"{path}: the extension {kind or 'of no name'!r} is not known. Readable: {READABLE}.")
+    if path.stat().st_size == 0:
+        raise FileFormatError(f"{path} is empty; give a log with rows.")
+    return kind

@@ -32,12 +32,8 @@ def _units(si: str, per_si: Mapping[str, float]) -> dict[str, LogUnit]:
     return {name: LogUnit(name, si, float(number)) for name, number in per_si.items()}
 
 
-_DEGREES, _TURNS = 180.0 / math.pi, 0.5 / math.pi
-"""In a radian."""
-
-ONE = LogUnit("1", "1")
-"""Of parts of a quaternion, of shares of a thrust and of switches."""
-
+_DEGREES, _TURNS = 180.0 / math.pi, 0.5 / math.pi  # in a radian
+ONE = LogUnit("1", "1")  # of parts of a quaternion, of shares of a thrust and of switches
 UNITS: dict[str, dict[str, LogUnit]] = {
     "time": _units("s", {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60}),
     "q": _units("rad", {"rad": 1, "mrad": 1e3, "deg": _DEGREES, "rev": _TURNS})
@@ -175,21 +171,18 @@ class ColumnMapping:
             alike = len(set(values)) == 1
             return (values[0],) if alike else tuple(values[place] for place in places)
 
-        changes: dict[str, Any] = {}
-        units = {name: in_order(values) for name, values in correction.get("unit", {}).items()}
-        if units:
-            changes["unit"] = {**self.unit, **units}
+        sign = dict(self.sign)
         for signal, values in correction.get("sign", {}).items():
-            now = self.sign.get(signal, (1.0,))
+            now = sign.get(signal, (1.0,))
             now = now * len(places) if len(now) == 1 else now
-            turned = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
-            changes["sign"] = {**self.sign, **changes.get("sign", {}), signal: turned}
+            sign[signal] = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
+        units = {name: in_order(values) for name, values in correction.get("unit", {}).items()}
+        axes = {**self.axes, **correction.get("axes", {})}
+        changes: dict[str, Any] = {"unit": {**self.unit, **units}, "sign": sign, "axes": axes}
         if "orientation" in correction:
             [changes["orientation"]] = correction["orientation"]["q"]
             if self.q is None and not self.joints:  # found by name: now their places count
                 changes["q"] = tuple(columns["q"])
-        if "axes" in correction:
-            changes["axes"] = {**self.axes, **correction["axes"]}
         for signal, order in correction.get("order", {}).items():
             if signal in columns:
                 changes[signal] = tuple(columns[signal][order[place]] for place in places)
@@ -283,7 +276,7 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
         require_known("key", key, "a mapping of columns", known)
         if value is None:
             continue
-        if key in SIGNALS or key == "joints":
+        if key in (*SIGNALS, "joints"):
             values[key] = _texts(key, value)
         elif key in ("unit", "axes"):
             quantities = ", ".join(UNITS if key == "unit" else AXES)
@@ -292,19 +285,15 @@ def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
         elif key == "sign":  # for all signals, if none is named: it turns the axis of a joint
             named = value if isinstance(value, dict) else dict.fromkeys(SIGNALS, value)
             values[key] = {str(k): tuple(_number(f"{key} of {k}", x) for x in _listed(own)) for k, own in named.items()}
-        elif key == "headerless":
-            values[key] = tuple(_listed(value))
-            for entry in values[key]:
-                whole = isinstance(entry, int) and not isinstance(entry, bool)
-                _require(whole, key, entry, "give the number of columns")
         elif key == "step":
             values[key] = _number(key, value)
-        elif key in ("side_by_side", "ned"):
-            _require(isinstance(value, bool), key, value, "give true or false")
-            values[key] = value
         else:
-            _require(isinstance(value, str), key, value, "give a text")
-            values[key] = value
+            whole = key == "headerless"
+            kind, remedy = {"headerless": (int, "give the number of columns"), "side_by_side": (bool, _TRUTH),
+                            "ned": (bool, _TRUTH)}.get(key, (str, "give a text"))  # fmt: skip
+            for entry in _listed(value) if whole else [value]:
+                _require(type(entry) is kind, key, entry, remedy)
+            values[key] = tuple(_listed(value)) if whole else value
     return ColumnMapping(**values)
 
 
@@ -335,6 +324,7 @@ def by_quantity(flag: str, text: str) -> dict[str, list[str]]:
     return found
 
 
+_TRUTH = "give true or false"
 _EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body"}
 
 

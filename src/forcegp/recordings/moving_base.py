@@ -22,10 +22,8 @@ from forcegp.robots.manifold import ConfigurationSpace, Group
 ANGLES = ("roll", "pitch", "yaw")
 TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
 """What changes sign by half a turn of world and base about x: north, east, down becomes north, west, up."""
-LARGEST_ERROR = 0.01
-"""Of the length of a quaternion: more is no rounding."""
-ROUNDED = 1e-9
-"""Differences from length 1 beyond this are reported."""
+LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
+ROUNDED = 1e-9  # differences from length 1 beyond this are reported
 
 
 def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:

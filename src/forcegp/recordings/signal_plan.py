@@ -28,10 +28,8 @@ from forcegp.summary import listed
 LACKING = LinearExpression({}, 0.0)
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
-EPISODE = "episode_index"
-"""Numbers the episodes where nothing else is stated, as in datasets of LeRobot."""
-MOST_NAMES = 40
-"""Of columns in a message."""
+EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
+MOST_NAMES = 40  # of columns in a message
 
 
 @dataclass(frozen=True)
@@ -87,11 +85,7 @@ class SignalPlan:
 
 
 def signal_plan(
-    mapping: ColumnMapping,
-    source: Source,
-    model: forcegp.Model | None,
-    *,
-    may_lack_switches: bool = False,
+    mapping: ColumnMapping, source: Source, model: forcegp.Model | None, *, may_lack_switches: bool = False
 ) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot if there is one.
 

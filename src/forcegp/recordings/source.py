@@ -9,20 +9,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool
 
 from forcegp.errors import FileFormatError, ForceGPError, require_known
 
 Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
 
-LONGEST_VECTOR = 4096
-"""Columns of a table in one array; wider ones are pictures and the like, not signals of joints."""
-
-MOST_ROWS = 100_000_000
-ROWS_AT_A_TIME = 2**16
-"""Of what libraries give in pieces."""
-
+LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 
 
@@ -47,33 +40,24 @@ class Source(ABC):
         """The names of all columns, in the order of the file; not empty, no name twice."""
 
     @abstractmethod
-    def pieces(self, names: Sequence[str]) -> Iterator[Columns]:
-        """The named columns in the order of the file, in pieces of any length; all of `names` are there.
+    def table(self, names: Sequence[str]) -> Columns:
+        """The named columns, all of which there are; a missing value is NaN."""
 
-        A value that is missing is NaN. Raises FileFormatError for a value that is no number.
-        """
-
-    def read(self, names: Sequence[str], most_rows: int = MOST_ROWS) -> Columns:
-        """The named columns. Raises FileFormatError for names that are no columns, for no rows and for too many."""
-        known, rows, pieces = self.columns(), 0, list[Columns]()
+    def read(self, names: Sequence[str]) -> Columns:
+        """The named columns, in this order. Raises FileFormatError for names that are no columns, and for no rows."""
         for name in names:
-            require_known("column", name, str(self.path), known, FileFormatError)
-        for piece in self.pieces(names):
-            pieces.append(piece)
-            rows += len(next(iter(piece.values())))
-            if rows > most_rows:
-                raise FileFormatError(f"{self.path} has more than {most_rows} rows; allow more with `most_rows`.")
-        if not rows:
+            require_known("column", name, str(self.path), self.columns(), FileFormatError)
+        found = self.table(names)
+        if not len(found[names[0]]):
             raise FileFormatError(f"{self.path} has no rows; give a log with rows.")
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
+        return {name: as_column(found[name]) for name in names}
 
     @property
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
         """Names that stand for several columns: `state` for `state[0], state[1], ...`."""
         found: dict[str, list[str]] = {}
         for name in self.columns():
-            element = ELEMENT.match(name)
-            if element:
+            if element := ELEMENT.match(name):
                 found.setdefault(element["vector"], []).append(name)
         return {name: tuple(elements) for name, elements in found.items()}
 
@@ -92,13 +76,6 @@ class Source(ABC):
     def place(self, row: int) -> str:
         """Where a row stands, for messages: `row 17`, counted from 0."""
         return f"{self.row_word} {row}"
-
-    def paused(self, gap: float | None, steps: float) -> Bool[np.ndarray, " rows"] | None:
-        """Rows of the last reading for which a part of the log was silent: for `gap` seconds, or so many median steps.
-
-        None where rows come whole.
-        """
-        return None
 
 
 def require_distinct(path: Path, names: Sequence[str]) -> None:
@@ -126,10 +103,7 @@ def as_column(values: np.ndarray) -> np.ndarray:
 
 def columns_of(tables: Mapping[str, np.ndarray], places: Mapping[str, tuple[str, int | None]]) -> Columns:
     """Columns out of tables (rows,) or (rows, k): name of a column -> its table, and where it is in that."""
-    return {
-        name: as_column(tables[own] if index is None else tables[own][:, index])
-        for name, (own, index) in places.items()
-    }
+    return {name: tables[own] if index is None else tables[own][:, index] for name, (own, index) in places.items()}
 
 
 def arrow_numbers(column: Any) -> np.ndarray:
@@ -159,8 +133,7 @@ def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[Non
 LARGEST_EXPANSION = 200
 """Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
 
-HARMLESS = 100 * 2**20
-"""Bytes; what expands to no more than this is never refused."""
+HARMLESS = 100 * 2**20  # Bytes; what expands to no more than this is never refused
 
 
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:
@@ -171,14 +144,3 @@ def require_plausible_size(path: Path, what: str, declared: int, stored: int) ->
             f"{LARGEST_EXPANSION} times as much, and no log of sensors shrinks so far: it is truncated or no log. "
             "Copy or write it again."
         )
-
-
-def require_plausible_gzip(path: Path) -> None:
-    """Refuse a .gz file that is none, or that states a size that no log shrinks from. Raises FileFormatError."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        if file.read(2) != b"\x1f\x8b":
-            raise FileFormatError(f"{path} is called .gz but is not compressed with gzip; rename or compress it.")
-        file.seek(max(size - 4, 0))
-        declared = int.from_bytes(file.read(4), "little")  # RFC 1952: ISIZE, modulo 2^32
-    require_plausible_size(path, "what is compressed", declared, size)

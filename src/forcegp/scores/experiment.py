@@ -256,8 +256,8 @@ def scored(
         posterior, test = observing(posterior, test, whole=True)
     table, stretches = row_scores(posterior, test, mass, progress)
     moving, facts = motion_scores(alone, motions, integrator)
-    told = [str(doubt) for doubt in contact_doubts(test, posterior.model)]
-    told = ([] if fitted_here else [*overlap_warnings(alone, recorded), *told]) + list(doubts(posterior, test, table))
+    before = [] if fitted_here else [*overlap_warnings(alone, recorded), *contact_doubts(test, posterior.model)]
+    told = [str(doubt) for doubt in (*before, *doubts(posterior, test, table))]
     told += [] if posterior is alone else [OBSERVED]
     told += [NORMAL_FORCES] if CONTACT_FORCE in table and normal_force_rests_on_prior(alone) else []
     return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

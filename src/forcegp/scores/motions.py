@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.data.motion_records import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.posterior import Posterior, observing
 from forcegp.posterior.rollout import Rollout

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, evenly
 from forcegp.errors import InvalidInput
 from forcegp.forces import (
     Actuation,
@@ -171,7 +171,7 @@ def _truth(posterior: Posterior, dataset: Dataset, panel: CurvePanel) -> tuple[n
     key = f"Q_U.{true_names(components, dataset).get(panel.component)}"
     if posterior.carries_known_forces or panel.term is None or key not in dataset.truth:
         return None
-    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, TRUE_POINTS).astype(int)))
+    rows = dataset.rows(evenly(dataset, TRUE_POINTS))
     model, term = posterior.model if dataset.model is None else dataset.model, panel.term
     with torch.no_grad():
         dynamics = model.dynamics(*(torch.tensor(values) for values in (rows.q, rows.v, rows.u)))

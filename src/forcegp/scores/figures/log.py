@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
-from forcegp.checks.torques import inverse_dynamics
-from forcegp.data import Dataset, Preparation, motion_spectrum
+from forcegp.checks.torques import needed_torques
+from forcegp.data import Dataset, motion_spectrum
 from forcegp.data.configurations import as_vectors, space_of
 from forcegp.scores.figures import style
 
@@ -45,7 +45,7 @@ def check_figure(report: CheckReport) -> Figure:
             title += f": {100.0 * left:.2g} % unexplained" if np.isfinite(left) else ": constant torque"
         style.quiet(panel, title=title, y=unit, x="time [s]" if lowest else "")
     counts = report.to_dict()["counts"]
-    wrong = ", ".join(dict.fromkeys(finding.subject for finding in report.findings if finding.severity == "wrong"))
+    wrong = report.doubts.at("wrong").subjects
     told = f"{counts['wrong']} wrong{wrong and f' ({wrong})'}, {counts['look']} to look at, {counts['ok']} ok"
     style.legend_above(halves[0], f"Check: {told}", *(panel for panel, _ in panels), markerscale=4)
     spectra = halves[1].subplots()
@@ -66,7 +66,7 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
         style.draw_line(axes, shown.time, values[:, joint], style.TRUTH, 1.0, label)
         return style.joint_units(shown, "q")[joint]
     rows = log.applied(shown)
-    tau = inverse_dynamics(log.robot, rows)
+    tau = needed_torques(log.robot, rows, log.laws)
     measured, fitted = rows.u[:, joint], log.fit.at(log.robot, tau, rows)[:, joint]
     if not np.array_equal(measured, shown.u[:, joint]):
         style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")
@@ -95,9 +95,9 @@ def _draw_spectra(axes: Axes, report: CheckReport, names: list[str]) -> None:
     if shown.size:
         top = 5.0 * float(shown.max())
         axes.set_ylim(max(0.1 * float(shown.min()), top * 10.0**-DECADES), top)
-    preparation = Preparation() if inputs.prepared is None else inputs.prepared.preparation
+    cutoff = inputs.cutoff
     title = "Acceleration as logged: no filter"
-    if preparation.cutoff is not None:
-        axes.axvline(float(preparation.cutoff), color=style.TRUTH, linestyle="--", linewidth=1.0, label="cut-off")
-        title = f"Acceleration as logged, and the cut-off at {float(preparation.cutoff):.3g} Hz"
+    if cutoff is not None:
+        axes.axvline(float(cutoff), color=style.TRUTH, linestyle="--", linewidth=1.0, label="cut-off")
+        title = f"Acceleration as logged, and the cut-off at {float(cutoff):.3g} Hz"
     style.quiet(axes, title=title, x="frequency [Hz]", y="(rad/s²)² / Hz" if inputs.rotates.all() else "power / Hz")

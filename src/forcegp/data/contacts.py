@@ -1,24 +1,25 @@
-"""Do the rows of a log bear out its contacts: their direction, their point, their force, and whether one is missing.
+"""In which rows of a log a contact acts, and whether the rows bear out where it is and that it pushes.
 
-Right contacts leave of `a - a_C(q, v, u)`, with a_C the acceleration of Gauss' principle, friction and noise alone. So
-this residual is fitted by friction of the joints and the tool (a linear basis seen through H), and compared with the
-same under other contacts: with the point moved, without any, or with one that the motion shows.
+How the point moves shows whether it stays on its surface. Where the force acts shows in what is left of the
+accelerations once friction is fitted, by linear least squares: it is compared with the same under other contacts, with
+the point moved, or without any.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 import forcegp.mechanics
-from forcegp.data.contact_residual import BLOCKS, Residual, missing_contact, moved_points, tensors
 from forcegp.data.dataset import Dataset
-from forcegp.data.findings import Finding, look, wrong
-from forcegp.data.row_selection import move_on
-from forcegp.data.successive_rows import white_noise
+from forcegp.data.views import evenly, move_on, tensors, white_noise
+from forcegp.doubts import Doubts, look, wrong
 from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
@@ -54,9 +55,9 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
             f"the dataset has {'no model' if model is None else 'a model without contacts'}; rows in contact can "
             "only be found for a model that lists its contacts: dataclasses.replace(dataset, model=...)."
         )
-    recovery = _recovery(model)
+    recovery = recovery_of(model)
     with torch.no_grad():
-        motions = _point_motions(dataset, model)
+        motions = point_motions(dataset, model)
     columns = []
     for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
         if isinstance(contact, forcegp.mechanics.LoopClosure) or contact.switch is not None:
@@ -88,7 +89,7 @@ def rows_in_contact(dataset: Dataset) -> Dataset:
     return dataset.rows(together)
 
 
-class _PointMotion(NamedTuple):
+class PointMotion(NamedTuple):
     """The point of a contact in every row, in m, m/s and m/s^2; `rate` and `residual` A a - b are along the normal.
 
     `noise` is the standard deviation of A a that the noise on the acceleration makes; 0 where it is not known. Those
@@ -105,11 +106,9 @@ class _PointMotion(NamedTuple):
     speed_noise: Float[np.ndarray, " rows"]
 
 
-def _point_motions(
-    dataset: Dataset,
-    model: forcegp.Model,
-    noise_seen: tuple[np.ndarray, ...] | None = None,
-) -> list[_PointMotion]:
+def point_motions(
+    dataset: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...] | None = None
+) -> list[PointMotion]:
     """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
     q, v, u, a = tensors(dataset)
     state = model.state(q, v, u)
@@ -125,16 +124,16 @@ def _point_motions(
         distance, rate = contact.distance(state.kinematics) / size, (A * v).sum(-1) / size
         residual = ((A * a).sum(-1) - b) / size
         noises = (A * sigma).norm(dim=-1) / size, (A * wander).norm(dim=-1) / size, (J * wander).flatten(1).norm(dim=-1)
-        motions.append(_PointMotion(*(x.numpy() for x in (distance, rate, speed, acceleration, residual, *noises))))
+        motions.append(PointMotion(*(x.numpy() for x in (distance, rate, speed, acceleration, residual, *noises))))
     return motions
 
 
-def _recovery(model: forcegp.Model) -> float:
+def recovery_of(model: forcegp.Model) -> float:
     """Baumgarte's omega [1/s]."""
     return 0.0 if model.baumgarte is None else model.baumgarte.omega
 
 
-def _acting(motion: _PointMotion, recovery: float) -> Bool[np.ndarray, " rows"]:
+def _acting(motion: PointMotion, recovery: float) -> Bool[np.ndarray, " rows"]:
     """The three conditions of `contact_rows`."""
     distance, residual = motion.distance, motion.residual
     along = np.sqrt(np.maximum(motion.speed**2 - motion.rate**2, 0.0))
@@ -155,9 +154,7 @@ MOST_ROWS = 240
 FEWEST_ROWS = 10
 
 FAR = 0.01  # m
-HARDLY_ANY = 0.2
-"""Share of rows that move along a surface, below which it is another one."""
-
+HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is another one
 BROKEN, NOISE = 0.2, 3.0
 """|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
 
@@ -167,43 +164,49 @@ MOVED_GAIN = 0.7
 NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
+MANY_ROWS = 40  # from which on friction may also turn a link about the normal of a contact
+BLOCKS = 6  # stretches that are left out in turn, for standard deviations
+STEP = 1e-3  # m
+SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
+FLOOR = 1e-14
 
-def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> list[Finding]:
+
+def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doubts:
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
-    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere), "no force"
-    or "missing". Not for contacts that hold several points of one body, nor for robots with closed loops.
+    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere) or
+    "no force". Not for contacts that hold several points of one body, nor for robots with closed loops.
     """
     model = dataset.model if model is None else model
-    if model is None or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
-        return []
+    if model is None or not model.contacts or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
+        return Doubts()
     seen = [white_noise(dataset, signal=name) if move_on(dataset) else None for name in ("v", "a")]
     noise = tuple(np.zeros(dataset.nv) if each is None else np.nan_to_num(each) for each in seen)
-    rows = dataset.rows(np.unique(np.linspace(0, len(dataset) - 1, MOST_ROWS).astype(int)))
+    rows = dataset.rows(evenly(dataset, MOST_ROWS))
     with torch.no_grad():
         try:
-            return _stated(rows, model.to("cpu"), noise) if model.contacts else _missing(rows, model.to("cpu"))
+            return _stated(rows, model.to("cpu"), noise)
         except (ForceGPError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
-            return []  # states that no contact bears: who computes with them raises what is wrong
+            return Doubts()  # states that no contact bears: who computes with them raises what is wrong
 
 
-def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> list[Finding]:
+def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> Doubts:
     touching = np.ones(len(rows), dtype=bool)
-    motions = _point_motions(rows, model, noise_seen)
+    motions = point_motions(rows, model, noise_seen)
     for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
         acts = (
             np.ones(len(rows), bool) if contact.switch is None else rows.u[:, model.inputs.index(contact.switch)] > 0.5
         )
         if not acts.any():
             continue
-        motion = _PointMotion(*(values[acts] for values in motion))
+        motion = PointMotion(*(values[acts] for values in motion))
         distance, rate = motion.distance, np.abs(motion.rate)
         residual, acceleration, noise = (
             float(np.median(np.abs(values))) for values in (motion.residual, motion.acceleration, motion.noise)
         )
         broken = residual > max(BROKEN * acceleration, NOISE * noise)
-        recovered = _recovery(model) * np.minimum(np.abs(distance), FARTHEST)
+        recovered = recovery_of(model) * np.minimum(np.abs(distance), FARTHEST)
         slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered + 2.0 * motion.rate_noise
         moves = motion.speed > 2.0 * (CREEP + motion.speed_noise)
         along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= FARTHEST)
@@ -212,7 +215,7 @@ def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, .
         share = float(along[moves].mean()) if moves.any() else 1.0
         far = float(np.median(np.abs(distance[along]))) if along.any() else float(np.median(np.abs(distance)))
         if share < HARDLY_ANY and not broken:
-            return []  # states that no contact holds, but accelerations that obey it: drawn, not recorded
+            return Doubts()  # states that no contact holds, but accelerations that obey it: drawn, not recorded
         if share < HARDLY_ANY:
             far = float(np.median(np.abs(distance)))
             seen = (
@@ -225,16 +228,16 @@ def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, .
             touching[acts] &= along
             continue
         numbers = {"kind": "off", "contact": index, "share": share, "distance": far}
-        return [wrong(subject="contact", seen=f"{what}{seen}", remedy=remedy, numbers=numbers)]
+        return Doubts([wrong(about="contact", what=f"{what}{seen}", do=remedy, numbers=numbers)])
     if touching.sum() < FEWEST_ROWS:
-        return []
+        return Doubts()
     return _forces(rows.rows(touching), model)
 
 
-def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
+def _forces(rows: Dataset, model: forcegp.Model) -> Doubts:
     """Whether forces act at the points that the contacts state, and whether there are any."""
     if len(rows) * (rows.nv - len(model.contacts)) < 2 * (3 * rows.nv + 5 * len(model.contacts)):
-        return []
+        return Doubts()
     others, tangents = moved_points(rows, model)
     given = Residual(rows, model, more=others)
     solution, left, weights = given.fitted(extra=True)
@@ -255,10 +258,10 @@ def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
             text = ",".join(f"{value + 0.0:.3g}" for value in np.round(point, 4))
             doubts.append(
                 look(
-                    subject="contact",
-                    seen=f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
+                    about="contact",
+                    what=f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
                     f"{100.0 * min(size, 1.0):.2g} cm ± {100.0 * uncertain:.1g} cm beside the stated point.",
-                    remedy=f"Check the contact's point (near {text}?), or what else presses against the robot.",
+                    do=f"Check the contact's point (near {text}?), or what else presses against the robot.",
                     numbers={
                         "kind": "point",
                         "contact": index,
@@ -271,33 +274,111 @@ def _forces(rows: Dataset, model: forcegp.Model) -> list[Finding]:
     if not doubts and necessary < NO_FORCE:
         doubts.append(
             look(
-                subject="contact",
-                seen="the accelerations show no force of the stated contact: they fit as well without it.",
-                remedy="If nothing was touched, leave the contact out (`contacts=none`).",
+                about="contact",
+                what="the accelerations show no force of the stated contact: they fit as well without it.",
+                do="If nothing was touched, leave the contact out (`contacts=none`).",
                 numbers={"kind": "no force", "gain": necessary},
             )
         )
-    return doubts
+    return Doubts(doubts)
 
 
-def _missing(rows: Dataset, model: forcegp.Model) -> list[Finding]:
-    """A point of a last link that stays on a plane or sphere, with a force that accelerations need."""
-    found = missing_contact(rows, model)
-    if found is None:
-        return []
-    gain, contact = found
-    surface = contact.surface
-    if isinstance(surface, forcegp.mechanics.Plane):
-        normal = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in surface.normal)
-        where = f"a plane with the normal ({normal})"
-    else:
-        where = "a sphere" if isinstance(surface, forcegp.mechanics.Sphere) else "a surface"
-    return [
-        look(
-            subject="contact",
-            seen=f"no contact is stated, but link {contact.frame!r} stays on {where}, and the accelerations "
-            "need a force along its normal.",
-            remedy="State it (`contacts`), or leave out the rows in contact.",
-            numbers={"kind": "missing", "frame": contact.frame, "gain": gain},
-        )
+class Residual:
+    """Accelerations that friction and some more columns leave of `a` under a model's contacts, joint by joint.
+
+    `friction` (rows, nv, k) are joint forces of the friction that may be there (default: of joints and contacts),
+    `more` the same model with something moved by STEP, whose effect is one more column each.
+    """
+
+    def __init__(
+        self,
+        rows: Dataset,
+        model: forcegp.Model,
+        friction: Float[Tensor, "rows nv k"] | None = None,
+        more: Sequence[forcegp.Model] = (),
+    ) -> None:
+        q, v, u, a = tensors(rows)
+        dynamics = model.dynamics(q, v, u)
+        given = dynamics.acceleration_map().offset
+        self.friction = _friction(rows, model, dynamics) if friction is None else friction
+        moved = [(other.dynamics(q, v, u).acceleration_map().offset - given) / STEP for other in more]
+        columns = torch.cat([dynamics.H @ self.friction, *(each[..., None] for each in moved)], dim=-1)
+        self.extra = len(moved)
+        parts = torch.cat([columns, (a - given)[..., None]], dim=-1).numpy()
+        size = np.linalg.norm(parts, axis=(0, 1))
+        self.used = size > 1e-9 * max(float(size.max()), 1e-300)
+        self.used[-1] = True
+        self.size = np.where(self.used, np.maximum(size, 1e-300), 1.0)
+        self.blocks = np.array_split(parts / self.size * self.used, BLOCKS)
+        self.count = len(rows)
+
+    def grams(self) -> Float[np.ndarray, "blocks nv k k"]:
+        """Products of all columns, the residual last, for successive blocks of rows."""
+        return np.stack([np.einsum("rjk,rjl->jkl", block, block) for block in self.blocks])
+
+    def solved(
+        self, gram: Float[np.ndarray, "nv k k"], weights: Float[np.ndarray, " nv"], extra: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (k,), and the power (nv,) that is left in every joint; with the columns of `more` if `extra`."""
+        count = gram.shape[-1] - 1
+        used = np.flatnonzero(self.used[:-1] & ((np.arange(count) < count - self.extra) | extra))
+        total = np.tensordot(weights, gram, 1)
+        solution = np.zeros(count + 1)
+        if len(used):
+            solution[used] = -np.linalg.lstsq(total[np.ix_(used, used)], total[used, -1], rcond=1e-12)[0]
+        solution[-1] = 1.0
+        left = np.maximum(np.einsum("k,jkl,l->j", solution, gram, solution), FLOOR * gram[:, -1, -1]) + 1e-300
+        return -solution[:-1] / self.size[:-1] * self.size[-1], left * self.size[-1] ** 2
+
+    def fitted(
+        self, extra: bool = False, weights: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coefficients, power left, and weights: those given, or in proportion to 1 over the power that is left."""
+        gram = self.grams().sum(axis=0)
+        chosen = 1.0 / np.maximum(gram[:, -1, -1], 1e-300) if weights is None else weights
+        for _ in range(3 if weights is None else 0):
+            chosen = self.size[-1] ** 2 / self.solved(gram, chosen, extra)[1]
+        return *self.solved(gram, chosen, extra), chosen
+
+
+def _friction(
+    rows: Dataset, model: forcegp.Model, dynamics: forcegp.mechanics.ConstrainedDynamics
+) -> Float[Tensor, "rows nv k"]:
+    """Joint forces of viscous and dry friction and constants in every joint, and of friction at every contact."""
+    state, v = dynamics.state, dynamics.state.v
+    slow = SLOW * v.square().mean(0).sqrt() + 1e-12
+    forces = [
+        torch.diag_embed(v),
+        torch.diag_embed(torch.tanh(v / slow)),
+        torch.eye(rows.nv).to(v).expand(len(v), -1, -1),
     ]
+    multipliers = dynamics.multiplier_map().offset.abs()
+    many = len(v) >= MANY_ROWS
+    for index, contact in enumerate(model.contacts):
+        J, turning = state.kinematics.frame_jacobian(contact.frame, contact.point).split(3, dim=1)
+        velocity = (J @ v[..., None])[..., 0]
+        speed = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
+        direction = velocity / (speed + SLOW * speed.square().mean().sqrt() + 1e-12)
+        tangential = torch.stack([velocity, direction, direction * multipliers[:, [index]]], dim=-1)
+        forces.append(J.mT @ tangential)
+        if many:  # friction beside the stated point turns the link about the normal
+            along = turning.mT @ dynamics.normals[:, index, :, None]
+            forces.append(along * torch.cat([velocity, direction * multipliers[:, [index]]], dim=-1)[:, None])
+    return torch.cat(forces, dim=-1)
+
+
+def moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Model], list[np.ndarray]]:
+    """The model with each contact point moved along the surface, in both directions of the link's frame."""
+    kinematics = model.robot.kinematics(torch.tensor(rows.q))
+    others, tangents = [], []
+    for index, contact in enumerate(model.contacts):
+        normal = contact.surface.gradient(contact.position(kinematics))
+        local = (kinematics.frame_pose(contact.frame)[:, :3, :3].mT @ normal[..., None])[..., 0].numpy()
+        across = np.linalg.eigh(local.T @ local)[1][:, :2].T  # the directions that are least along the normal
+        for direction in across:
+            point = tuple(np.asarray(contact.point) + STEP * direction)
+            contacts = list(model.contacts)
+            contacts[index] = replace(contact, point=point)
+            others.append(model.with_contacts(contacts))
+        tangents.append(across)
+    return others, tangents

@@ -1,0 +1,353 @@
+"""`Filter`: what a linear filter makes of signals, its gain, and for how long the noise behind it remembers itself."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float
+from scipy.interpolate import CubicSpline
+
+from forcegp.data.configurations import actuators, continuous, rates, space_of, through
+from forcegp.data.dataset import Dataset
+from forcegp.data.dataset_fields import unit_of_each
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.robots.arguments import whole_number
+from forcegp.robots.manifold import ConfigurationSpace
+
+Signal = Literal["q", "v", "u", "a"]
+Values = Float[np.ndarray, "rows columns"]
+
+TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours
+
+
+class Filter(ABC):
+    """A linear filter of signals in time; `(a >> b)(values, time)` is b behind a."""
+
+    @abstractmethod
+    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+        """The values behind the filter, at the same times [s]."""
+
+    @abstractmethod
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
+        """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]."""
+
+    @property
+    def memory(self) -> float:
+        """Time [s] within which noise behind the filter repeats itself: rows closer than that count as one."""
+        return 0.0
+
+    def __rshift__(self, other: Filter) -> Filter:
+        return Chain((self, other))
+
+
+@dataclass(frozen=True)
+class Chain(Filter):
+    """Filters one after the other."""
+
+    parts: tuple[Filter, ...]
+
+    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+        """Through all of them."""
+        for part in self.parts:
+            values = part(values, time)
+        return values
+
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
+        """The product."""
+        return np.prod([part.gain(frequency, rate) for part in self.parts], axis=0)
+
+    @property
+    def memory(self) -> float:
+        """That of the slowest."""
+        return max(part.memory for part in self.parts)
+
+
+@dataclass(frozen=True)
+class LowPass(Filter):
+    """Butterworth low-pass at `cutoff` Hz, run forwards and backwards so that nothing is delayed.
+
+    Both ends are continued by point reflection until the filter's transient has died out, so that straight lines pass.
+    Two passes square the gain: `1 / (1 + (tan(pi f / f_s) / tan(pi f_c / f_s))^(2 order))`, so 1/2 at the cut-off.
+    Raises InvalidInput for a cut-off at or above half the sample rate, DatasetError for too few rows.
+    """
+
+    cutoff: float
+    order: int = 4
+
+    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+        """Filtered, for rows at even times. Raises as `uniform_step`."""
+        rate = 1.0 / uniform_step(time)
+        if not 0 < self.cutoff < rate / 2:
+            raise InvalidInput(
+                f"cutoff is {self.cutoff} Hz; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate."
+            )
+        whole_number("order", self.order, 1, 12)
+        from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
+
+        sections = butter(self.order, self.cutoff, fs=rate, output="sos")
+        slowest = np.abs(butter(self.order, self.cutoff, fs=rate, output="zpk")[1]).max()
+        padding = max(int(np.ceil(np.log(TRANSIENT) / np.log(slowest))), self.order + 1)
+        if len(values) <= padding:
+            raise DatasetError(
+                f"{len(values)} rows are too few for a filter of order {self.order} with a cut-off at {self.cutoff} Hz;"
+                f" more than {padding} are needed. Use a higher cut-off, or leave the episode out."
+            )
+        return sosfiltfilt(sections, values, axis=0, padlen=padding)
+
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
+        """Real, and 0 at half the rate."""
+        with np.errstate(over="ignore"):  # infinite at half the sample rate, where nothing passes
+            warped = np.tan(np.pi * frequency / rate) / np.tan(np.pi * self.cutoff / rate)
+            return 1.0 / (1.0 + np.abs(warped) ** (2 * self.order)) + 0j
+
+    @property
+    def time_constant(self) -> float:
+        """Of its slowest pole [s]."""
+        return 1.0 / (2.0 * np.pi * self.cutoff * np.sin(0.5 * np.pi / self.order))
+
+    @property
+    def memory(self) -> float:
+        """A third of the period of the cut-off."""
+        return 1.0 / (PASSED * self.cutoff)
+
+
+@dataclass(frozen=True)
+class Later(Filter):
+    """The values so many seconds later, by a cubic spline; those at the ends hold beyond them."""
+
+    seconds: float
+
+    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+        """At `time + seconds`."""
+        if self.seconds == 0.0:
+            return values
+        return CubicSpline(time, values)(np.clip(time + self.seconds, time[0], time[-1]))
+
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
+        """Of size 1."""
+        return np.exp(2j * np.pi * frequency * self.seconds)
+
+
+@dataclass(frozen=True)
+class Lag(Filter):
+    """What an actuator of first order with that time constant makes of values, at rest with the first of them.
+
+    By Tustin's rule (trapezoids), exact for values that are linear between equal steps of time up to the square of
+    step over time constant.
+    """
+
+    seconds: float
+
+    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+        """T x' + x = values."""
+        step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        if self.seconds <= 0.25 * step:
+            return values
+        from scipy.signal import lfilter
+
+        ratio = 2.0 * self.seconds / step
+        return np.asarray(lfilter([1.0, 1.0], [1.0 + ratio, 1.0 - ratio], values - values[0], axis=0)) + values[0]
+
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
+        """Of the differential equation."""
+        return 1.0 / (1.0 + 2j * np.pi * frequency * self.seconds)
+
+
+@dataclass(frozen=True)
+class Mean(Filter):
+    """Means over windows of `rows` rows about each, an odd number; windows are shorter at the ends."""
+
+    rows: int
+
+    def __call__(self, values: Values, time: Float[np.ndarray, " rows"] | None = None) -> Values:
+        """Averaged."""
+        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+        place = np.arange(len(values))
+        first = np.maximum(place - self.rows // 2, 0)
+        last = np.minimum(place + self.rows // 2 + 1, len(values))
+        return (total[last] - total[first]) / (last - first)[:, None]
+
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
+        """Dirichlet's kernel."""
+        angles = 2.0 * np.pi * frequency / rate
+        return np.cos(np.outer(np.arange(self.rows) - self.rows // 2, angles)).mean(axis=0) + 0j
+
+
+def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q", "v", "u", "a")) -> Dataset:
+    """The Dataset with the named signals behind a `LowPass` within each episode.
+
+    Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Filtering q,
+    v or u drops `truth`: with it, the equation of motion would no longer hold in the changed rows. Switches of contacts
+    stay as they are. Raises as `LowPass`, naming the episode; DatasetError for rows that are not in order of time, for
+    positions that jump by a turn, and for a base that turns faster than the filter passes.
+    """
+    if not signals or not set(signals) <= {"q", "v", "u", "a"}:
+        raise InvalidInput(f"signals are {tuple(signals)!r}; allowed: one or more of q, v, u, a.")
+    smooth = LowPass(cutoff)
+
+    def filtered(name: str, rows: Dataset, label: str) -> np.ndarray:
+        if name == "q":
+            require_no_turns(rows, label)
+            return through(space_of(rows), rows.q, lambda q: smooth(q, rows.time))
+        values = getattr(rows, name)
+        forces = actuators(rows) if name == "u" else rows.nv
+        return np.concatenate([smooth(values[:, :forces], rows.time), values[:, forces:]], axis=1)
+
+    changed = by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
+    noise_std = None if "a" in signals else dataset.noise_std
+    return replace(dataset, **changed, truth=dataset.truth if set(signals) == {"a"} else {}, noise_std=noise_std)
+
+
+def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
+    """The dataset with each actuator's force taken so many seconds later, after a lag [s] where one is given."""
+    ways = [Lag(lag) >> Later(each) for each, lag in zip(seconds, lags or [0.0] * len(seconds), strict=True)]
+
+    def acting(rows: Dataset, label: str) -> dict[str, np.ndarray]:
+        moved = [way(rows.u[:, joint], rows.time) for joint, way in enumerate(ways)]
+        return {"u": np.column_stack([*moved, rows.u[:, len(moved) :]])}
+
+    return replace(dataset, **by_episode(dataset, acting), truth={})
+
+
+JITTER = 0.01
+"""Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
+
+
+def differentiate(
+    values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"], space: ConfigurationSpace | None = None
+) -> np.ndarray:
+    """Central differences, second order also at both ends and for unequal steps (three-point Lagrange formulas).
+
+    Units: those of `values` per second. Positions of a `space` in which they do not add up give velocities (rows, nv)
+    in body axes. Raises DatasetError for fewer than three rows or time that does not increase.
+    """
+    if len(values) < 3:
+        raise DatasetError(f"{len(values)} rows are too few to differentiate; at least 3 are needed.")
+    if len(time) != len(values) or not (np.diff(time) > 0).all():
+        raise DatasetError(f"time must have {len(values)} entries that increase strictly.")
+    if space is not None and not space.is_vector_space:
+        return rates(space, values, time)
+    return np.gradient(values, time, axis=0, edge_order=2)
+
+
+def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording") -> float:
+    """The sampling interval [s]. Raises DatasetError if steps differ by more than `JITTER` (1 %) from their median."""
+    if len(time) < 2:
+        raise DatasetError(f"{name} has {len(time)} row; at least 2 are needed.")
+    steps = np.diff(time)
+    median = float(np.median(steps))
+    worst = int(np.argmax(np.abs(steps - median)))
+    if median <= 0 or abs(steps[worst] - median) > JITTER * median:
+        raise DatasetError(
+            f"{name} is not sampled uniformly: the step after row {worst} is {steps[worst]:.6g} s, the median "
+            f"{median:.6g} s. Resample it first (forcegp.data.resample)."
+        )
+    return float((time[-1] - time[0]) / (len(time) - 1))
+
+
+def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset:
+    """The Dataset with `a` computed from `v` by central differences, or `v` and `a` from `q`, within each episode.
+
+    Differences amplify noise: filter `source` first (`low_pass`). `noise_std` becomes None. `truth` is dropped where
+    `v` changes: the equation of motion would no longer hold with it. Raises DatasetError for rows that are not in
+    order of time, episodes of fewer than 3 rows and positions that jump by a turn; InvalidInput for another source.
+    """
+    if source not in ("q", "v"):
+        raise InvalidInput(f"source is {source!r}; allowed: 'q' (gives v and a) or 'v' (gives a).")
+
+    def derivatives(rows: Dataset, label: str) -> dict[str, np.ndarray]:
+        if source == "v":
+            return {"a": differentiate(rows.v, rows.time)}
+        require_no_turns(rows, label)
+        velocity = differentiate(rows.q, rows.time, space_of(rows))
+        return {"v": velocity, "a": differentiate(velocity, rows.time)}
+
+    truth = dataset.truth if source == "v" else {}
+    return replace(dataset, **by_episode(dataset, derivatives), truth=truth, noise_std=None)
+
+
+def resample(dataset: Dataset, step: float) -> Dataset:
+    """The Dataset at uniform times, `step` [s] apart, by a cubic spline through each signal of each episode.
+
+    Switches of contacts are those of the row before.
+    Filter first (`low_pass`) when going to a longer step: a spline does not remove what the new rate cannot carry.
+    `truth` and `noise_std` are dropped, since interpolation makes neither. Raises InvalidInput for a step <= 0 or
+    longer than an episode, DatasetError for rows that are not in order of time or positions that jump by a turn.
+    """
+    if not (np.isfinite(step) and step > 0):
+        raise InvalidInput(f"step is {step} s; it must be > 0.")
+    parts: list[dict[str, np.ndarray]] = []
+    for number, rows, label in episodes_in_order(dataset):
+        require_no_turns(rows, label)
+        duration = rows.time[-1] - rows.time[0]
+        count = int(np.floor(duration / step * (1 + 1e-12))) + 1
+        if count < 2:
+            raise InvalidInput(f"step is {step} s, longer than {label} ({duration:.6g} s).")
+        time = np.minimum(rows.time[0] + step * np.arange(count), rows.time[-1])
+
+        def spline(values: np.ndarray, own: np.ndarray = rows.time, time: np.ndarray = time) -> np.ndarray:
+            return CubicSpline(own, values, axis=0)(time)
+
+        signals = {name: spline(getattr(rows, name)) for name in ("v", "u", "a")}
+        signals["q"] = through(space_of(rows), rows.q, spline)
+        before = np.searchsorted(rows.time, time * (1 + 1e-12), side="right") - 1
+        signals["u"][:, actuators(rows) :] = rows.u[before, actuators(rows) :]
+        parts.append({**signals, "time": time, "episode": np.full(count, number)})
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return replace(dataset, **joined, truth={}, noise_std=None)
+
+
+def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
+    """Number, rows and name for messages of every episode. Raises DatasetError for rows not in order of time."""
+    if not dataset.time_ordered:
+        raise DatasetError(
+            "the rows are not in order of time (a sample of rows?); filter the whole recording, then sample."
+        )
+    return [(number, dataset.select_episodes([number]), f"episode {number}") for number in dataset.episodes]
+
+
+def sums_before(
+    values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"], seconds: float
+) -> Float[np.ndarray, "rows k"]:
+    """Sums of the rows before each, with weights exp(-age / seconds); zero for the first."""
+    sums = np.zeros_like(values)
+    keep = np.exp(-np.diff(time) / seconds)
+    for row in range(1, len(values)):
+        sums[row] = keep[row - 1] * (sums[row - 1] + values[row - 1])
+    return sums
+
+
+def by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Apply `change` to each episode and put its rows back where they came from."""
+    result: dict[str, np.ndarray] = {}
+    for number, rows, label in episodes_in_order(dataset):
+        try:
+            changed = change(rows, label)
+        except DatasetError as error:
+            raise error if label in str(error) else DatasetError(f"{label}: {error}") from error
+        for name, values in changed.items():
+            result.setdefault(name, np.empty_like(values, shape=(len(dataset), *values.shape[1:])))
+            result[name][dataset.episode == number] = values
+    return result
+
+
+def require_no_turns(rows: Dataset, label: str) -> None:
+    """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
+    space = space_of(rows)
+    continuous(space, rows.q)
+    units = unit_of_each("q", rows.units["q"], rows.nv)
+    angular = [units[k] == "rad" for k in space.single_rows]
+    jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi
+    if jumps.any():
+        row, column = np.argwhere(jumps)[0]
+        joint = rows.joint_names[np.asarray(space.single_rows)[angular][column]]
+        raise DatasetError(
+            f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
+            "Unwrap it first (np.unwrap(q, axis=0))."
+        )

@@ -1,0 +1,331 @@
+"""Views of a log: rows that follow each other, windows, motions of equal length, and which rows to take."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from forcegp.data.dataset import Dataset
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.model import Model
+from forcegp.robots.arguments import whole_number
+
+Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
+"""Which rows: numbers of at most so many of a log, such as `evenly` and `farthest` give."""
+
+BLOCK = 4096  # rows
+EVEN_STEPS = 1e-3  # time steps of a recording count as equal within this fraction
+LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
+
+
+def tensors(rows: Dataset, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """q, v, u and a of the rows."""
+    return tuple(torch.tensor(getattr(rows, name), device=device) for name in "qvua")  # type: ignore[return-value]
+
+
+def in_blocks(
+    rows: Dataset, of: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]], device: torch.device | str
+) -> list[np.ndarray]:
+    """What `of(q, v, u, a)` gives for blocks of rows, joined; without gradients, and with little memory."""
+    states, parts = tensors(rows, device), []
+    with torch.no_grad():
+        for start in range(0, len(rows), BLOCK):
+            parts.append(of(*(x[start : start + BLOCK] for x in states)))
+    return [torch.cat(own).cpu().numpy() for own in zip(*parts, strict=True)]
+
+
+def evenly(dataset: Dataset, count: int) -> Int[np.ndarray, " chosen"]:
+    """Rows at even distances over the log, the first and the last among them; a `Select`."""
+    return np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(int))
+
+
+def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
+    """Whether the next row belongs to the same episode and follows; False for the last row."""
+    return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
+
+
+def move_on(dataset: Dataset) -> bool:
+    """Whether rows that follow each other belong to one motion; a sample of rows or of random states leaps about."""
+    steps = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]]
+    spread = dataset.q.std(axis=0)
+    moving = spread > 0.0
+    if not len(steps) or not moving.any():
+        return bool(len(steps))
+    return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
+
+
+def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
+    """First rows of all runs of True, and the rows after them."""
+    return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)
+
+
+def whole_windows(dataset: Dataset, width: int) -> Int[np.ndarray, " windows"]:
+    """First rows of the windows of so many rows that lie within an episode."""
+    breaks = np.cumsum(np.insert(~consecutive(dataset), 0, False))
+    first = np.arange(max(0, len(dataset) - width + 1))
+    return first[breaks[first + width - 1] == breaks[first]]
+
+
+def window_means(values: Float[np.ndarray, "rows k"], first: np.ndarray, width: int) -> Float[np.ndarray, "windows k"]:
+    """Means over `width` rows from each of the `first` on."""
+    sums = np.cumsum(np.insert(values, 0, 0.0, axis=0), axis=0)
+    return (sums[first + width] - sums[first]) / width
+
+
+def with_memory(dataset: Dataset, model: Model) -> Dataset:
+    """The log with the columns of u that `model.memory` names: one scan over each episode, from where it begins.
+
+    Rows before the first reversal depend on that beginning, which no log tells. Raises InvalidInput for rows that are
+    not in order of time, since a sample has no past.
+    """
+    memory = model.memory
+    if not memory.names or dataset.u.shape[1] == len(model.inputs):
+        return dataset
+    if not dataset.time_ordered:
+        raise InvalidInput(
+            f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
+        )
+    columns = np.zeros((len(dataset), len(memory.names)))
+    for episode in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == episode)
+        q, time = (torch.as_tensor(np.array(x[rows]), device=model.robot.device) for x in (dataset.q, dataset.time))
+        columns[rows] = memory.along(q, time).cpu().numpy()
+    first = model.inputs.index(memory.names[0])
+    u = np.concatenate([dataset.u[:, :first], columns, dataset.u[:, first:]], axis=1)
+    return replace(dataset, u=u, model=model.known)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMotions:
+    """B recorded motions of T steps of `dt` seconds; in row k of a motion u[k] acts until row k + 1.
+
+    q, v: (B, T+1, nv) and u: (B, T, nv) in the units of the Dataset; `rows` where each begins in it.
+    """
+
+    rows: tuple[int, ...]
+    dt: float
+    q: Float[np.ndarray, "motions rows nq"]
+    v: Float[np.ndarray, "motions rows nv"]
+    u: Float[np.ndarray, "motions steps nu"]
+
+    @property
+    def time(self) -> Float[np.ndarray, " rows"]:
+        """Seconds since the beginning of each motion."""
+        return self.dt * np.arange(self.q.shape[1])
+
+
+def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: float) -> RecordedMotions:
+    """The motions of that length that begin at the given rows, or at so many rows spread evenly over the recording.
+
+    A number of starts takes motions without a gap, where there are any.
+    Raises InvalidInput for rows at which no motion of that length begins, for steps of time that are not equal, and for
+    a length of less than one step.
+    """
+    if not dataset.time_ordered:
+        raise InvalidInput("the rows of the dataset are not in the order of time; give a whole recording.")
+    dt, before = _even_steps(dataset)
+    if not (np.isfinite(seconds) and seconds > 0 and round(seconds / dt) >= 1):
+        raise InvalidInput(f"the length is {seconds} s; it must be at least one step of the recording, {dt:.4g} s.")
+    steps = round(seconds / dt)
+    possible = whole_windows(dataset, steps + 1)
+    if not possible.size:
+        longest = np.unique(dataset.episode, return_counts=True)[1].max() - 1
+        raise InvalidInput(
+            f"no episode lasts {steps * dt:.4g} s: the longest has {dt * longest:.4g} s; ask for fewer seconds."
+        )
+    if isinstance(starts, int):
+        if starts < 1:
+            raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
+        whole = possible[before[possible + steps] == before[possible]]
+        possible = whole if whole.size else possible  # which is refused then
+        chosen = possible[np.unique(np.linspace(0, len(possible) - 1, starts).round().astype(int))]
+    else:
+        chosen = np.asarray(starts, dtype=int)
+        for row in chosen[~np.isin(chosen, possible)][:1]:
+            raise InvalidInput(
+                f"no motion of {steps * dt:.4g} s begins at row {row} of the {len(dataset)} rows within its episode; "
+                "start earlier, or ask for fewer seconds."
+            )
+    for row in chosen[before[chosen + steps] != before[chosen]][:1]:
+        pauses = np.diff(dataset.time[row : row + steps + 1])
+        worst = int(np.abs(pauses - dt).argmax())
+        raise InvalidInput(
+            f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere; resample "
+            "the recording to equal steps, or start where there is no gap."
+        )
+    index = chosen[:, None] + np.arange(steps + 1)
+    return RecordedMotions(tuple(chosen.tolist()), dt, dataset.q[index], dataset.v[index], dataset.u[index[:, :-1]])
+
+
+def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[RecordedMotions, int]:
+    """The recording cut into stretches of that length, and of how many of its rows a step of `longest_step` s may be.
+
+    Stretches with a gap are left out; their length is a multiple of the steps. Raises InvalidInput where none is left.
+    """
+    dt, before = _even_steps(dataset)
+    stride = max(1, int(longest_step / dt * (1.0 + EVEN_STEPS)))
+    steps = stride * max(1, round(seconds / dt / stride))
+    starts = list[int]()
+    for number in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == number)
+        firsts = rows[: len(rows) - steps : steps]
+        starts += firsts[before[firsts + steps] == before[firsts]].tolist()
+    if not starts:
+        raise InvalidInput(
+            f"no stretch of {steps * dt:.4g} s has equal steps of {dt:.4g} s; give fewer seconds, or resample the "
+            "recording (forcegp import does)."
+        )
+    return recorded_motions(dataset, starts, steps * dt), stride
+
+
+def _even_steps(dataset: Dataset) -> tuple[float, Int[np.ndarray, " rows"]]:
+    """The median step of time [s], and how many steps before each row are not of that length."""
+    pauses = np.diff(dataset.time)
+    own = pauses[consecutive(dataset)[:-1]]
+    if not own.size:
+        raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")
+    dt = float(np.median(own))
+    return dt, np.concatenate([[0], np.cumsum(np.abs(pauses - dt) > EVEN_STEPS * dt)])
+
+
+MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
+FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
+
+
+def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.ndarray, " nv"] | None:
+    """Standard deviation of noise on a signal, or on its means over `width` rows, from differences of successive ones.
+
+    The k-th difference of white noise has the variance binomial(2k, k), that of a smooth motion falls with k: NaN where
+    it is motion that is seen. Medians, since impacts are no noise. None for rows out of order and fewer than 30.
+    """
+    if not log.time_ordered:
+        return None
+    noise = []
+    for order, variance in ((3, 20.0), (4, 70.0)):
+        first = whole_windows(log, width * (order + 1))
+        if len(first) < FEWEST_DIFFERENCES:
+            return None
+        first = first[:: max(1, len(first) // MOST_DIFFERENCES)]
+        means = np.stack([window_means(getattr(log, signal), first + k * width, width) for k in range(order + 1)])
+        differences = np.diff(means, order, axis=0)[0]
+        noise.append(1.4826 * np.median(np.abs(differences), axis=0) / np.sqrt(variance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where((noise[0] < MOTION * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
+
+
+def time_blocks(
+    time: Float[np.ndarray, " rows"], episode: Int[np.ndarray, " _"], seconds: float
+) -> tuple[tuple[int, ...], ...]:
+    """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
+
+    To leave whole blocks out tests the prediction of a part of the motion that was not seen (block cross-validation;
+    Burman, Chow & Nolan 1994, "A cross-validatory method for dependent data").
+
+    `time` [s] and `episode` may come in any order, such as that of `farthest_rows`. Stretches are counted from the
+    first of these rows in every episode; those without rows give no block, so that every row is in exactly one.
+    Raises InvalidInput for a length that is not positive and finite, and for columns of different lengths.
+    """
+    if not 0.0 < seconds < float("inf"):
+        raise InvalidInput(f"seconds is {seconds}; it must be positive and finite.")
+    if time.shape != episode.shape:
+        raise InvalidInput(f"time has {len(time)} rows and episode {len(episode)}; give both for the same rows.")
+    blocks: dict[tuple[int, int], list[int]] = {}
+    first = {int(number): float(time[episode == number].min()) for number in np.unique(episode)}
+    for row in np.lexsort((time, episode)):
+        number = int(episode[row])
+        stretch = int((time[row] - first[number]) / seconds)
+        blocks.setdefault((number, stretch), []).append(int(row))
+    return tuple(tuple(rows) for rows in blocks.values())
+
+
+def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Dataset) -> Int[np.ndarray, " repeated"]:
+    """Numbers of the rows of `test` whose (q, v, u) is exactly one of those in `trained`, each (rows, k)."""
+    # -0.0 becomes 0.0: equal numbers have equal bytes
+    known, rows = (np.hstack(each) + 0.0 for each in (trained, (test.q, test.v, test.u)))
+    found = {row.tobytes() for row in known}
+    return np.array([number for number, row in enumerate(rows) if row.tobytes() in found], dtype=np.int64)
+
+
+def require_disjoint(train: Dataset, test: Dataset) -> None:
+    """Refuse a pair of Datasets in which the test repeats the training.
+
+    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both were simulated or recorded with
+    the same `metadata` (same seed, same configuration) and share an episode: two samples of one trajectory.
+    """
+    repeated = repeated_rows((train.q, train.v, train.u), test)
+    if repeated.size:
+        raise DatasetError(
+            f"{repeated.size} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
+            "Test on another trajectory: another episode, recording or seed."
+        )
+    shared = sorted(set(train.episodes) & set(test.episodes))
+    if train.metadata and train.metadata == test.metadata and shared:
+        raise DatasetError(
+            f"training and test rows come from the same trajectory: equal metadata, episodes {shared} in both. "
+            "Test on another episode, recording or seed."
+        )
+
+
+ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below which a column is constant but for rounding
+
+
+def farthest_point_sampling(
+    points: Float[np.ndarray, "rows features"], count: int, *, start: int = 0
+) -> Int[np.ndarray, " count"]:
+    """Numbers of `count` rows of which each is the farthest from all rows chosen before it.
+
+    Greedy k-centre (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance") with Euclidean distances
+    on columns standardised to zero mean and unit standard deviation. The first row is `start`. The
+    result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are the sample of
+    size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
+    Time O(rows * count * features), memory O(rows * features).
+
+    Raises InvalidInput if `points` is not a finite table, or for a `count` or `start` outside the rows.
+    """
+    table = np.asarray(points)
+    if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():
+        raise InvalidInput(
+            f"points must be a (rows, features) table of finite numbers; given: {table.dtype} {table.shape}."
+        )
+    rows = table.shape[0]
+    count = whole_number("count", count, 1, rows, "the number of rows")
+    columns = _standardized_columns(table)
+    distance = np.full(rows, np.inf)
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
+    for position in range(count):
+        if position:
+            chosen[position] = np.argmax(distance)  # the lowest row number among equals
+        row = chosen[position]
+        # Differences, not |x|^2 - 2 x.y + |y|^2: a repeated row must have distance exactly 0.
+        squared = np.zeros(rows)
+        for column in columns:
+            difference = column - column[row]
+            squared += difference * difference
+        np.minimum(distance, squared, out=distance)
+        distance[row] = -1.0  # never chosen again, not even among repeated rows
+    return chosen
+
+
+def farthest(dataset: Dataset, count: int, *, start: int = 0) -> Int[np.ndarray, " count"]:
+    """The rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`."""
+    return farthest_point_sampling(np.hstack([dataset.q, dataset.v, dataset.u]), count, start=start)
+
+
+def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
+    """A Dataset of the rows that are `farthest`: one of fewer points takes the first, `farthest_rows(...)[:100]`."""
+    return dataset.rows(farthest(dataset, count, start=start))
+
+
+def _standardized_columns(table: np.ndarray) -> np.ndarray:
+    """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
+    columns = np.ascontiguousarray(table.T, dtype=np.float64)
+    scale = np.abs(columns).max(axis=1, keepdims=True)
+    columns = columns / np.where(scale > 0, scale, 1.0)  # so that squaring in std cannot overflow or underflow
+    spread = columns.std(axis=1, keepdims=True)
+    spread[spread < ROUNDING] = 0.0
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)

@@ -1,0 +1,295 @@
+"""One recording from a log: columns in SI, checked, continued, cut at gaps, and its rows as a Dataset has them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import make_interp_spline
+
+import forcegp.robots
+from forcegp.data.filters import JITTER
+from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
+from forcegp.recordings.moving_base import Jumps, Layout, read_poses
+from forcegp.recordings.ros_bag import Read, read_on_one_clock
+from forcegp.recordings.signal_plan import SignalPlan
+from forcegp.recordings.source import Columns, Source
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was read of one table.
+
+    Fields
+    ------
+    label: what people call it, a file or an array in it.
+    signals: those that were logged, (rows, entries) in SI, in the order of a Dataset.
+    time: (rows,) [s] from its first row on.
+    begin: the stamp of the log at the first row, in s.
+    stretches: episode number of the log and numbers of the rows, without gaps.
+    step: the median of the steps between rows that are used [s]; `worst` the largest relative deviation from it within
+        a stretch; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` [s].
+    jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
+        seen, and what to do.
+    """
+
+    label: str
+    source: Source
+    signals: Mapping[str, Float[np.ndarray, "rows entries"]]
+    time: Float[np.ndarray, " rows"]
+    begin: float
+    jumps: tuple[Jumps, ...]
+    layout: Layout
+    notes: tuple[str, ...]
+    stretches: tuple[tuple[int, Int[np.ndarray, " rows"]], ...]
+    step: float
+    worst: float
+    repeated: int
+    gaps: tuple[float, ...]
+    dropped: int
+
+    @property
+    def even(self) -> bool:
+        """Is every step within 1 % of the median?"""
+        return self.worst <= JITTER
+
+    def rows(self, used: Int[np.ndarray, " rows"], step: float | None) -> dict[str, np.ndarray]:
+        """Time and the signals q, v, u, a of these rows, `step` [s] apart, or for None at the times of the log."""
+        time, signals = self.time[used], {name: values[used] for name, values in self.signals.items()}
+        if step is not None:
+            stamps, held = time, list(self.layout.held)
+            count = int(np.floor((stamps[-1] - stamps[0]) / step * (1 + 1e-12))) + 1
+            time = np.minimum(stamps[0] + step * np.arange(count), stamps[-1])
+            before = np.searchsorted(stamps, time * (1 + 1e-12), side="right") - 1
+            u = signals.get("u", np.zeros((len(stamps), 0)))[before]
+            signals = {name: make_interp_spline(stamps, values, k=3)(time) for name, values in signals.items()}
+            if held:
+                signals["u"][:, held] = u[:, held]
+        return {"time": time, **self.layout.signals(signals, time)}
+
+
+def read_recording(
+    source: Source,
+    plan: SignalPlan,
+    label: str,
+    options: Any,
+    robot: forcegp.robots.Robot | None,
+    believed: Collection[str],
+) -> Recording:
+    """Read a table as the `ImportOptions` say; `believed` joints may turn often.
+
+    Raises FileFormatError and DatasetError naming the file, the row, the time and the column.
+    """
+    if not plan.columns:
+        raise FileFormatError(f"{label} has no rows; give a log with rows.")
+    read = read_on_one_clock(source, plan)
+    columns = read.columns
+    rows = len(columns[plan.columns[0]])
+    time, begin = _seconds(plan, source, columns, rows)
+    values = np.stack([item.value(columns, rows) for item in plan.signals], axis=1)
+    _require_finite(values, columns, plan, source, time)
+    episodes = np.zeros((1, 2), np.int64) if plan.episode is None else _episodes(columns[plan.episode], source)
+    jumps = _continued(plan, values, episodes[:, 1], options.unwrap)
+    if not options.beyond_limits:
+        _require_plausible_positions(label, values, plan, robot, believed)
+    signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
+    signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
+    layout = replace(plan.layout, held=read.held or plan.layout.held)
+    stretches = _stretches(label, source, time, episodes, read, options)
+    return Recording(label, source, signals, time, begin, (*jumps, *turned), layout, (*read.notes, *told), *stretches)
+
+
+def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
+    """Seconds since the first row, and its stamp in s.
+
+    Whole numbers are subtracted as such: a float64 has no epochs in ns to 1 ns.
+    """
+    if plan.time is None:
+        assert plan.step is not None
+        return np.arange(rows) * plan.step, 0.0
+    name = next(iter(plan.time.weights))
+    whole = plan.time.is_column and columns[name].dtype == np.int64
+    raw = columns[name] if whole else plan.time.value(columns, rows)
+    if not whole and not np.isfinite(raw).all():
+        row = int(np.argmin(np.isfinite(raw)))
+        raise DatasetError(
+            f"{source.path}: column {name!r}, the time, is {_shown(raw[row])} at {source.place(row)}. Repair or remove "
+            "that row."
+        )
+    begin = float(plan.time_unit.in_si(raw[:1].astype(np.float64))[0])
+    return plan.time_unit.in_si((raw - raw[0]).astype(np.float64)), begin
+
+
+def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap: bool) -> list[Jumps]:
+    """Jumps of turning joints by more than half a turn; with `unwrap`, whole turns are added in `values` instead."""
+    jumps = list[Jumps]()
+    for column, item in enumerate(plan.signals):
+        if item.signal != "q" or item.unit.si != "rad" or item.joint not in plan.joints:
+            continue
+        if unwrap:
+            values[:, column] = np.concatenate([np.unwrap(each) for each in np.split(values[:, column], begins[1:])])
+            continue
+        steps = np.abs(np.diff(values[:, column], prepend=values[:1, column]))
+        steps[begins] = 0.0
+        seen = f"q of joint {item.joint!r} jumps by more than half a turn"
+        remedy = "the angle wraps, or is in degrees. Add `unwrap`, or `unit` q=deg."
+        jumps.append((np.flatnonzero(steps > np.pi), seen, remedy))
+    return jumps
+
+
+def _require_finite(
+    values: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, time: Float[np.ndarray, " rows"]
+) -> None:
+    if np.isfinite(values).all():
+        return
+    row, index = (int(position) for position in np.argwhere(~np.isfinite(values))[0])
+    item = plan.signals[index]
+    wrong = [name for name in item.expression.weights if not np.isfinite(columns[name][row])]
+    name = wrong[0] if wrong else next(iter(item.expression.weights), "")
+    raise DatasetError(
+        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(columns[name][row])} at "
+        f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values. "
+        "Repair or remove these rows, or map another column."
+    )
+
+
+def _shown(value: float) -> str:
+    return "missing (empty or NaN)" if np.isnan(value) else f"{value}"
+
+
+def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
+    """Number and first row of every episode."""
+    numbers = np.asarray(column, dtype=np.float64)
+    odd = ~np.isfinite(numbers) | (numbers != np.round(numbers))
+    if odd.any():
+        row = int(np.argmax(odd))
+        raise DatasetError(f"{source.path}: the episode is {numbers[row]} at {source.place(row)}, not a whole number.")
+    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1.0))
+    own = numbers[starts].astype(np.int64)
+    again = np.setdiff1d(np.arange(len(own)), np.unique(own, return_index=True)[1])
+    if len(again):
+        raise DatasetError(
+            f"{source.path}: episode {own[again[0]]} begins again at {source.place(int(starts[again[0]]))}; rows of an "
+            "episode must lie together. Sort the log by episode and time."
+        )
+    return np.stack([own, starts], axis=1)
+
+
+BEYOND = 0.1
+"""Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
+
+TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
+
+
+def _require_plausible_positions(
+    label: str,
+    values: Float[np.ndarray, "rows signals"],
+    plan: SignalPlan,
+    robot: forcegp.robots.Robot | None,
+    believed: Collection[str],
+) -> None:
+    """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees."""
+    limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
+    for item, column in zip(plan.signals, values.T, strict=True):
+        if item.signal != "q":
+            continue
+        low, high = float(column.min()), float(column.max())
+        lower, upper = limits.get(item.joint, (-np.inf, np.inf))
+        margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        degrees = item.unit.name == "rad" and max(-low, high) > TURNS
+        where = f"{label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
+        if low < lower - margin or high > upper + margin:
+            seen = f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF."
+            if degrees:
+                hint = "Is it in degrees? Then add `unit` q=deg. `beyond_limits` accepts it."
+                raise MistakenUnit(f"{seen} {hint}", "q", "deg")
+            raise DatasetError(f"{seen} Are unit, sign, zero and URDF right? `beyond_limits` accepts it.")
+        if degrees and item.joint not in believed and not np.isfinite(upper - lower):
+            hint = "Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
+            raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", "deg")
+
+
+REPEATED = 0.05
+"""Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
+
+GAP = 10.0
+"""Median steps. A cubic spline through samples g apart misses at most 5/384 (2 pi f g)^4 of the amplitude of a sine of
+frequency f (Hall & Meyer 1976): across 10 steps at 1 kHz 0.013 % at 5 Hz and 3 % at 20 Hz. Longer pauses end an
+episode."""
+
+FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
+SLOWEST, FASTEST = 2.0, 2e5
+"""Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
+
+
+def _stretches(
+    label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
+) -> tuple[Any, ...]:
+    """Rows between gaps, their median step, its worst deviation, repeated stamps, gaps, and rows left out.
+
+    Rows in a pause of one topic of several are left out. Of rows with the same stamp the first is kept: what comes
+    after it is a sample that was sent again, or one whose time is not known. Raises DatasetError for time that runs
+    backwards, and for rates that no robot is logged at.
+    """
+    begins = episodes[:, 1]
+    steps = np.diff(time)
+    steps[begins[begins > 0] - 1] = np.nan
+    backwards = np.flatnonzero(steps < 0)
+    if backwards.size:
+        row = int(backwards[0]) + 1
+        raise DatasetError(
+            f"{label}: time runs backwards by {-steps[row - 1]:.6g} s at {source.place(row)} ({time[row]:.6g} s from "
+            f"the start), {backwards.size} times in all. Sort the log, map another column as the time, or name the "
+            "column that numbers its episodes (`episode`)."
+        )
+    positive = steps[steps > 0]
+    if len(time) < FEWEST_ROWS:
+        raise DatasetError(f"{label} has {len(time)} rows; an episode has at least {FEWEST_ROWS}.")
+    if not positive.size:
+        raise DatasetError(f"{label}: all rows have the same time stamp; map another column as the time.")
+    typical = float(np.median(positive))
+    _require_rate(label, typical)
+    kept = np.diff(time, prepend=-np.inf) >= REPEATED * typical
+    kept[begins] = True
+    repeated = len(kept) - int(kept.sum())
+    since = time - np.repeat(time[begins], np.diff([*begins, len(time)]))
+    start, end = -np.inf if options.start is None else options.start, np.inf if options.end is None else options.end
+    kept &= (since >= start) & (since <= end)
+    if not kept.any():
+        raise DatasetError(f"{label}: no row lies between `start` and `end`; it has {since.max():.6g} s.")
+    paused = read.paused(options.gap, GAP)
+    used = np.flatnonzero(kept & ~paused)
+    number = np.searchsorted(begins, used, side="right") - 1
+    same = np.diff(number) == 0
+    between = np.diff(time[used])
+    step = float(np.median(between[same])) if same.any() else typical
+    limit = GAP * step if options.gap is None else options.gap
+    inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)
+    pieces = np.split(np.arange(len(used)), np.flatnonzero(~inside) + 1)
+    stretches = [(int(episodes[number[own[0]], 0]), used[own]) for own in pieces if len(own) >= FEWEST_ROWS]
+    if not stretches:
+        raise DatasetError(
+            f"{label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
+            "a longer `gap` may be right."
+        )
+    worst = float(np.abs(between[inside] / step - 1.0).max())
+    dropped = len(used) - sum(len(rows) for _, rows in stretches)
+    return tuple(stretches), step, worst, repeated, tuple(between[same & ~inside].tolist()), dropped
+
+
+def _require_rate(label: str, step: float) -> None:
+    rate = 1.0 / step
+    if SLOWEST <= rate <= FASTEST:
+        return
+    seen = f"{label}: the median step is {step:.6g} s, {rate:.3g} rows per second, no rate of a robot's log."
+    if rate > FASTEST:
+        hint = "Is the time in s rather than in a smaller unit? Then add `unit` time=s."
+        raise MistakenUnit(f"{seen} {hint}", "time", "s")
+    fitting = [unit for unit, factor in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if 10.0 <= rate * factor <= 2e4]
+    if fitting:
+        hint = f"Is the time in {' or '.join(fitting)}? Then add `unit` time={fitting[0]}."
+        raise MistakenUnit(f"{seen} {hint}", "time", fitting[0])
+    raise DatasetError(f"{seen} Map another column as the time.")
