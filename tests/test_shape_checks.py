@@ -72,7 +72,6 @@ def whole_way() -> None:
             posterior, data = load_posterior(f"{folder}/model"), Dataset.load(f"{folder}/data.h5")
         states = [torch.tensor(x[:5]) for x in (data.q, data.v, data.u)]
         posterior.components(*states)
-        posterior.leave_out()
         predictor = posterior.update(data[:2]).predictor(covariance="none", compile=compiled)
         predictor.linearize(*states)
         predictor.rollouts(*(x[:2] for x in states[:2]), states[2].expand(2, 5, -1), 0.01)

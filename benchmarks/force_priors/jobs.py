@@ -128,8 +128,7 @@ def fit(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, A
         if spec["region"]:
             test = test.rows(_tool_x(test) > TEST_X)
         tests[label] = scores(posterior, test)
-    left_out = {"leave_one_out": posterior.leave_out().total / spec["points"]}
-    return {"tests": tests, "curves": curve_scores(posterior), **left_out, "search": search_report(posterior)}
+    return {"tests": tests, "curves": curve_scores(posterior), "search": search_report(posterior)}
 
 
 def fitted(spec: Mapping[str, Any], train: Dataset) -> Any:

@@ -131,7 +131,6 @@ class ForceExperiment(Experiment):
             "tests": tests,
             "curve_coverage": median_and_range(chain.from_iterable(coverages)),
             "curve_coverage_of_seeds": median_and_range(sum(each) / len(each) for each in coverages if each),
-            "leave_one_out": median_and_range(job["leave_one_out"] for job in found),
             "search_seconds": median_and_range(job["search"]["cpu_seconds"] for job in found),
         }
 

@@ -160,7 +160,6 @@ def test_predictor_rollout_and_other_devices():
 def test_what_needs_single_rows_is_refused_with_a_remedy():
     data, posterior = motion(), fitted()
     for attempt in (
-        posterior.leave_out,
         lambda: posterior.update(data.rows([1, 2])),
         lambda: posterior.predictor(covariance="compressed", compile=False),
     ):

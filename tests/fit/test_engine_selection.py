@@ -135,11 +135,6 @@ def test_learning_points_are_checked(data):
         fit(data, learning_points=1)
 
 
-def test_leaving_rows_out_needs_the_exact_engine(data):
-    with pytest.raises(InvalidInput, match="engine='exact'"):
-        fit(data, "inducing").leave_out()
-
-
 def test_functions_are_drawn_and_curves_read_from_inducing_points(data, states):
     q, v, u = (torch.tensor(x) for x in states)
     posterior = fit(data, Inducing(), prior=JointFriction())

@@ -1,4 +1,3 @@
-from .block_cross_validation import LeaveOut as LeaveOut, leave_blocks_out as leave_blocks_out
 from .dense_kernels import LatentKernels as LatentKernels
 from .engines import (
     ENGINES as ENGINES, Choice as Choice, Engine as Engine, Exact as Exact, Inducing as Inducing,

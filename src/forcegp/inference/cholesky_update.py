@@ -7,7 +7,7 @@ to the one with it. With P = T^-1 and alpha = P t it needs the row's own blocks 
     1/2 (tr P_ii - log|P_ii| - r + alpha_i^T (P_ii^-1 - I) alpha_i),
 
 for P_ii^-1 is the covariance of t_i given all other rows, noise I included, and P_ii^-1 alpha_i what these predict
-wrongly of it (`leave_out`). (Csato & Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a
+wrongly of it. (Csato & Opper 2002, "Sparse on-line Gaussian processes", delete basis points by such a
 score.) Leaving a row out of P is a step of Cholesky's algorithm on P, so that no other inversion is needed.
 """
 

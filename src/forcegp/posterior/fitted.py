@@ -1,6 +1,6 @@
 """`Fitted`: what a fit has found, which rows it knows, and how well it predicts those that are left out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -19,12 +19,8 @@ from forcegp.inference import (
     InducingPosterior,
     LatentKernels,
     LatentPosterior,
-    LeaveOut,
     OptimizationResult,
-    exact,
-    leave_blocks_out,
 )
-from forcegp.inference.threads import blas_threads
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
 from forcegp.posterior.estimates import Estimates
@@ -189,15 +185,3 @@ class Fitted(Summary):
         `fit/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
         """
         return float(self.settings.get("widening", 1.0))
-
-    def leave_out(self, blocks: Sequence[Sequence[int]] | None = None) -> LeaveOut:
-        """How well training rows are predicted from those outside their block: in closed form, without another fit.
-
-        `blocks` holds numbers of training rows; None leaves one row out at a time. Rows that follow each other in time
-        hold nearly the same information, so leave them out together: `forcegp.data.time_blocks`. The parameters stay
-        those that were fitted to all rows, so the scores flatter a model with many of them a little.
-        Raises InvalidInput for blocks that overlap, and for models that would have to be trained again.
-        """
-        with torch.no_grad(), blas_threads(self.training.q.numel()):
-            *_, noise = self.likelihood.terms(self.hyperparameters)
-            return leave_blocks_out(exact(self.latent, "leaving rows out").system, noise, blocks)
