@@ -293,7 +293,7 @@ class Model(Summary):
         u: Float[Tensor, "*#batch nu"],
         bodies: Float[Tensor, "bodies 10"] | None = None,
     ) -> ConstrainedDynamics:
-        """A, b, H, Q_b and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
+        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
 
         Differentiable in all arguments. `bodies` are standard parameters of the bodies in the place of the robot's
         (`Kinematics.torque_regressor`). Contact points are kinematic: no inertial parameter moves them.

@@ -47,12 +47,16 @@ class TestAgainstDenseEquations:
         assert_close(dynamics.acceleration(Q_U), a, TOLERANCE)
         assert_close(dynamics.multiplier(Q_U), multiplier, TOLERANCE)
 
-    def test_H_and_Q_b(self, solved):
-        """H is the response to unit forces; Q_b the constraint force that b needs when nothing else acts."""
+    def test_H_and_the_constrained_offset(self, solved):
+        """H is the response to unit forces; the constraint force gives the offset when nothing else acts."""
         dynamics, Q_U = solved
         nothing = torch.zeros_like(Q_U)
         at_rest, multiplier = solve_kkt(dynamics.M, nothing, dynamics.A, dynamics.b)
-        assert_close(dynamics.Q_b, (dynamics.A.mT @ multiplier[..., None])[..., 0], TOLERANCE)
+        assert_close(
+            (dynamics.M @ dynamics.constrained_offset[..., None])[..., 0],
+            (dynamics.A.mT @ multiplier[..., None])[..., 0],
+            TOLERANCE,
+        )
         columns = []
         for unit in torch.eye(Q_U.shape[-1], dtype=torch.float64):
             response, _ = solve_kkt(dynamics.M, unit.expand_as(Q_U), dynamics.A, torch.zeros_like(dynamics.b))
@@ -140,7 +144,7 @@ def test_without_contacts_it_is_forward_dynamics():
     assert_close(dynamics.H, torch.linalg.inv(dynamics.M), TOLERANCE)
     assert dynamics.A.shape == (6, 0, built.robot.nv)
     assert dynamics.b.shape == dynamics.multiplier(Q_U).shape == (6, 0)
-    assert not dynamics.Q_b.any()
+    assert not dynamics.constrained_offset.any()
 
 
 def test_as_many_constraints_as_joints_leave_nothing_to_move():
@@ -181,7 +185,7 @@ def test_derivatives(model, kind):
 
     def function(q, v, u, bodies):
         dynamics = built.dynamics(q, v, u, bodies)
-        parts = dynamics.acceleration(Q_U), dynamics.multiplier(Q_U), dynamics.Q_b, dynamics.H.sum(-1)
+        parts = dynamics.acceleration(Q_U), dynamics.multiplier(Q_U), dynamics.constrained_offset, dynamics.H.sum(-1)
         return torch.cat([part.flatten() for part in parts])
 
     assert_derivatives(function, *(x[0] for x in regular_states(built, 1)), bodies_of(built))

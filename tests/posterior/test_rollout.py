@@ -135,7 +135,7 @@ def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"q0": torch.zeros(2, 4)}, r"q0 has shape \(2, 4\); it must be \(\.\.\., 3\)"),
+        ({"q0": torch.zeros(2, 4)}, r"q0 has shape \(2, 4\); its last dimension must be 3"),
         ({"u": torch.zeros(3)}, r"u has shape \(3,\); it must be \(\.\.\., T, 3\)"),
         ({"u": torch.zeros(0, 3)}, "u has no rows"),
         ({"v0": torch.full((3,), float("nan"))}, "v0 has values that are not finite"),

@@ -253,7 +253,7 @@ def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> 
         "model": posterior.description,
         "points": len(posterior.training),
         "learning_points": settings.get("learning_points", len(posterior.training)),
-        "objective_is": posterior.objective,
+        "objective_is": "negative log likelihood with hyperpriors [nats]",
         "objective": result.value,
         "nll": posterior.negative_log_likelihood,
         "iterations": len(result.history) - 1,

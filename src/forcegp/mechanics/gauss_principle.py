@@ -239,7 +239,7 @@ class AffineMap(NamedTuple):
 class ConstrainedDynamics:
     """The dynamics at a batch of states, affine in the joint forces that are still unknown.
 
-    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_b`, `Q_K` (..., nv); `normals` (..., m, 3) are the
+    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_K` (..., nv); `normals` (..., m, 3) are the
     surface gradients s_p, so that the contact force on the robot in N is s_p^T lambda. `state` holds (q, v, u)
     themselves, `contacts` what the rows of A belong to (none for a constraint that was given as a matrix).
     """
@@ -250,7 +250,6 @@ class ConstrainedDynamics:
     b: Float[Tensor, "*batch m"]
     normals: Float[Tensor, "*batch m 3"]
     H: Float[Tensor, "*batch nv nv"]
-    Q_b: Float[Tensor, "*batch nv"]
     Q_K: Float[Tensor, "*batch nv"]
     constrained_offset: Float[Tensor, "*batch nv"]  # M^-1 Q_b
     inverse_lower: Float[Tensor, "*batch nv nv"]  # L^-1
@@ -273,7 +272,7 @@ class ConstrainedDynamics:
         Raises NumericalError when M is not positive definite or A is not finite.
         """
         identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
-        lower, inverse_lower = factors(M)
+        inverse_lower = factors(M)[1]
         A_white = A @ inverse_lower.mT
         if A.shape[-2]:
             try:
@@ -287,9 +286,8 @@ class ConstrainedDynamics:
         H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower
         H = 0.5 * (H + H.mT)
         white_offset = pseudo_inverse @ b[..., None]
-        Q_b = (lower @ white_offset)[..., 0]
         offset = (inverse_lower.mT @ white_offset)[..., 0]
-        return cls(state, M, A, b, normals, H, Q_b, Q_K, offset, inverse_lower, pseudo_inverse, contacts)
+        return cls(state, M, A, b, normals, H, Q_K, offset, inverse_lower, pseudo_inverse, contacts)
 
     def acceleration_map(self) -> AffineMap:
         """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K."""

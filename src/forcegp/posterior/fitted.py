@@ -169,11 +169,6 @@ class Fitted(Summary):
         return self.model.robot.joint_names
 
     @property
-    def objective(self) -> str:
-        """What `result.history` holds, with its unit in brackets."""
-        return "negative log likelihood with hyperpriors [nats]"
-
-    @property
     def latent_names(self) -> tuple[str, ...]:
         """The processes that the prior is made of."""
         return self.trained.unknown.latent_names(self.trained.robot)

@@ -19,8 +19,9 @@ from forcegp.integration.trajectory import Trajectory, check_start, warn_of_dive
 from forcegp.mechanics import Baumgarte
 from forcegp.model import Model
 from forcegp.posterior.motion_intervals import MotionIntervals
+from forcegp.posterior.prediction import state_tensor
 from forcegp.posterior.programs import steps_of
-from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite, whole_number
+from forcegp.robots.arguments import broadcast_batch, whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
@@ -316,18 +317,16 @@ def checked_start(
 
     Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
     """
-    given = {name: real_tensor(name, values, device).to(device) for name, values in (("q0", q0), ("v0", v0), ("u", u))}
-    for size, (name, values) in zip(sizes, given.items(), strict=True):
-        if values.requires_grad and torch.is_grad_enabled() and remedy is not None:
+    given = {}
+    for size, (name, values) in zip(sizes, (("q0", q0), ("v0", v0), ("u", u)), strict=True):
+        tensor = given[name] = state_tensor(name, values, size, device).to(device)
+        if tensor.requires_grad and torch.is_grad_enabled() and remedy is not None:
             raise InvalidInput(
                 f"{name} requires a gradient, which a rollout drops unless asked to keep it; {remedy}, or "
                 f"{name}.detach()."
             )
-        least = 2 if name == "u" else 1
-        if values.dim() < least or values.shape[-1] != size:
-            wanted = f"(..., T, {size})" if name == "u" else f"(..., {size})"
-            raise InvalidInput(f"{name} has shape {tuple(values.shape)}; it must be {wanted}, one value per joint.")
-        require_finite(name, values)
+        if name == "u" and tensor.dim() < 2:
+            raise InvalidInput(f"u has shape {tuple(tensor.shape)}; it must be (..., T, {size}), one row per step.")
     q, v, forces = given.values()
     steps = forces.shape[-2]
     if not steps:
