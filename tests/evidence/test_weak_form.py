@@ -137,7 +137,7 @@ def test_a_stored_model_predicts_the_same_and_says_that_it_knows_windows(tmp_pat
         save_posterior(posterior, tmp_path / "broken")
     finally:
         object.__setattr__(posterior.likelihood, "training", loaded.training)
-    with pytest.raises(FileFormatError, match=r"training.weights has shape \(23, 8\)"):
+    with pytest.raises(FileFormatError, match="incomplete or damaged"):
         load_posterior(tmp_path / "broken")
 
 

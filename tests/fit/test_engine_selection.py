@@ -138,8 +138,8 @@ def test_learning_points_are_checked(data):
 def test_functions_are_drawn_and_curves_read_from_inducing_points(data, states):
     q, v, u = (torch.tensor(x) for x in states)
     posterior = fit(data, Inducing(), prior=JointFriction())
-    sampled = posterior.accelerations(None, 3)(*(x[None].expand(3, -1, -1) for x in (q, v, u)))
-    assert sampled.shape == (3, 8, 3)
+    sampled = posterior.accelerations(None, 3)(*(x.repeat(3, 1) for x in (q, v, u)))
+    assert sampled.shape == (24, 3)
     assert bool(torch.isfinite(sampled).all())
     curve = posterior.curve(posterior.latent_names[0], points=5)
     assert bool((curve.std > 0).all())
