@@ -132,3 +132,16 @@ def test_what_cannot_be_checked_is_refused():
         check(data.rows([5, 3, 1]))
     with pytest.raises(InvalidInput, match=r"pan, lift, bend, those of pendulum shoulder, elbow"):
         check(data, pendulum())
+
+
+def test_a_joint_that_is_held_in_one_episode_is_named():
+    one, other = clean(6), clean(7)
+    q, v = other.q.copy(), other.v.copy()
+    q[:, 1], v[:, 1] = 0.2 + 1e-5 * np.sin(9 * other.time), 9e-5 * np.cos(9 * other.time)
+    joined = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in ("u", "a", "time")}
+    both = replace(
+        one, q=np.concatenate([one.q, q]), v=np.concatenate([one.v, v]), episode=np.repeat([0, 1], len(one)), **joined
+    )
+    (found,) = check(replace(both, u=both.u * 0 + np.sin(both.time[:, None]))).doubts.of("held joint")
+    assert found.joints == ("lift",)
+    assert found.numbers["stretches"] == [1]

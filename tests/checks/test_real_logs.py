@@ -60,4 +60,7 @@ def test_a_double_pendulum_whose_elbow_sticks_in_one_run(shared, tmp_path):
     model = Model(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
     runs = [folder / "raw" / f"20230629-{name}.csv.gz" for name in ("143339", "143601", "143906")]
     found = import_recordings(runs, mapping, model=model)
-    assert check(found).doubts.level == "look"
+    report = check(found)
+    assert report.doubts.level == "look"
+    (held,) = report.doubts.of("held joint")
+    assert (held.joints, held.numbers["stretches"]) == (("joint2",), [2])

@@ -104,6 +104,7 @@ WELL = 100.0  # condition number up to which identification is commonly called w
 BADLY = 1000.0
 HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
 FEWEST_CHANGES = 2
+HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
 STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
 
 
@@ -134,7 +135,32 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         if joints:
             about = {"joints": tuple(joints), "numbers": {"joints": motions}}
             yield look(about="excitation", what=f"{listed(joints)} {what}", do=remedy, **about)
+    yield from _held(inputs, still)
     yield from _base_parameters(inputs)
+
+
+def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
+    """Joints that stand still in whole stretches although they move in others."""
+    rows = inputs.prepared
+    if rows is None or len(rows.episodes) < 2:
+        return
+    spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
+    for joint in (joint for joint, name in enumerate(inputs.names) if name not in still):
+        own, unit = spans[:, joint], "rad" if inputs.rotates[joint] else "m"
+        held = np.flatnonzero((own < HELD * own.max()) & (spans.max(axis=1) > 5.0 * own))
+        if 0 < len(held) <= len(spans) // 2:
+            first = int(held[0])
+            begin = float(rows.time[rows.episode == rows.episodes[first]][0])
+            yield look(
+                about="held joint",
+                what=f"{inputs.names[joint]} stays within {own[first]:.2g} {unit} in {len(held)} of {len(spans)} "
+                f"stretches while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); "
+                f"elsewhere it moves {own.max():.2g}.",
+                do="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
+                "(`locked`).",
+                joints=(inputs.names[joint],),
+                numbers={"stretches": held.tolist(), "range": float(own[first])},
+            )
 
 
 def _base_parameters(inputs: CheckInput) -> Iterator[Doubt]:
