@@ -95,3 +95,13 @@ def test_a_box_becomes_a_sentence():
 │         Train on so many rows.         │
 ╰────────────────────────────────────────╯"""
     assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."
+    lines = (
+        " Required options",
+        " ----- ",
+        "  Missing from forcegp fit:",
+        "      --out FOLDER",
+        "          Where.",
+        "  ---",
+    )
+    plain = "\n".join(lines)
+    assert one_line(plain) == "Missing from forcegp fit: --out FOLDER."

@@ -134,15 +134,17 @@ def one_line(box: str) -> str:
     │         Train on so many rows.         │
     ╰────────────────────────────────────────╯
 
-    becomes "Unrecognized options: --pionts. Perhaps you meant: --points N."
+    becomes "Unrecognized options: --pionts. Perhaps you meant: --points N." Without such letters the heading stands
+    above a line of its own.
     """
     lines = [line.strip("│|")[1:].rstrip() for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
     sections: list[list[str]] = [[]]
     for line in lines:
-        if line.strip("─-") == "" and line:
+        if line.strip() and not line.strip(" ─-"):
             sections.append([])
         elif line.strip() and not line.startswith(" " * 8):  # what is indented so far is the help of an option
             sections[-1].append(line.strip())
+    sections = sections if "╭" in box else sections[1:]
     sentences = [" ".join(section) for section in sections if section]
     sentences = [section for section in sentences if not section.startswith(("For full helptext", "Argument helptext"))]
     return " ".join(section if section.endswith(".") else f"{section}." for section in sentences)

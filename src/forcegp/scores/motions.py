@@ -60,9 +60,10 @@ def held_out_motions(
     None takes those of `HORIZONS` that some stretch lasts for, with a note on the others, and on time steps that are
     uneven. Raises InvalidInput for horizons that are not positive or that no stretch lasts for, and for no starts.
     """
-    wanted = tuple(sorted(set(HORIZONS if horizons is None else horizons)))
-    if not all(np.isfinite(h) and h > 0.0 for h in wanted):
+    wanted = tuple(HORIZONS if horizons is None else horizons)
+    if not all(isinstance(h, int | float) and 0.0 < h < np.inf for h in wanted):
         raise InvalidInput(f"horizons are {list(wanted)}; give positive numbers of seconds.")
+    wanted = tuple(sorted(set(wanted)))
     if starts < 1:
         raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
     if not wanted:
