@@ -19,7 +19,8 @@ import torch
 
 from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import CONFIG, FINE, GAINS, RATE, Reference, excitation, fits, followed, robot_of, rows_of
-from forcegp import ContactMonitor, Model, PDGravity, Robot, Viscous
+from forcegp import ContactMonitor, Model, Robot, Viscous
+from forcegp.control import PDGravity
 from forcegp.control.monitor import ContactState
 from forcegp.forces import Stribeck
 

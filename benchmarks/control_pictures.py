@@ -33,7 +33,8 @@ from benchmarks.tracking import (
     rows_of,
     task_of,
 )
-from forcegp import Excitation, Model, PDGravity, Robot
+from forcegp import Model, Robot
+from forcegp.control import Excitation, PDGravity
 from forcegp.posterior import Posterior
 from forcegp.scores import contacts_figure, curve_panels
 from forcegp.scores.figures.style import (

@@ -44,8 +44,10 @@ from benchmarks.tracking import (
     robot_of,
     task_of,
 )
-from forcegp import ComputedTorque, Dataset, Inducing, JointFriction, Model, PDGravity, fit
+from forcegp import ComputedTorque, Dataset, JointFriction, Model, fit
+from forcegp.control import PDGravity
 from forcegp.data import farthest_rows
+from forcegp.inference import Inducing
 from forcegp.posterior import Posterior
 
 SECONDS, LOST = 600, 0.3

@@ -39,7 +39,8 @@ from benchmarks.tracking import (
     rows_of,
     task_of,
 )
-from forcegp import ComputedTorque, Dataset, JointFriction, Model, PDGravity, excitation, fit
+from forcegp import ComputedTorque, Dataset, JointFriction, Model, excitation, fit
+from forcegp.control import PDGravity
 from forcegp.control.informative_motions import Excitation, LearnedForces, Motion
 from forcegp.errors import ContactWarning
 

@@ -32,15 +32,8 @@ from benchmarks.force_recordings import (
     visited,
     with_force,
 )
-from forcegp import (
-    ContactFriction,
-    JointAccelerations,
-    JointForces,
-    JointFriction,
-    KukaSurfaceConfig,
-    PeriodicJointForces,
-    ToolForces,
-)
+from forcegp import ContactFriction, JointForces, JointFriction, KukaSurfaceConfig, ToolForces
+from forcegp.forces import JointAccelerations, PeriodicJointForces
 from forcegp.forces.contact_friction import ExpectedFriction
 from forcegp.scores import friction_curves_figure, normal_force_figure, save_figure
 from forcegp.scores.figures.style import (

@@ -21,7 +21,8 @@ import numpy as np
 from mujoco import rollout
 
 from benchmarks.tracking import GAINS, excitation, followed, robot_of, rows_of
-from forcegp import JointFriction, Model, PDGravity, Robot, fit
+from forcegp import JointFriction, Model, Robot, fit
+from forcegp.control import PDGravity
 from forcegp.control.mujoco_forces import MujocoForces
 
 mujoco: Any = untyped

@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 import torch
 
-from forcegp import Preparation
+from forcegp.data import Preparation
 from forcegp.evidence import Accelerations, Torques
 from forcegp.fit import fit
 from forcegp.forces import Coulomb, RigidBodies, Viscous

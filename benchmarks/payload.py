@@ -26,8 +26,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from forcegp import Dataset, Model, Preparation, Robot
+from forcegp import Dataset, Model, Robot
 from forcegp.cli.main import main
+from forcegp.data import Preparation
 from forcegp.evidence import Torques
 from forcegp.fit import fit
 from forcegp.forces import Payload, Rotor

@@ -25,8 +25,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.quadrotor import TIMES, training_error
-from forcegp import AerodynamicForce, Dataset, Model, Preparation, Robot, fit
-from forcegp.data import differentiate
+from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
+from forcegp.data import Preparation, differentiate
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.posterior import Posterior, observing
 

@@ -13,9 +13,10 @@ import time
 import numpy as np
 import torch
 
-from forcegp import Baumgarte, KukaSurfaceConfig, fit, simulate_kuka_surface
+from forcegp import KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.data import recorded_motions
 from forcegp.forces import JointForces
+from forcegp.mechanics import Baumgarte
 from forcegp.scores.motions import apart_from, inside_interval
 
 HELD = Baumgarte(10.0, 1.0)

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from forcegp import Dataset, Preparation
-from forcegp.data import estimate_stance
+from forcegp import Dataset
+from forcegp.data import Preparation, estimate_stance
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 NOISES = (0.0, 0.02, 0.05, 0.1)  # rad/s and m/s

@@ -23,18 +23,8 @@ import numpy as np
 import torch
 
 from benchmarks.plants import JointFrictionLaw
-from forcegp import (
-    ComputedTorque,
-    Coulomb,
-    Dataset,
-    JointFriction,
-    KukaSurfaceConfig,
-    Model,
-    PDGravity,
-    Robot,
-    Viscous,
-    fit,
-)
+from forcegp import ComputedTorque, Coulomb, Dataset, JointFriction, KukaSurfaceConfig, Model, Robot, Viscous, fit
+from forcegp.control import PDGravity
 from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import RigidBodies, Rotor

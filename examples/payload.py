@@ -6,7 +6,8 @@ Needs `pip install 'forcegp[mujoco]'`.
 import numpy as np
 from ur5_log import URDF, recorded
 
-from forcegp import Dataset, Model, Offset, Payload, Preparation, Robot, Rotor, Stribeck, Viscous, fit
+from forcegp import Dataset, Model, Offset, Payload, Robot, Rotor, Stribeck, Viscous, fit
+from forcegp.data import Preparation
 
 time, q, v, u = np.split(recorded(seconds=12.0), [1, 7, 13], axis=1)
 a = np.gradient(v, time[:, 0], axis=0)

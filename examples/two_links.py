@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from forcegp import Actuation, Model, RigidBodies, Robot, Stribeck
+from forcegp import Model, RigidBodies, Robot, Stribeck
+from forcegp.forces import Actuation
 
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="0.1"/>
 <inertia ixx="0.003" iyy="0.003" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>"""

@@ -3,20 +3,12 @@
 import pytest
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import (
-    Model,
-    Torques,
-    calibrated,
-    check,
-    fit,
-    save_posterior,
-    score,
-    split_named,
-)
+from forcegp import Model, Torques, check, fit, save_posterior, score
 from forcegp.errors import InvalidInput
 from forcegp.evidence import motion_residuals
-from forcegp.fit import held_out_noise
+from forcegp.fit import calibrated, held_out_noise
 from forcegp.forces import JointForces
+from forcegp.scores import split_named
 
 
 @pytest.fixture(scope="module")

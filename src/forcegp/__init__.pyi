@@ -10,11 +10,8 @@ from .mechanics import Contact as Contact
 from .mechanics import Plane as Plane
 from .mechanics import Sphere as Sphere
 from .mechanics import Cylinder as Cylinder
-from .mechanics import ImplicitSurface as ImplicitSurface
-from .mechanics import Baumgarte as Baumgarte
 
 # laws, and priors on their numbers
-from .forces import Actuation as Actuation
 from .forces import RigidBodies as RigidBodies
 from .forces import Payload as Payload
 from .forces import Viscous as Viscous
@@ -22,33 +19,22 @@ from .forces import Coulomb as Coulomb
 from .forces import Stribeck as Stribeck
 from .forces import LoadFriction as LoadFriction
 from .forces import Offset as Offset
-from .forces import DirectionalFriction as DirectionalFriction
 from .forces import Spring as Spring
 from .forces import Rotor as Rotor
-from .forces import CoupledRotors as CoupledRotors
 from .forces import Normal as Normal
 from .forces import LogNormal as LogNormal
-from .forces import Body as Body
 
 # unknown forces
 from .forces import JointForces as JointForces
 from .forces import AerodynamicForce as AerodynamicForce
-from .forces import BaseWrench as BaseWrench
 from .forces import JointFriction as JointFriction
-from .forces import PeriodicJointForces as PeriodicJointForces
 from .forces import ToolForces as ToolForces
 from .forces import ContactFriction as ContactFriction
-from .forces import JointAccelerations as JointAccelerations
-from .forces import IndependentAccelerations as IndependentAccelerations
 
 # what was measured
 from .data import Dataset as Dataset
 from .checks import check as check
-from .checks import CheckReport as CheckReport
-from .data import Preparation as Preparation
 from .recordings import import_recordings as import_recordings
-from .recordings import ColumnMapping as ColumnMapping
-from .recordings import ImportOptions as ImportOptions
 from .simulation import KukaSurfaceConfig as KukaSurfaceConfig
 from .simulation import simulate_kuka_surface as simulate_kuka_surface
 
@@ -58,9 +44,7 @@ from .evidence import Torques as Torques
 from .evidence import Windows as Windows
 from .evidence import Motions as Motions
 from .fit import fit as fit
-from .fit import calibrated as calibrated
 from .posterior import Posterior as Posterior
-from .posterior import Estimate as Estimate
 from .posterior import save_posterior as save_posterior
 from .posterior import load_posterior as load_posterior
 from .posterior import casadi_function as casadi_function
@@ -68,20 +52,14 @@ from .posterior import export_c as export_c
 
 # what is done with it
 from .control import ComputedTorque as ComputedTorque
-from .control import PDGravity as PDGravity
 from .control import ContactMonitor as ContactMonitor
 from .control import HybridForce as HybridForce
 from .control import MPPI as MPPI
 from .control import excitation as excitation
-from .control import Excitation as Excitation
 
 # how and where it is computed
-from .inference import Exact as Exact
-from .inference import Inducing as Inducing
 
 # how good it is
 from .scores import score as score
-from .scores import Scores as Scores
-from .scores import split_named as split_named
 
 __version__: str

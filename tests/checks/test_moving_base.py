@@ -7,11 +7,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from forcegp import ColumnMapping, Dataset, Model, Robot, check, excitation, import_recordings
+from forcegp import Dataset, Model, Robot, check, excitation, import_recordings
 from forcegp.checks import quick_check
 from forcegp.data.configurations import rates
 from forcegp.errors import InvalidInput
 from forcegp.forces import Actuation, RigidBodies, Thrusters
+from forcegp.recordings import ColumnMapping
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 BODY = """<robot name="drone"><link name="body"><inertial><mass value="2"/>

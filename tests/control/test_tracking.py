@@ -8,7 +8,8 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import ComputedTorque, HybridForce, Model, PDGravity, Robot, Viscous, fit
+from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
+from forcegp.control import PDGravity
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, RigidBodies
 from forcegp.inference import OptimizerOptions

@@ -8,8 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp import Preparation
-from forcegp.data import Dataset, differentiated, low_pass, motion_spectrum, resample
+from forcegp.data import Dataset, Preparation, differentiated, low_pass, motion_spectrum, resample
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import Dataset, Model, Preparation, Robot
-from forcegp.data import estimate_stance, motion_spectrum
+from forcegp import Dataset, Model, Robot
+from forcegp.data import Preparation, estimate_stance, motion_spectrum
 from forcegp.errors import ContactError, DatasetError, InvalidInput
 from forcegp.mechanics import fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped

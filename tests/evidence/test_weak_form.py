@@ -9,21 +9,11 @@ import torch
 from tests.posterior.arm import URDF, arm_model
 from tests.posterior.raw_log import SENSOR, motion
 
-from forcegp import (
-    Body,
-    JointForces,
-    JointFriction,
-    Noise,
-    RigidBodies,
-    Windows,
-    fit,
-    load_posterior,
-    save_posterior,
-    score,
-)
+from forcegp import JointForces, JointFriction, Noise, RigidBodies, Windows, fit, load_posterior, save_posterior, score
 from forcegp.data import Dataset
 from forcegp.errors import FileFormatError, InvalidInput, NotEnoughMemory
 from forcegp.evidence import MarginalLikelihood, TrainingData
+from forcegp.forces import Body
 from forcegp.inference import FunctionalPosterior, OptimizerOptions
 from forcegp.posterior import Posterior
 from forcegp.robots import Robot

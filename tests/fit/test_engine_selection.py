@@ -8,10 +8,11 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data
 
-from forcegp import JointAccelerations, JointForces, JointFriction, load_posterior, save_posterior
+from forcegp import JointForces, JointFriction, load_posterior, save_posterior
 from forcegp import fit as fit_model
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalWarning
 from forcegp.fit import refinement
+from forcegp.forces import JointAccelerations
 from forcegp.inference import Exact, Inducing, OptimizerOptions, ProblemSize, choose_engine
 from forcegp.inference import memory as memory_module
 

@@ -9,9 +9,9 @@ from tests.fit.test_motion_fit import QUIET, bump, recording, refined, slide
 from tests.posterior import floating_arm
 
 from forcegp import JointFriction, fit, load_posterior, save_posterior
-from forcegp import calibrated as with_intervals
 from forcegp.data.views import recorded_motions
 from forcegp.errors import InvalidInput
+from forcegp.fit import calibrated as with_intervals
 from forcegp.posterior.motion_intervals import DEVIATIONS, MotionIntervals
 from forcegp.scores.motions import inside_interval, interval_about
 

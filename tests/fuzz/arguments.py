@@ -168,7 +168,7 @@ def _contact(**arguments: Any) -> Any:
 
 
 def _baumgarte(**arguments: Any) -> Any:
-    return arm_model(baumgarte=forcegp.Baumgarte(**arguments)).dynamics(*(torch.tensor(x) for x in STATE)).b
+    return arm_model(baumgarte=forcegp.mechanics.Baumgarte(**arguments)).dynamics(*(torch.tensor(x) for x in STATE)).b
 
 
 def _robot_from(**arguments: Any) -> Any:
@@ -181,7 +181,7 @@ def _drone() -> Any:
 
 def _link_force(kind: Any, **arguments: Any) -> Any:
     made = kind(**arguments)
-    known = (made,) if kind is forcegp.Actuation else (forcegp.Actuation(), made)
+    known = (made,) if kind is forcegp.forces.Actuation else (forcegp.forces.Actuation(), made)
     model = forcegp.Model(_drone(), (), (*known, forcegp.RigidBodies()))
     forcegp.Model.from_json(model.to_json())
     return model.dynamics(POSE, np.zeros(6), np.ones(len(model.inputs))).M
@@ -284,7 +284,9 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "IndependentAccelerations": (
         lambda **k: fit(
-            INPUTS.data.model.without_mean().with_forces(forcegp.IndependentAccelerations(**k)), INPUTS.data, **FIT
+            INPUTS.data.model.without_mean().with_forces(forcegp.forces.IndependentAccelerations(**k)),
+            INPUTS.data,
+            **FIT,
         ),
         lambda: {"inputs": ("q",)},
     ),
@@ -338,7 +340,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {"frame": "body", "names": ("x", "y", "z")},
     ),
     "Actuation": (
-        functools.partial(_link_force, forcegp.Actuation),
+        functools.partial(_link_force, forcegp.forces.Actuation),
         lambda: {"matrix": np.ones((6, 2)), "names": ("one", "two")},
     ),
     "fixed_point": (
@@ -361,7 +363,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {"frame": "body", "inputs": ("velocity", "thrust"), "kernel": "linear", "observe": 0.5},
     ),
     "BaseWrench": (
-        lambda **k: _flying(forcegp.BaseWrench(**k)),
+        lambda **k: _flying(forcegp.forces.BaseWrench(**k)),
         lambda: {"frame": "body", "inputs": ("velocity",), "kernel": "linear"},
     ),
     "QuadrotorConfig": (
@@ -382,7 +384,13 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "with_armature": (lambda armature: _robot().with_armature(armature), lambda: {"armature": (0.1, 0.1, 0.1)}),
     "Model": (
         forcegp.Model,
-        lambda: {"robot": _robot(), "contacts": (), "forces": (forcegp.Actuation(),), "noise": None, "baumgarte": None},
+        lambda: {
+            "robot": _robot(),
+            "contacts": (),
+            "forces": (forcegp.forces.Actuation(),),
+            "noise": None,
+            "baumgarte": None,
+        },
     ),
     "dynamics": (lambda **k: INPUTS.data.model.dynamics(**k).A, _states),
     "Contact": (_contact, lambda: {"frame": "hand", "point": (0.0, 0.0, 0.2), "surface": forcegp.Plane(**SURFACES)}),
@@ -403,9 +411,9 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {"level": 0.1, "breakaway": 0.1, "stribeck_velocity": 0.1},
     ),
     "constant": (functools.partial(_forces, forcegp.Offset), lambda: {"value": 0.1}),
-    "direction": (functools.partial(_forces, forcegp.DirectionalFriction), lambda: {"difference": 0.1}),
+    "direction": (functools.partial(_forces, forcegp.forces.DirectionalFriction), lambda: {"difference": 0.1}),
     "armature": (functools.partial(_forces, forcegp.Rotor), lambda: {"inertia": 0.1}),
-    "rotor": (functools.partial(_forces, forcegp.CoupledRotors), lambda: {"inertia": 0.1, "transmission": None}),
+    "rotor": (functools.partial(_forces, forcegp.forces.CoupledRotors), lambda: {"inertia": 0.1, "transmission": None}),
     "load": (functools.partial(_forces, forcegp.LoadFriction), lambda: {"level": 0.1, "factor": 0.1}),
     "spring": (functools.partial(_forces, forcegp.Spring), lambda: {"stiffness": 0.1, "rest": None}),
     "Normal": (
@@ -429,7 +437,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "JointFriction": (functools.partial(_prior, forcegp.JointFriction), lambda: {"joints": None, "kernel": "friction"}),
     "PeriodicJointForces": (
-        functools.partial(_prior, forcegp.PeriodicJointForces),
+        functools.partial(_prior, forcegp.forces.PeriodicJointForces),
         lambda: {"period": 6.28, "joints": None},
     ),
     "ToolForces": (
@@ -459,16 +467,22 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         functools.partial(_forces, forcegp.Payload),
         lambda: {"link": "hand", "mass": 1.0, "center_of_mass": (0.0, 0.0, 0.1), "inertia": None},
     ),
-    "Inducing": (functools.partial(_engine, forcegp.Inducing), lambda: {"points": 5, "tolerance": 0.02, "refine": 0}),
+    "Inducing": (
+        functools.partial(_engine, forcegp.inference.Inducing),
+        lambda: {"points": 5, "tolerance": 0.02, "refine": 0},
+    ),
     "Preparation": (
-        lambda **k: forcegp.Preparation(**k).apply(INPUTS.free),
+        lambda **k: forcegp.data.Preparation(**k).apply(INPUTS.free),
         lambda: {"cutoff": 20.0, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
     ),
     "ComputedTorque": (
         functools.partial(_control, forcegp.ComputedTorque, lambda: arm_model(0)),
         lambda: {**TRACKING, "forces_at": "desired", "on_failure": "raise"},
     ),
-    "PDGravity": (functools.partial(_control, forcegp.PDGravity, _robot), lambda: {**TRACKING, "on_failure": "hold"}),
+    "PDGravity": (
+        functools.partial(_control, forcegp.control.PDGravity, _robot),
+        lambda: {**TRACKING, "on_failure": "hold"},
+    ),
     "ContactMonitor": (
         lambda **k: forcegp.ContactMonitor(arm_model(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
         lambda: {"dt": 0.01, "bandwidth": 5.0, "covariance": "noise"},
@@ -516,9 +530,9 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "Torques": (forcegp.Torques, lambda: {"noisy": "u", "robust": False, "mean": None}),
     "Motions": (forcegp.Motions, lambda: {"seconds": 1.0, "bodies": True}),
-    "split_named": (forcegp.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
+    "split_named": (forcegp.scores.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
     "ColumnMapping": (
-        forcegp.ColumnMapping,
+        forcegp.recordings.ColumnMapping,
         lambda: {
             "time": "t",
             "q": ("q",),
@@ -531,7 +545,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         },
     ),
     "ImportOptions": (
-        forcegp.ImportOptions,
+        forcegp.recordings.ImportOptions,
         lambda: {"gap": None, "rate": "auto", "start": None, "end": None},
     ),
     "KukaSurfaceConfig": (
@@ -546,7 +560,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         },
     ),
     "Windows": (forcegp.Windows, lambda: {"seconds": 0.1, "nodes": 6, "signal": "q", "order": 2}),
-    "Body": (forcegp.Body, lambda: {"strength": 1.0, "parts": ("mass",)}),
+    "Body": (forcegp.forces.Body, lambda: {"strength": 1.0, "parts": ("mass",)}),
     "load_posterior": (forcegp.load_posterior, lambda: {"path": INPUTS.folder / "carried", "contacts": None}),
     "Dataset.load": (forcegp.Dataset.load, lambda: {"path": INPUTS.folder / "train.h5"}),
 }

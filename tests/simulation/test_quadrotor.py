@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import AerodynamicForce, Dataset, Model, Robot, calibrated, fit
+from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
 from forcegp.data import Lag, estimate_thruster_lag, recorded_motions
 from forcegp.errors import InvalidInput
+from forcegp.fit import calibrated
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
 from forcegp.posterior.observed_wrench import _lasting

@@ -5,9 +5,9 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp import Accelerations, Body, Coulomb, Normal, Stribeck, Torques, Viscous, fit
+from forcegp import Accelerations, Coulomb, Normal, Stribeck, Torques, Viscous, fit
 from forcegp.errors import InvalidInput
-from forcegp.forces import Actuation, RigidBodies
+from forcegp.forces import Actuation, Body, RigidBodies
 from forcegp.model import Model
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 

@@ -153,8 +153,8 @@ class Auto(Command):
         return content
 
     def _imported(
-        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.ColumnMapping
-    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.ColumnMapping, list[Doubt]]:
+        self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.recordings.ColumnMapping
+    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.recordings.ColumnMapping, list[Doubt]]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
         mistakes: list[Doubt] = []
         for _ in range(MOST_CORRECTIONS):
@@ -183,7 +183,7 @@ class Auto(Command):
             mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])
         raise DatasetError("the log is not right after eight corrections; look at it with forcegp check.")
 
-    def _command(self, mapping: forcegp.ColumnMapping) -> str:
+    def _command(self, mapping: forcegp.recordings.ColumnMapping) -> str:
         """The same command with the columns, units and signs of the mapping."""
         stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "out"}
         others = [name for name in options_of(Auto) if name not in stated]
@@ -191,7 +191,7 @@ class Auto(Command):
         return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
-        self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.Preparation
+        self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.data.Preparation
     ) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
         """Rows to learn from, the same at the full rate, and what was done."""
         first = replace(wanted, every=1, stance="log")
@@ -212,7 +212,7 @@ class Auto(Command):
 
     def _scored(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model
-    ) -> tuple[forcegp.Scores, forcegp.posterior.Posterior]:
+    ) -> tuple[forcegp.scores.Scores, forcegp.posterior.Posterior]:
         """The scores of the models, and the recommended one, learned from all rows and stored."""
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
@@ -240,7 +240,7 @@ class Auto(Command):
         recording: forcegp.Dataset,
         content: Mapping[str, Any],
         answer: list[tuple[str, str]],
-        scores: forcegp.Scores,
+        scores: forcegp.scores.Scores,
     ) -> None:
         """The page to send around."""
         posterior, recording = forcegp.posterior.observing(posterior, recording)
@@ -304,7 +304,7 @@ def default_models(model: forcegp.Model) -> tuple[str, ...]:
 
 
 def answer_lines(
-    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str, scores: forcegp.Scores
+    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str, scores: forcegp.scores.Scores
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
     names, values, robot = dataset.joint_names, identified.estimates, identified.model.robot
@@ -366,7 +366,7 @@ def answer_lines(
     ]
 
 
-def far_worse(scores: forcegp.Scores, model: str) -> str:
+def far_worse(scores: forcegp.scores.Scores, model: str) -> str:
     """The joint whose acceleration is predicted far worse than that of the joint in the middle, if there is one."""
     errors = zip(scores.joint_names, scores.columns("nrmse", model=model), strict=True)
     known = {name: error for name, error in errors if error is not None}
@@ -376,7 +376,7 @@ def far_worse(scores: forcegp.Scores, model: str) -> str:
     return f"; {worst} is predicted far worse than the others (nRMSE {known[worst]:.2g}): look at it"
 
 
-def best_sentence(scores: forcegp.Scores, dataset: forcegp.Dataset) -> str:
+def best_sentence(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     """Which model to trust, and how much better than the URDF it is on unseen time."""
     best = scores.recommended
     assert best is not None, "a model was scored"
@@ -403,14 +403,14 @@ def best_sentence(scores: forcegp.Scores, dataset: forcegp.Dataset) -> str:
     return f"Trust the model “{name}”: on unseen time, {ahead}.{doubt}"
 
 
-def _motion(scores: forcegp.Scores, model: str) -> float | None:
+def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
     """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
     if model not in scores.models or not scores.finished(model) or not scores.horizons:
         return None
     return scores.value("rmse", f"position after {scores.horizons[-1]:g} s", model)
 
 
-def _acceleration(scores: forcegp.Scores, model: str) -> float | None:
+def _acceleration(scores: forcegp.scores.Scores, model: str) -> float | None:
     if model not in scores.models or not scores.finished(model):
         return None
     return scores.value("nrmse", model=model)

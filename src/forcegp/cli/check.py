@@ -62,7 +62,7 @@ class Check(Command):
         return content
 
 
-def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[Any]:
+def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -> list[Any]:
     """One paragraph per doubt, worst first, and the numbers of every joint."""
     from rich.text import Text
 
@@ -74,7 +74,7 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.CheckReport) -> list[
     return [heading, doubts, _numbers(report, content)] if measured else [heading, doubts]
 
 
-def _numbers(report: forcegp.CheckReport, content: Mapping[str, Any]) -> Any:
+def _numbers(report: forcegp.checks.CheckReport, content: Mapping[str, Any]) -> Any:
     cutoff = content["cutoff"]
     filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
     header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered, "times M"]

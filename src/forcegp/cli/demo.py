@@ -99,7 +99,7 @@ class Demo(Command):
         folder: Path,
         posterior: forcegp.posterior.Posterior,
         test: forcegp.Dataset,
-        scores: forcegp.Scores,
+        scores: forcegp.scores.Scores,
         results: Mapping[str, Any],
     ) -> str:
         """The page with everything, whose best sentence is returned."""

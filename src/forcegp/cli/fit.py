@@ -313,7 +313,7 @@ MOST_OPEN = 5
 """Combinations that the log does not tell apart, of which the first are named."""
 
 
-def estimates_table(title: str, estimates: Mapping[str, forcegp.Estimate]) -> Any:
+def estimates_table(title: str, estimates: Mapping[str, forcegp.posterior.Estimate]) -> Any:
     """Start, value, 95 % interval and what decides it, below the law or body that has them."""
     rows, owner = [], None
     for name, each in estimates.items():

@@ -84,7 +84,7 @@ class Import(Command):
         terminal.show(*shown, *([] if prepared is None else [_price(self.out, raw, prepared)]))
         return {"out": str(self.out), **done}
 
-    def _dataset(self, preparation: forcegp.Preparation) -> forcegp.Dataset:
+    def _dataset(self, preparation: forcegp.data.Preparation) -> forcegp.Dataset:
         """The dataset that is to be prepared. Raises InvalidInput for options that are about logs."""
         path, *others = self.logs
         about_logs = self.words("write_mapping", *options_of(ColumnOptions))

@@ -32,14 +32,14 @@ class CutoffOptions:
     differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities."""
 
-    def preparation(self) -> forcegp.Preparation:
+    def preparation(self) -> forcegp.data.Preparation:
         """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
         if self.cutoff in ("none", "auto"):
             cutoff = None if self.cutoff == "none" else "auto"
         else:
             complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
             [cutoff] = numbers_of(self.cutoff, complaint, one=True)
-        return forcegp.Preparation(cutoff=cutoff, differentiate=self.differentiate)
+        return forcegp.data.Preparation(cutoff=cutoff, differentiate=self.differentiate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class FilterOptions(CutoffOptions):
     trim: Annotated[float, arg(metavar="S")] = 0.0
     """Drop S seconds at both ends of each episode, after the filter."""
 
-    def preparation(self) -> forcegp.Preparation:
+    def preparation(self) -> forcegp.data.Preparation:
         """As above."""
         late: dict[str, Any] = {}
         for name in ("delay", "lag"):
@@ -70,8 +70,8 @@ class FilterOptions(CutoffOptions):
 
 
 def with_delay_that_shows(
-    terminal: Terminal, preparation: forcegp.Preparation, dataset: forcegp.Dataset
-) -> forcegp.Preparation:
+    terminal: Terminal, preparation: forcegp.data.Preparation, dataset: forcegp.Dataset
+) -> forcegp.data.Preparation:
     """The same with a delay of 0 instead of "auto" where a log shows none, which is reported on stderr."""
     contacts = dataset.model is not None and dataset.model.contacts
     if preparation.delay != "auto" or (forcegp.data.torques_of_joints(dataset) and not contacts):
@@ -148,14 +148,14 @@ class ColumnOptions:
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
 
-    def options(self) -> forcegp.ImportOptions:
+    def options(self) -> forcegp.recordings.ImportOptions:
         """How rows come of columns. Raises InvalidInput."""
         same = ("gap", "start", "end", "unwrap", "beyond_limits")
         given: dict[str, Any] = {name: getattr(self, name) for name in same} | {"rate": self.rate}
         if self.rate not in ("auto", "log"):
             complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."
             [given["rate"]] = numbers_of(self.rate, complaint, one=True)
-        return forcegp.ImportOptions(stance="auto", **given)
+        return forcegp.recordings.ImportOptions(stance="auto", **given)
 
     def model(self, robot: RobotOptions) -> forcegp.Model | None:
         """The robot, with the known forces and contacts of --identified, or with feet and wheels."""
@@ -170,7 +170,9 @@ class ColumnOptions:
             raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
         return model.with_contacts((*touching, *model.loops))
 
-    def mapped(self, logs: Sequence[Path], terminal: Terminal, written: Path | None = None) -> forcegp.ColumnMapping:
+    def mapped(
+        self, logs: Sequence[Path], terminal: Terminal, written: Path | None = None
+    ) -> forcegp.recordings.ColumnMapping:
         """The mapping of the file, changed by the flags. Raises InvalidInput for one that is to be `written`, too."""
         path = self.mapping
         if path is None:
@@ -183,11 +185,13 @@ class ColumnOptions:
                 if written is not None and path.resolve() == written.resolve():
                     raise InvalidInput(f"{path} is read by this command; give --write-mapping another name.")
                 terminal.note(f"the columns are mapped by {path}")
-        stored = forcegp.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
+        stored = forcegp.recordings.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
         return stored.changed_by(self._flags())
 
-    def _flags(self) -> forcegp.ColumnMapping:
-        given: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(forcegp.ColumnMapping)}
+    def _flags(self) -> forcegp.recordings.ColumnMapping:
+        given: dict[str, Any] = {
+            item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)
+        }
         if self.delimiter is not None:
             given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:

@@ -110,7 +110,7 @@ class Score(Command):
             models[path.name if path.name not in models else str(path)] = self._loaded(terminal, path, raw, data)
         models |= {name: name for name in self.models.names()}
         rows, recording, model = self._prepared(terminal, raw, data) if fits else (self._thinned(raw), raw, None)
-        split = forcegp.split_named(rows, self.split or "auto", self.guard) if fits else None
+        split = forcegp.scores.split_named(rows, self.split or "auto", self.guard) if fits else None
         with terminal.progress(f"scoring {len(rows)} rows") as report:
             scores = forcegp.score(
                 models or None,
@@ -200,7 +200,7 @@ class Score(Command):
         terminal: Terminal,
         posterior: forcegp.posterior.Posterior,
         rows: forcegp.Dataset,
-        scores: forcegp.Scores,
+        scores: forcegp.scores.Scores,
         content: Mapping[str, Any],
     ) -> None:
         """What is shown, drawn and written of a single model."""
@@ -240,7 +240,7 @@ class Score(Command):
         )
 
 
-def comparison(scores: forcegp.Scores, title: str) -> list[Any]:
+def comparison(scores: forcegp.scores.Scores, title: str) -> list[Any]:
     """Models side by side, which to take by every criterion, and what failed."""
     header, rows = forcegp.scores.overall(scores)
     brief = [[cell.partition(" (")[0] for cell in row] for row in rows]

@@ -157,7 +157,7 @@ class Fitted(Summary):
 
     @property
     def motion_intervals(self) -> MotionIntervals | None:
-        """Widths of the intervals of motions, where they were calibrated (`forcegp.calibrated`); a rollout has them."""
+        """Widths of the intervals of motions, where they were `calibrated`; a rollout has them."""
         stored = self.settings.get("motion_intervals")
         found = None if stored is None else MotionIntervals.from_dict(stored)
         # widths of motions that an observer's columns were part of are not those of motions without

@@ -161,7 +161,7 @@ def _progress(report: Report | None, restarts: int, steps: int) -> Any:
 def with_intervals_of_motions(
     posterior: Posterior, recording: Dataset, report: Callable[[int, int], None] | None = None
 ) -> tuple[Posterior, str | None]:
-    """`forcegp.calibrated`; the posterior itself, and why, where the recording is too short for it."""
+    """`calibrated`; the posterior itself, and why, where the recording is too short for it."""
     try:
         return calibrated(posterior, recording, report=report), None
     except InvalidInput as error:
