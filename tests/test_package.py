@@ -153,5 +153,5 @@ def test_every_module_of_a_public_name_is_checked_strictly(repository):
     text = (repository / "pyright-public.json").read_text()
     checked = set(re.findall(r'"(src/forcegp/[^"]+)"', text))
     public = {getattr(forcegp, name).__module__ for name in forcegp.__all__}
-    assert checked == {f"src/{module.replace('.', '/')}.py" for module in public}
+    assert checked >= {f"src/{module.replace('.', '/')}.py" for module in public}
     assert '"typeCheckingMode": "strict"' in text

@@ -18,6 +18,15 @@ from tests.posterior.arm import URDF, arm_model
 from tests.robots.mjcf_models import FOUR_BAR
 
 import forcegp
+import forcegp.control
+import forcegp.data
+import forcegp.errors
+import forcegp.forces
+import forcegp.inference
+import forcegp.mechanics
+import forcegp.recordings
+import forcegp.scores
+import forcegp.simulation
 from forcegp import forces, mechanics
 from forcegp.evidence import parse_evidence
 from forcegp.fit import fit

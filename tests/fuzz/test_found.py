@@ -16,6 +16,7 @@ from tests.fuzz.oracle import require_ended_well
 from tests.posterior.arm import URDF
 
 import forcegp
+import forcegp.inference
 from forcegp.atomic_files import write_digests
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
 from forcegp.model import Model

@@ -16,6 +16,8 @@ import forcegp
 import forcegp.checks
 import forcegp.data
 import forcegp.evidence
+import forcegp.posterior
+import forcegp.recordings
 import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.checks
 import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, Command, unless_given

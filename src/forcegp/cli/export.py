@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import forcegp
+import forcegp.posterior
 from forcegp.cli.command import MODEL, Command, unless_given
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
