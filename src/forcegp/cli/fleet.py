@@ -40,7 +40,7 @@ class Line:
     """One log: its name, and the words of its command without --out."""
 
     name: str
-    words: tuple[str, ...]
+    common: tuple[str, ...]
 
 
 class Quiet(Terminal):
@@ -70,7 +70,7 @@ class Fleet(Command):
     replaces = False
 
     command: str
-    words: tuple[str, ...]
+    common: tuple[str, ...]
     logs_from: Path
     out: Path
     jobs: Jobs = 1
@@ -79,7 +79,7 @@ class Fleet(Command):
         """Run it for each log; a log that fails is a row that says so. Raises InvalidInput for a folder of others."""
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-        lines = lines_of(self.command, self.words, self.logs_from, self.out)
+        lines = lines_of(self.command, self.common, self.logs_from, self.out)
         with terminal.progress("running") as report:
             rows = run_fleet(self.command, lines, self.out, self.jobs, overwrite=self.overwrite, progress=report)
         write_text(self.out / TABLE, table_of(rows))
@@ -205,7 +205,7 @@ def fleet_of(command: str, words: Sequence[str]) -> Fleet:
     switches = {word.removeprefix("--"): word in words for word in SWITCHES}
     return Fleet(
         command=command,
-        words=tuple(common),
+        common=tuple(common),
         logs_from=Path(own[FLAG]),
         out=Path(own["--out"]),
         jobs=int(jobs),
