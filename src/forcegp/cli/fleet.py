@@ -40,7 +40,7 @@ class Line:
     """One log: its name, and the words of its command without --out."""
 
     name: str
-    common: tuple[str, ...]
+    words: tuple[str, ...]
 
 
 class Quiet(Terminal):

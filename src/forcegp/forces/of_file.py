@@ -1,12 +1,11 @@
 """The forces that a robot's file states."""
 
 from forcegp.forces.actuation import Actuation
-from forcegp.forces.dry_friction import Coulomb
 from forcegp.forces.force import Force
+from forcegp.forces.friction import Coulomb, Viscous
 from forcegp.forces.offset import Spring
 from forcegp.forces.rigid_bodies import RigidBodies
 from forcegp.forces.thrusters import Thrusters
-from forcegp.forces.viscous import Viscous
 from forcegp.robots import Robot
 from forcegp.robots.mjcf_model import Translation
 
