@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import ContactError, DataWarning, InvalidInput
-from forcegp.evidence.windows import WindowedRows
+from forcegp.evidence.evidence import WindowedRows
 from forcegp.forces import Scaling
 from forcegp.mechanics import AffineMap
 from forcegp.model import Model

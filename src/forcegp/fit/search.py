@@ -16,7 +16,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, FitError, InvalidInput, require_type, usable_arguments
-from forcegp.evidence.windows import WindowedRows
+from forcegp.evidence.evidence import WindowedRows
 from forcegp.forces.basic_kernels import register_log_normal_prior
 from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, best_of, minimize_objective
 from forcegp.inference.memory import blas_threads
