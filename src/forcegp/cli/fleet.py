@@ -35,14 +35,6 @@ SHOWN = 12
 """Logs that failed which a terminal shows; the table has all."""
 
 
-@dataclass(frozen=True)
-class Line:
-    """One log: its name, and the words of its command without --out."""
-
-    name: str
-    words: tuple[str, ...]
-
-
 class Quiet(Terminal):
     """A terminal of a log among many, which keeps warnings and shows nothing."""
 
@@ -76,12 +68,28 @@ class Fleet(Command):
     jobs: Jobs = 1
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Run it for each log; a log that fails is a row that says so. Raises InvalidInput for a folder of others."""
+        """Run it for each log. One that fails is a row that says so; what is finished, of the same files, stays.
+
+        Raises InvalidInput for a folder of others, and BackendError where a process of this machine died.
+        """
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-        lines = lines_of(self.command, self.common, self.logs_from, self.out)
+        lines, work = lines_of(self.command, self.common, self.logs_from, self.out), []
+        kind = f"forcegp {self.command} {FLAG}"
+        store = JobStore.open(self.out, kind, {"command": self.command}, overwrite=self.overwrite)
+        for name, words in lines.items():
+            stamps = {word: _stamp(Path(word)) for word in words if not word.startswith("-") and Path(word).is_file()}
+            spec = {"command": self.command, "words": words, "out": str(self.out / name), "files": stamps}
+            work.append(Job(name, f"{__name__}:one", spec))
+            if store.place(name).exists() and store.result(name)["error"]:
+                shutil.rmtree(store.place(name))  # what was wrong may be mended
         with terminal.progress("running") as report:
-            rows = run_fleet(self.command, lines, self.out, self.jobs, overwrite=self.overwrite, progress=report)
+            run_jobs(store, work, self.jobs, report)
+        kept = {name: store.load(name) for name in lines}
+        rows = [
+            {"log": name, "folder": str(self.out / name), "cpu_seconds": row["cpu_seconds"]} | row["result"]
+            for name, row in kept.items()
+        ]
         write_text(self.out / TABLE, table_of(rows))
         failed = [row for row in rows if row["error"]]
         told = {row["log"]: row["error"] for row in failed[:SHOWN]}
@@ -92,9 +100,11 @@ class Fleet(Command):
 
 
 def fleet(words: Sequence[str], jobs: Jobs = 1) -> list[dict[str, Any]]:
-    """The rows of `forcegp WORDS`, such as ["fit", "--logs-from", "list.txt", "--out", "fleet"], in any executor.
+    """The rows of `forcegp WORDS`, such as ["fit", "--logs-from", "list.txt", "--out", "fleet"].
 
-    Raises as the command.
+    {"log", "folder", "error", "cpu_seconds", "warnings", "numbers"} each. `jobs` is a number of processes of this
+    machine, or an `Executor` whose workers see the same files, such as Dask's `client.get_executor()`. Raises as the
+    command.
     """
     asked = command_of(words)
     if not isinstance(asked, Fleet):
@@ -108,41 +118,6 @@ def command_of(words: Sequence[str]) -> Command:
     if asked and words[0] in COMMANDS and "logs_from" in options_of(command_class(words[0])):
         return fleet_of(words[0], words[1:])
     return parsed(words)
-
-
-def run_fleet(
-    command: str,
-    lines: Sequence[Line],
-    out: Path,
-    jobs: Jobs = 1,
-    *,
-    overwrite: bool = False,
-    progress: Any = None,
-) -> list[dict[str, Any]]:
-    """One row per log, in their order: {"log", "folder", "error", "cpu_seconds", "warnings", "numbers"}.
-
-    `jobs` is a number of processes of this machine, or an `Executor`, such as Dask's `client.get_executor()`, whose
-    workers see the same files. Rows are kept as they come: the same call resumes, and runs what is new or has changed.
-    Raises InvalidInput for a folder of another command, and BackendError where a process of this machine died.
-    """
-    store = JobStore.open(out, f"forcegp {command} {FLAG}", {"command": command}, overwrite=overwrite)
-    work = []
-    for line in lines:
-        spec = {
-            "command": command,
-            "words": list(line.words),
-            "out": str(out / line.name),
-            "files": _stamps(line.words),
-        }
-        work.append(Job(line.name, f"{__name__}:one", spec))
-        if store.place(line.name).exists() and store.result(line.name)["error"]:
-            shutil.rmtree(store.place(line.name))  # what was wrong may be mended
-    run_jobs(store, work, jobs, progress)
-    kept = {line.name: store.load(line.name) for line in lines}
-    return [
-        {"log": name, "folder": str(out / name), "cpu_seconds": row["cpu_seconds"]} | row["result"]
-        for name, row in kept.items()
-    ]
 
 
 def one(store: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -213,9 +188,9 @@ def fleet_of(command: str, words: Sequence[str]) -> Fleet:
     )
 
 
-def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> list[Line]:
-    """The lines of a list of logs. Raises InvalidInput for words that make no command, and FileFormatError."""
-    lines = dict[str, Line]()
+def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict[str, list[str]]:
+    """By name, the words of each line of a list of logs. Raises InvalidInput for words that make no command, and FileFormatError."""
+    lines = dict[str, list[str]]()
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -229,13 +204,13 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> list
             stem = Path(logs[0]).name.partition(".")[0] if logs else f"line-{number}"
             name = stem if stem not in lines else f"{stem}-{number}"
             differing = [word.partition("=")[0] for word in given if word.startswith("--")]
-            lines[name] = Line(name, (*_without(common, differing), *given))
-            parsed([command, *lines[name].words, "--out", str(out / name)])
+            lines[name] = [*_without(common, differing), *given]
+            parsed([command, *lines[name], "--out", str(out / name)])
         except (InvalidInput, ValueError) as error:
             raise InvalidInput(f"line {number} of {path}: {error}") from None
     if not lines:
         raise InvalidInput(f"{path} names no log; write one in each line, with the options that differ for it.")
-    return list(lines.values())
+    return lines
 
 
 def _taken(words: Sequence[str], flags: Sequence[str]) -> dict[str, str]:
@@ -258,7 +233,6 @@ def _without(words: Sequence[str], flags: Sequence[str]) -> list[str]:
     return left
 
 
-def _stamps(words: Sequence[str]) -> dict[str, list[int]]:
-    """Size and time of the files that words name, by which a row is known to be of these files."""
-    files = {word: Path(word) for word in words if not word.startswith("-") and Path(word).is_file()}
-    return {word: [path.stat().st_size, path.stat().st_mtime_ns] for word, path in files.items()}
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size and time of a file, by which a row is known to be of it."""
+    return path.stat().st_size, path.stat().st_mtime_ns
