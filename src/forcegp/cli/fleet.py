@@ -189,7 +189,7 @@ def fleet_of(command: str, words: Sequence[str]) -> Fleet:
 
 
 def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict[str, list[str]]:
-    """By name, the words of each line of a list of logs. Raises InvalidInput for words that make no command, and FileFormatError."""
+    """By name, the words of each line of a list. Raises InvalidInput for words of no command, and FileFormatError."""
     lines = dict[str, list[str]]()
     try:
         text = path.read_text(encoding="utf-8")
