@@ -1,5 +1,6 @@
 """The public page and the papers of the package say the same thing everywhere."""
 
+import ast
 import re
 import subprocess
 import tomllib
@@ -26,9 +27,12 @@ def test_one_version_everywhere(repository):
 def test_public_names_are_public_in_their_rooms_and_documented(name, repository):
     value = getattr(forcegp, name)
     page = (repository / "src/forcegp/__init__.pyi").read_text()
-    package = re.search(rf"^from \.(\w+) import {name} as {name}$", page, re.M)
-    assert package is not None
-    assert value is getattr(import_module(f"forcegp.{package[1]}"), name)
+    (package,) = [
+        node.module
+        for node in ast.parse(page).body
+        if isinstance(node, ast.ImportFrom) and name in {alias.asname for alias in node.names}
+    ]
+    assert value is getattr(import_module(f"forcegp.{package}"), name)
     assert value.__doc__, f"{name} has no docstring"
     assert name in dir(forcegp)
 

@@ -35,31 +35,15 @@ class RobotModelError(ForceGPError):
 
 
 class MalformedUrdf(RobotModelError):
-    """Not well-formed XML, or XML that is not a URDF."""
+    """Not well-formed XML, or no URDF: names that are missing, twice or of nothing, xacro that was not expanded."""
 
 
 class MalformedMjcf(RobotModelError):
     """A file that MuJoCo cannot read or compile, or that is larger than that of a robot."""
 
 
-class MissingElement(MalformedUrdf):
-    """A link or joint lacks an element or attribute that has no default."""
-
-
 class InvalidNumber(MalformedUrdf):
     """Text where a number belongs, too few or too many numbers, or a number that makes no sense there."""
-
-
-class DuplicateName(MalformedUrdf):
-    """Two links or two joints of the same name."""
-
-
-class DanglingJoint(MalformedUrdf):
-    """A joint names a link that the file does not define."""
-
-
-class UnexpandedXacro(MalformedUrdf):
-    """A xacro macro file that was not expanded to a URDF."""
 
 
 class UnreadableRobotFile(RobotModelError):

@@ -17,12 +17,8 @@ from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidd
 from defusedxml import ElementTree as SafeElementTree
 
 from forcegp.errors import (
-    DanglingJoint,
-    DuplicateName,
     InvalidNumber,
     MalformedUrdf,
-    MissingElement,
-    UnexpandedXacro,
     UnsafeXml,
     UnsupportedJoint,
 )
@@ -109,7 +105,7 @@ def refuse_xacro(root: Element, source: str) -> None:
         if "xacro}" in element.tag and not element.tag.endswith(left)
     ]
     for element in (*macros, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
-        raise UnexpandedXacro(
+        raise MalformedUrdf(
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
             "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
         )
@@ -203,7 +199,7 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     if root is not None:
         links = {root: None} | links
         seen = f"{source}: the link {root!r} is a parent, and the file does not define it"
-        problems.errors.append(DanglingJoint(seen, ". It can be the root, fixed in the world.", {"root": root}))
+        problems.errors.append(MalformedUrdf(seen, ". It can be the root, fixed in the world.", {"root": root}))
     joints = []
     for joint, part in parts.items():
         with problems.collected():
@@ -217,10 +213,10 @@ def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
         with problems.collected():
             name = element.get("name", "")
             if not name.strip():
-                raise MissingElement(f'{problems.source}: a <{kind}> has no name; write <{kind} name="...">.')
+                raise MalformedUrdf(f'{problems.source}: a <{kind}> has no name; write <{kind} name="...">.')
             if name in found:
                 seen = f"{problems.source}: two {kind}s are called {name!r}"
-                raise DuplicateName(seen, f"; {kind} names must be unique, rename one.")
+                raise MalformedUrdf(seen, f"; {kind} names must be unique, rename one.")
             found[name] = element
     return found
 
@@ -247,14 +243,14 @@ class _Place:
 def _attribute(element: Element, attribute: str, place: _Place) -> str:
     value = element.get(attribute)
     if value is None:
-        raise MissingElement(f"{place}: <{element.tag}> has no attribute {attribute!r}; add it.")
+        raise MalformedUrdf(f"{place}: <{element.tag}> has no attribute {attribute!r}; add it.")
     return value
 
 
 def _child(element: Element, tag: str, place: _Place) -> Element:
     child = _optional_child(element, tag, place)
     if child is None:
-        raise MissingElement(f"{place}: <{element.tag}> has no <{tag}>; add it.")
+        raise MalformedUrdf(f"{place}: <{element.tag}> has no <{tag}>; add it.")
     return child
 
 
@@ -366,7 +362,7 @@ def _joint(element: Element, name: str, links: dict[str, InertialDescription | N
         if ends[end] not in links:
             close = difflib.get_close_matches(ends[end], links, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise DanglingJoint(
+            raise MalformedUrdf(
                 f"{place} names the {end} link {ends[end]!r}, which the file does not define{hint}",
                 f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
