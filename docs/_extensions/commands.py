@@ -4,7 +4,7 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from forcegp.cli.main import COMMANDS
+from forcegp.cli.arguments import COMMANDS
 
 
 class Commands(SphinxDirective):

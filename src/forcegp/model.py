@@ -14,8 +14,8 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.forces import Actuation, Force, Law, Payload, RigidBodies, Rotor, Thrusters, Viscous
-from forcegp.forces.memory import Memory
-from forcegp.forces.of_file import forces_of_file, forces_of_mjcf
+from forcegp.forces.actuation import forces_of_file, forces_of_mjcf
+from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
 from forcegp.forces.thrusters import FADES, OBSERVED, ObservedWrench

@@ -2,9 +2,12 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 from benchmarks.paper.__main__ import main
+
+from forcegp.cli.main import main as forcegp
 
 pytest.importorskip("pybullet")
 
@@ -51,3 +54,14 @@ def test_all_figures_are_there_and_a_second_run_changes_nothing(tmp_path, monkey
     assert {file: file.stat().st_mtime_ns for file in kept} == kept
     assert main(["all", "--preset", "paper", "--out", "out"]) == 2
     assert "holds results with another preset" in capfd.readouterr().err
+
+
+def test_forcegp_reproduce_is_the_same(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    for words, message in (("fig9", "no figure 'fig9'"), ("fig2b --preset huge", "no preset 'huge'")):
+        assert forcegp(["reproduce", *words.split(), "--out", "new"]) == 2
+        assert message in capfd.readouterr().err
+    monkeypatch.setattr("forcegp.cli.reproduce.EXPERIMENTS", Path("nowhere.py"))
+    assert forcegp(["reproduce", "all"]) == 2
+    assert "git clone" in capfd.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -12,7 +12,7 @@ import sys
 import pytest
 from tests.posterior.arm import URDF, arm_data
 
-from forcegp.cli.main import COMMANDS
+from forcegp.cli.arguments import COMMANDS
 
 
 @pytest.fixture

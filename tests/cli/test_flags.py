@@ -5,8 +5,9 @@ import shlex
 
 import pytest
 
+from forcegp.cli.arguments import command_class, one_line
 from forcegp.cli.command import FIELDS, NUMBERS, options_of, split_list, values_of
-from forcegp.cli.main import ARGUMENTS, command_class, one_line, parse_arguments
+from forcegp.cli.main import ARGUMENTS, parse_arguments
 from forcegp.errors import InvalidInput
 
 FIT = "fit x.h5 --out run"

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from tests.posterior.arm import arm_data
 
+from forcegp.cli.arguments import COMMANDS, command_class
 from forcegp.cli.command import options_of
-from forcegp.cli.main import COMMANDS, command_class
 from forcegp.cli.terminal import OTHERWISE, with_option_names
 from forcegp.errors import ForceGPError
 from forcegp.fit import fit

@@ -13,7 +13,7 @@ from tests.data.test_moving_bases import jumbled, tumbling
 from forcegp.data import REVOLUTE_UNITS, Dataset, Preparation
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.evidence import Windows
-from forcegp.evidence.windows import white_noise
+from forcegp.evidence.evidence import white_noise
 
 HOWS = {
     "weak form on q": Windows(0.1, nodes=10),

@@ -12,8 +12,8 @@ from forcegp.data import Dataset
 from forcegp.errors import NumericalWarning
 from forcegp.fit import fit
 from forcegp.fit.fit import _Functions
-from forcegp.fit.objective import Search
 from forcegp.fit.refinement import SETTLED, fit_with_refined_loads
+from forcegp.fit.search import Search
 from forcegp.forces import ContactFriction, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model

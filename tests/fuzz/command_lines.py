@@ -12,8 +12,9 @@ from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import DefectError, Target, require_ended_well
 from tests.fuzz.values import WORDS, hostile_pickle
 
+from forcegp.cli.arguments import COMMANDS, command_class
 from forcegp.cli.command import options_of
-from forcegp.cli.main import COMMANDS, command_class, parse_arguments
+from forcegp.cli.main import parse_arguments
 from forcegp.errors import ForceGPError
 
 FILES = (

@@ -9,8 +9,14 @@ from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from forcegp.errors import InvalidInput
 from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
-from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
-from forcegp.inference.pathwise import ComposedSamples, FunctionSamples, draw_functions, mean_function
+from forcegp.inference.pathwise import (
+    ComposedSamples,
+    DrawnTerm,
+    FunctionSamples,
+    draw_functions,
+    kernel_terms,
+    mean_function,
+)
 
 POINTS, OUTPUTS = 9, 3
 

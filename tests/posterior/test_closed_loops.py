@@ -59,7 +59,7 @@ def test_friction_inside_a_loop_is_learned(model, dataset, posterior):
     dynamics = model.dynamics(q, v, u)
     torch.testing.assert_close((dynamics.A @ found.mean[..., None])[..., 0], dynamics.b, rtol=0.0, atol=1e-6)
     assert contact_rows(dataset).all()
-    assert contact_doubts(dataset) == []
+    assert contact_doubts(dataset) == ()
     assert usual_forces(model) == "gp:joint-friction"
 
 

@@ -11,7 +11,7 @@ from tests.posterior.arm import arm_data
 
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.fit.objective import Search
+from forcegp.fit.search import Search
 from forcegp.forces import JointForces, JointFriction, Unknown, kernel_of
 from forcegp.inference import OptimizerOptions
 from forcegp.posterior import save_posterior

@@ -67,6 +67,9 @@ class Auto(Command):
     """Continue although the log contains mistakes."""
     link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
     """Where a payload may be."""
+    logs_from: Annotated[Path | None, unless_given("LIST", "one log", Path)] = None
+    """In the place of LOG a text file with one in each line, and the options that differ for it, such as --robot.
+    --out gets a folder for each and fleet.csv; --jobs logs are at work at once. What is finished is kept."""
     robot: RobotOptions = RobotOptions()
     columns: ColumnOptions = ColumnOptions()
     filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto", lag="auto")

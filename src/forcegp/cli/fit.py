@@ -110,6 +110,9 @@ class Fit(Command):
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
+    logs_from: Annotated[Path | None, unless_given("LIST", "one log", Path)] = None
+    """In the place of LOG a text file with one in each line, and the options that differ for it, such as --robot.
+    --out gets a folder for each and fleet.csv; --jobs logs are at work at once. What is finished is kept."""
     robot: RobotOptions = RobotOptions()
     search: SearchOptions = SearchOptions()
 

@@ -28,8 +28,8 @@ from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.evidence.identifiability import base_parameters, torque_regressor
 from forcegp.inference.cholesky_update import with_only
+from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import exact
-from forcegp.inference.threads import blas_threads
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact
 from forcegp.model import Model

@@ -1,5 +1,6 @@
-"""What a model is conditioned on: rows or windows with standardised features."""
+"""What a model is conditioned on: rows or windows with standardised features, which touch its contacts."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
-from forcegp.evidence.windows import WindowedRows
+from forcegp.errors import ContactError, DataWarning, InvalidInput
+from forcegp.evidence.evidence import WindowedRows
 from forcegp.forces import Scaling
 from forcegp.mechanics import AffineMap
+from forcegp.model import Model
 
 CONSTANT = 1e-12
 """Spread of a feature, relative to 1 plus its size, below which it is constant."""
@@ -140,3 +142,33 @@ def shrunk(
     covariance = torque_noise @ kept.mT
     matrix, offset = kept @ acceleration.matrix, (kept @ acceleration.offset[..., None])[..., 0]
     return AffineMap(offset, matrix), 0.5 * (covariance + covariance.mT)
+
+
+FAR_FROM_SURFACE = 0.01
+"""Median distance of the training points from a contact's surface, in m, beyond which a warning is given."""
+
+
+def check_distance(model: Model, training: TrainingData) -> None:
+    """Refuse a surface that no training state touches, and warn where half of them are far from it."""
+    kinematics = model.robot.kinematics(training.q)
+    for index, contact in enumerate(model.contacts):
+        # divided by |s_p|, which is 1 for signed distances, the value of any surface is a distance near it
+        size = torch.linalg.vector_norm(contact.surface.gradient(contact.position(kinematics)), dim=-1)
+        distances = (contact.distance(kinematics) / size).abs()
+        distance = float(distances.median())
+        what = f"the surface of contact {index} (frame {contact.frame!r})"
+        remedy = "check its surface, point and units (m), or leave the contact out"
+        if float(distances.min()) > FAR_FROM_SURFACE:
+            raise ContactError(
+                f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away, half of them "
+                f"more than {distance:.3g} m; {remedy}"
+            )
+        if distance > FAR_FROM_SURFACE:
+            _warn(
+                f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
+                "rows in contact only (forcegp.data.rows_in_contact)"
+            )
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, DataWarning, stacklevel=6)

@@ -13,14 +13,13 @@ from torch import Tensor
 from forcegp.data import Dataset, contact_doubts, evenly, thruster_columns
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
-from forcegp.evidence.contacts import FAR_FROM_SURFACE
 from forcegp.evidence.identifiability import carrying
 from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
-from forcegp.evidence.payload_link import CLEARLY, left_by_least_squares
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.evidence.training_data import CONSTANT
+from forcegp.evidence.training_data import CONSTANT, FAR_FROM_SURFACE
+from forcegp.fit.equations import CLEARLY, left_by_least_squares
 from forcegp.forces import JointLaw, Law, Normal, Offset, RigidBodies
 from forcegp.mechanics import State
 from forcegp.model import Model

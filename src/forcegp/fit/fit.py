@@ -15,9 +15,9 @@ from forcegp.data.dataset import require_rows
 from forcegp.data.views import with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows
-from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
+from forcegp.evidence.training_data import check_distance
 from forcegp.fit.doubts import check_forces, refuse_what_looks_alike, warn_of_contacts
 from forcegp.fit.joint import (
     CHANGE,
@@ -28,7 +28,6 @@ from forcegp.fit.joint import (
     with_free_numbers,
 )
 from forcegp.fit.motion_fit import refine_on_motions
-from forcegp.fit.objective import LOG_VARIANCE_SPREAD, FitObjective, Search, with_variance_priors
 from forcegp.fit.physical import fit_physical, typical_sizes, with_payloads_placed
 from forcegp.fit.refinement import (
     fit_with_refined_loads,
@@ -39,12 +38,16 @@ from forcegp.fit.refinement import (
 )
 from forcegp.fit.search import (
     ALL_ROWS,
+    LOG_VARIANCE_SPREAD,
     MOST_POINTS_FOR_RESTARTS,
+    FitObjective,
     FitProgress,
+    Search,
     described_rows,
     learns_noise,
     noise_of_windows,
     resolved_noise,
+    with_variance_priors,
 )
 from forcegp.fit.widening import widened
 from forcegp.forces import UnknownForces

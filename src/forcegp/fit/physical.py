@@ -21,9 +21,8 @@ from forcegp.evidence.bodies import thickened
 from forcegp.evidence.identifiability import BaseParameters, parameter_names
 from forcegp.evidence.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares, without
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.payload_link import most_likely, possible_links
 from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
-from forcegp.fit.equations import Equations
+from forcegp.fit.equations import Equations, most_likely, possible_links
 from forcegp.forces import Payload, RigidBodies
 from forcegp.model import Model
 from forcegp.noise import Noise

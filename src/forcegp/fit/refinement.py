@@ -16,10 +16,9 @@ import torch
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.preparation import memory
 from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
-from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood
-from forcegp.evidence.training_data import TrainingData
-from forcegp.fit.objective import FitObjective
+from forcegp.evidence.training_data import TrainingData, check_distance
+from forcegp.fit.search import FitObjective
 from forcegp.forces import UnknownForces
 from forcegp.forces.contact_friction import JAMMING, TabulatedCurve, refined_loads
 from forcegp.inference import (
@@ -35,8 +34,7 @@ from forcegp.inference import (
 )
 from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
 from forcegp.inference.linear_functionals import require_memory_for_functionals
-from forcegp.inference.memory import require_memory
-from forcegp.inference.threads import blas_threads
+from forcegp.inference.memory import blas_threads, require_memory
 from forcegp.noise import ACCELERATION
 from forcegp.posterior import Posterior
 from forcegp.robots.arguments import whole_number

@@ -22,11 +22,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import NumericalError
-from forcegp.fit.objective import FitObjective
-from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
+from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS, FitObjective
 from forcegp.inference import LatentPosterior
+from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import FactorizedPosterior
-from forcegp.inference.threads import blas_threads
 from forcegp.posterior import Posterior
 from forcegp.posterior.motion_intervals import DEVIATIONS
 

@@ -1,7 +1,7 @@
 from .actuation import Actuation as Actuation
 from .base_wrench import AerodynamicForce as AerodynamicForce, BaseWrench as BaseWrench
 from .contact_friction import ContactFriction as ContactFriction, foot_friction as foot_friction
-from .dry_friction import Coulomb as Coulomb, Stribeck as Stribeck, LoadFriction as LoadFriction
+from .friction import Coulomb as Coulomb, Stribeck as Stribeck, LoadFriction as LoadFriction
 from .force import Force as Force, JointLaw as JointLaw, Law as Law
 from .joint_forces import (
     IndependentAccelerations as IndependentAccelerations, JointAccelerations as JointAccelerations,
@@ -26,4 +26,4 @@ from .tool_forces import ToolForces as ToolForces
 from .unknown import (
     Scaling as Scaling, Unknown as Unknown, UnknownForces as UnknownForces, has_few_inputs as has_few_inputs,
 )
-from .viscous import DirectionalFriction as DirectionalFriction, Viscous as Viscous
+from .friction import DirectionalFriction as DirectionalFriction, Viscous as Viscous

@@ -8,11 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.forces.dry_friction import Coulomb
 from forcegp.forces.force import JointLaw, Law
+from forcegp.forces.friction import Coulomb, Viscous
 from forcegp.forces.offset import Offset
 from forcegp.forces.rotor import Rotor
-from forcegp.forces.viscous import Viscous
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Kinematics, Robot
 

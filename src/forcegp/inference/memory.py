@@ -1,11 +1,14 @@
-"""How much memory there is, and the error that names what a computation would need."""
+"""How much memory there is, the error that names what a computation would need, and threads of linear algebra."""
 
 import ctypes
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import psutil
 import torch
+from threadpoolctl import threadpool_limits
 
 from forcegp.errors import NotEnoughMemory
 
@@ -56,3 +59,12 @@ def _free_in_container() -> int:
     except (OSError, ValueError, KeyError):
         return 2**63
     return 2**63 if limit == "max" else max(0, int(limit) - used + int(cached))
+
+
+SMALL_COVARIANCE = 2000
+"""Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
+
+
+def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
+    """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times as much."""
+    return threadpool_limits(1) if covariance_rows <= SMALL_COVARIANCE else nullcontext()

@@ -10,11 +10,10 @@ import torch
 
 from forcegp.codegen.graph import Graph
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_sums import PADDING, KernelSum
 from forcegp.inference.one_input_functions import OneInputFunctions, drawn_form, markov_functions, one_input_form
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, kernel_sums
+from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum, kernel_sums
 
 FEW_CENTERS = 128
 """Kernels without an exact form in pieces are summed over so few centres as fast as a table is looked up."""

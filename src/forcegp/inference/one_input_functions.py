@@ -20,8 +20,7 @@ from torch import Tensor
 from forcegp.codegen.c_writer import c_text, filled
 from forcegp.errors import InvalidInput
 from forcegp.inference.kernel_matrices import PointMap
-from forcegp.inference.kernel_terms import DrawnTerm, kernel_terms
-from forcegp.inference.pathwise import ComposedSamples, FunctionSamples
+from forcegp.inference.pathwise import ComposedSamples, DrawnTerm, FunctionSamples, kernel_terms
 from forcegp.inference.posterior import LatentPosterior
 
 MOST_INTERVALS = 2**15

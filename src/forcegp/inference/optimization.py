@@ -37,14 +37,13 @@ class OptimizerOptions:
     fraction of it; `slow`: stop when `SLOW_ITERATIONS` of them together lower it by less than this (nats), 0 for never;
     `patience`: stop when so many iterations at the present pace would not reach the best of earlier starts, 0 for
     never; `gradient_tolerance`: stop when the largest gradient entry is below this; `memory`: iterations that make up
-    the curvature; `keep_iterates`: keep the parameters after every one.
+    the curvature.
     """
 
     iterations: int = 200
     tolerance: float = 1e-8
     gradient_tolerance: float = 1e-4
     memory: int = 200
-    keep_iterates: bool = False
     slow: float = 0.0
     patience: int = 0
 
@@ -59,10 +58,7 @@ class OptimizerOptions:
 
 @dataclass(frozen=True)
 class OptimizationResult:
-    """The best parameters seen, the objective there, its value after every iteration, and why the search ended.
-
-    `iterates` are the parameters that belong to `history`, where `keep_iterates` asked for them; else it is empty.
-    """
+    """The best parameters seen, the objective there, its value after every iteration, and why the search ended."""
 
     parameters: dict[str, Tensor]
     value: float
@@ -71,7 +67,6 @@ class OptimizationResult:
     converged: bool
     evaluations: int
     cpu_seconds: float
-    iterates: tuple[dict[str, Tensor], ...] = ()
 
 
 class _Search:
@@ -168,12 +163,9 @@ def minimize_objective(
     if search.evaluate(search.best_point) is None:
         raise FitError(f"the marginal likelihood cannot be evaluated at the start values: {search.cause}")
     history = [search.best_value]
-    points = [search.best_point.copy()]
 
     def after_iteration(intermediate_result: OptimizeResult) -> None:
         history.append(float(intermediate_result.fun))
-        if options.keep_iterates:
-            points.append(intermediate_result.x.copy())
         if progress is not None:
             progress(len(history) - 1, history[-1])
         hopeless = options.patience and SLOW_ITERATIONS * (history[-1] - rival) > options.patience * pace()
@@ -231,7 +223,6 @@ def minimize_objective(
         converged=converged,
         evaluations=search.evaluations,
         cpu_seconds=time.process_time() - start_time,
-        iterates=tuple(map(search.unflatten, points)) if options.keep_iterates else (),
     )
 
 

@@ -13,18 +13,229 @@ So it is never below the exact one (the difference V^T (I - B B^T) V is positive
 numbers per latent and centre. B holds leading left singular vectors of V at sample states, each weighted by what it
 does to the standard deviations there, found a block at a time, where most is missing, until they are enough: up to a
 tenth more than the best ones, in a third of the time that a singular value decomposition takes.
+
+Posterior means of latents as C: sums over the centres, f_c(z) = sum_j w_cj k_c(z, z_j), for kernels of any kind.
+The kernel of one pair (z, z_j) is traced as a graph (`codegen.tracing`) and taken apart: what depends on the centre
+alone is computed once, when the sums are made, and becomes a table; what depends on z alone is computed once per state
+and is an operand of the C function; only what depends on both is computed in its loop. Of scaled squared exponentials
+of latents that share their centres
+
+    log k_c(z, z_j) = log s_c - 1/2 |z / l_c|^2 + (z / l_c^2) . z_j - 1/2 |z_j / l_c|^2
+
+that is one product per feature, and one exponential. Several states stand in the lanes of vector registers, or, where
+there is only one, several centres.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from forcegp.codegen.c_writer import c_text, c_value, filled, sections
+from forcegp.codegen.derivatives import gradients
+from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
+from forcegp.codegen.tracing import trace
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
-from forcegp.inference.kernel_sums import KernelSum, PairFunction
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior
+
+PADDING = 8
+"""Centres are filled up to a multiple of the most lanes, with weights of zero."""
+
+BLOCK = 64
+"""Centres whose kernels are held at once."""
+
+
+PairFunction = Callable[[Tensor, Tensor], Tensor]
+"""(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair."""
+
+
+@dataclass(frozen=True, eq=False)
+class KernelSum:
+    """The sums of G latents over the same N centres, with what their C function needs.
+
+    `weights` (G, N) are those of the posterior mean. `name` is that of the C function.
+    """
+
+    name: str
+    latents: tuple[int, ...]
+    features: int
+    centers: Float[Tensor, "N d"]
+    weights: Float[Tensor, "G N"]
+    pair: Graph
+    kernels: tuple[int, ...]
+    prior: Graph
+    variances: tuple[int, ...]
+    level: tuple[float, ...]
+    roots: Float[Tensor, "G N R"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        latents: tuple[int, ...],
+        centers: Float[Tensor, "N d"],
+        weights: Float[Tensor, "G N"],
+        function: PairFunction,
+        diagonal: Callable[[Tensor], Tensor],
+        level: tuple[float, ...],
+    ) -> "KernelSum":
+        """Traced from kernels less a constant `level` each. Raises InvalidInput, naming what no graph holds."""
+        example = centers[:1]
+        pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
+        prior, (variances,) = trace(lambda z: [diagonal(z)], [example])
+        nodes = (tuple(found.flatten().tolist()) for found in (kernels, variances))
+        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes), level)
+
+    def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
+        """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
+        operands = self.given(graph, z)
+        name = self.name + ("_slopes" if slopes else "")
+        called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        constants = map(graph.constant, self.constants)
+        return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
+
+    @property
+    def constants(self) -> list[float]:
+        """What the sums of `pair` lack."""
+        totals = (math.fsum(weights.tolist()) for weights in self.weights)
+        return [level * total for level, total in zip(self.level, totals, strict=True)]
+
+    def _dependence(self) -> list[int]:
+        """Of every node of the pair: 1 if it depends on z, 2 on the centre, 3 on both, 0 on none."""
+        found: list[int] = []
+        for node, (operation, *rest) in enumerate(self.pair.nodes):
+            if operation == "input":
+                found.append(1 if rest[0] < self.features else 2)
+            else:
+                found.append(0)
+                for operand in self.pair.operands(node):
+                    found[node] |= found[operand]
+        return found
+
+    def _frontier(self, kind: int) -> list[int]:
+        """Nodes of one kind that those which depend on both, or the kernels themselves, are computed from."""
+        needed, dependence = self.pair.needed(self.kernels), self._dependence()
+        used = {x for node in needed if dependence[node] == 3 for x in self.pair.operands(node)}
+        return [node for node in needed if dependence[node] == kind and (node in used or node in self.kernels)]
+
+    @cached_property
+    def operands(self) -> list[int]:
+        """What a state gives: nodes of the pair."""
+        return self._frontier(1)
+
+    def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
+        """The operands at features z."""
+        return Copier(graph, self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)
+
+    def variance(self, graph: Graph, z: Sequence[int]) -> list[int]:
+        """Prior variances at features z."""
+        return Copier(graph, self.prior, dict(zip(self.prior.inputs, z, strict=True)))(self.variances)
+
+    @cached_property
+    def rows(self) -> list[int]:
+        """What a centre gives: nodes of the pair."""
+        return self._frontier(2)
+
+    @cached_property
+    def _partials(self) -> dict[tuple[int, int], int]:
+        """(latent, operand) -> the node of d k / d operand."""
+        found = {}
+        for g, kernel in enumerate(self.kernels):
+            for k, node in enumerate(gradients(self.pair, [kernel], [ONE], self.operands)):
+                if self.pair.value(node) != 0.0:
+                    found[g, k] = node
+        return found
+
+    @cached_property
+    def _slopes(self) -> Slopes:
+        return {pair: len(self.latents) + k for k, pair in enumerate(self._partials)}
+
+    def table(self) -> np.ndarray:
+        """[number of centres filled up, true number, 0 ...], a row per quantity of the centres, a row of weights each.
+
+        Eight numbers stand before the rows, so that these are aligned as the table is.
+        """
+        valid = len(self.centers)
+        filled = -valid % PADDING
+        rows = [np.pad(row, (0, filled), "edge") for row in self.row_values()]
+        weights = np.pad(self.weights.numpy(), ((0, 0), (0, filled)))
+        return np.concatenate([[valid + filled, valid, *[0.0] * 6], *rows, *weights])
+
+    def row_values(self) -> list[np.ndarray]:
+        """The numbers of every row, one per centre."""
+        inputs = [*np.zeros((self.features, 1)), *self.centers.numpy().T]
+        return [np.broadcast_to(x, len(self.centers)) for x in evaluated(self.pair, self.rows, inputs)]
+
+    def root_table(self) -> np.ndarray:
+        """The roots of the compressed covariance, of as many centres as there are in the table."""
+        assert self.roots is not None, "asked for with a compressed covariance only"
+        filled = -len(self.centers) % PADDING
+        return torch.nn.functional.pad(self.roots, (0, 0, 0, filled)).numpy().ravel()
+
+    def c_source(self, lanes: int, slopes: bool) -> str:
+        """The C function `NAME(table, live, z, f)`, or NAME_slopes, whose derivatives follow the values."""
+        name = self.name + ("_slopes" if slopes else "")
+        made = list(self.kernels) + (list(self._partials.values()) if slopes else [])
+        owner = list(range(len(self.latents))) + ([g for g, _ in self._partials] if slopes else [])
+        if lanes == 1:
+            return self._loop(name, made, owner, lanes, False)
+        both = [self._loop(f"{name}_{'one' if one else 'many'}", made, owner, lanes, one) for one in (True, False)]
+        choice = f"if (live == 1) {name}_one(t, live, z, f); else {name}_many(t, live, z, f);"
+        return "\n".join(
+            [*both, f"static void {name}(const double *t, long live, const real *z, real *f) {{ {choice} }}"]
+        )
+
+    def roots_source(self, lanes: int, rank: int) -> str:
+        """`NAME_roots(t, F, z, P)`: P (G, rank) += k(z, Z) F for one state, F (G, N filled up, rank)."""
+        kernels = self._loop(f"{self.name}_kernels", list(self.kernels), [], lanes, True)
+        return kernels + filled(
+            c_text(__name__, "kernel_roots.c"),
+            {"NAME": self.name, "RANK": rank, "LATENTS": len(self.latents), "BLOCK": BLOCK},
+        )
+
+    def _loop(self, name: str, made: list[int], owner: list[int], lanes: int, one: bool) -> str:
+        """One state and several centres at a time with `one`, else several states."""
+        graph, dependence, keep = self.pair, self._dependence(), not owner
+        state, centre, step = ("double", "real", "LANES") if one else ("real", "double", "1")
+        G = len(self.latents)
+        operands = {node: k for k, node in enumerate(self.operands)}
+        rows = {node: k for k, node in enumerate(self.rows)}
+
+        def operand(node: int) -> str:
+            operation, *rest = graph.nodes[node]
+            if operation == "constant":
+                return f"({float(rest[0]).hex()})"
+            return f"z{operands[node]}" if node in operands else f"c{rows[node]}" if node in rows else f"x{node}"
+
+        def as_real(node: int) -> str:
+            """Constants, and what is a double here, as the type of what depends on both."""
+            narrow = dependence[node] == 0 or dependence[node] == (1 if one else 2)
+            return f"R({operand(node)})" if narrow else operand(node)
+
+        made_of_both = [node for node in graph.needed(made) if dependence[node] == 3]
+        pick = "AT(z[{0}], 0)" if one and not keep else "z[{0}]"
+        load = "LOAD(rows + {0} * n + j)" if one else "rows[{0} * n + j]"
+        total = "R(TOTAL(s{0}))" if one else "s{0}"
+        words: dict[str, object] = {"NAME": name, "STEP": step}
+        words["OPERANDS"] = [f"const {state} z{k} = {pick.format(k)};" for k in range(len(operands))]
+        words["ROWS"] = [f"const {centre} c{k} = {load.format(k)};" for k in range(len(rows))]
+        words["NODES"] = [f"const real x{n} = {c_value(graph, n, operand, as_real, lanes)};" for n in made_of_both]
+        words["STARTS"] = [f"real s{k} = R(0.0);" for k in range(len(made))]
+        words["WEIGHTS"] = [f"const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
+        words["SUMS"] = [f"s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made) if owner]
+        words["ENDS"] = [f"f[{k}] = {total.format(k)};" for k in range(len(made))]
+        stored = enumerate(zip(made, self.level, strict=False))
+        words["KEPT"] = [
+            f"STORE(k + {g * BLOCK} + j - first, {as_real(x)} + {level.hex()});" for g, (x, level) in stored
+        ]
+        words |= {word: "\n".join(lines) for word, lines in words.items() if isinstance(lines, list)}
+        return filled(sections(__name__, "kernel_loop.c")["kept" if keep else "summed"], words)
+
 
 ROUNDING = 1e-7
 """Standard deviations below this fraction of the prior's are rounding: nothing there can be uncertain."""

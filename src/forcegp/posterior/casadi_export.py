@@ -20,8 +20,8 @@ from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.codegen.tracing import trace
 from forcegp.errors import NumericalError, require_type, required_extra
-from forcegp.inference.kernel_sums import KernelSum
 from forcegp.inference.one_input_calls import OneInputCall
+from forcegp.inference.prepared_kernels import KernelSum
 from forcegp.integration import integrator_named
 from forcegp.posterior.c_export import identifier, rounding
 from forcegp.posterior.posterior import Posterior

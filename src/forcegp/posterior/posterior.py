@@ -368,11 +368,7 @@ class Posterior(Fitted):
         """
         model = self.trained.to(device)
         at: torch.device = model.robot.device
-        result = replace(
-            self.result,
-            parameters=_all_on(self.result.parameters, at),
-            iterates=tuple(_all_on(point, at) for point in self.result.iterates),
-        )
+        result = replace(self.result, parameters=_all_on(self.result.parameters, at))
         there = Posterior.conditioned(
             model,
             self.training.to(at),

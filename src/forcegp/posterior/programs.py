@@ -44,10 +44,9 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import CompilerError, ForceGPError, InvalidInput
 from forcegp.evidence.training_data import Standardization
 from forcegp.forces import Actuation, RigidBodies, UnknownForces, force_to_dict
-from forcegp.inference.kernel_sums import PADDING
 from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls, refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance
+from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance
 from forcegp.integration.integrators import check_time_step, integrator_named
 from forcegp.integration.trajectory import SPEED_LIMIT
 from forcegp.mechanics import ConstrainedDynamics

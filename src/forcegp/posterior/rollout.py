@@ -11,8 +11,8 @@ from torch import Tensor
 
 from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
+from forcegp.inference.memory import blas_threads
 from forcegp.inference.pathwise import draw_functions, mean_function
-from forcegp.inference.threads import blas_threads
 from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
 from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
 from forcegp.integration.trajectory import Trajectory, check_start, warn_of_divergence

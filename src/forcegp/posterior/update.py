@@ -12,15 +12,13 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, InvalidInput, require_known
-from forcegp.evidence.contacts import check_distance
 from forcegp.evidence.likelihood import MarginalLikelihood
-from forcegp.evidence.training_data import TrainingData
+from forcegp.evidence.training_data import TrainingData, check_distance
 from forcegp.forces import UnknownForces
 from forcegp.inference import ExactPosterior, InducingPosterior, Terms, exact
 from forcegp.inference.cholesky_update import rows_to_keep, with_only, with_rows
 from forcegp.inference.engines import ENOUGH, InducingWeights
-from forcegp.inference.memory import require_memory
-from forcegp.inference.threads import blas_threads
+from forcegp.inference.memory import blas_threads, require_memory
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 

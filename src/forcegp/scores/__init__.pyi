@@ -5,7 +5,7 @@ from .candidates import Candidate as Candidate, Training as Training
 from .doubts import (
     normal_force_rests_on_prior as normal_force_rests_on_prior, unfinished_search as unfinished_search,
 )
-from .figures.contacts import contacts_figure as contacts_figure
+from .figures.log import contacts_figure as contacts_figure
 from .figures.friction_curves import curve_panels as curve_panels, friction_curves_figure as friction_curves_figure
 from .figures.log import check_figure as check_figure
 from .figures.model import (

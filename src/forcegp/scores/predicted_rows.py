@@ -13,7 +13,7 @@ from torch.distributions import MultivariateNormal
 
 from forcegp.data import Dataset
 from forcegp.errors import NumericalError
-from forcegp.inference.threads import blas_threads
+from forcegp.inference.memory import blas_threads
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.prediction import Prediction
 

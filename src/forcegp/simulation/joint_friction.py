@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from forcegp.forces.columns import LazyState
 from forcegp.forces.force import JointLaw, Law
+from forcegp.forces.friction import Viscous
 from forcegp.forces.registry import parse_forces
-from forcegp.forces.viscous import Viscous
 from forcegp.robots import Robot
 
 Numbers = Mapping[str, Any]

@@ -28,9 +28,8 @@ from forcegp.simulation.contact_forces import (
     ViscousFriction,
     with_tool_sphere,
 )
-from forcegp.simulation.recording import recorded
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, table_of
+from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, recorded, table_of
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"

@@ -18,8 +18,8 @@ from forcegp.data import Dataset
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.simulation.recording import RATE, recorded
 from forcegp.simulation.scenarios import QuadrotorConfig
+from forcegp.simulation.trajectory import RATE, recorded
 
 FINE = 2  # steps between two rows
 PLACES = np.array([(0.13, -0.13, 0.02), (-0.13, 0.13, 0.02), (0.13, 0.13, 0.02), (-0.13, -0.13, 0.02)])  # m

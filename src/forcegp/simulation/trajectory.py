@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 import forcegp.mechanics
+from forcegp import __version__
+from forcegp.data import Dataset, units_for
+from forcegp.model import Model
 from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 
@@ -243,3 +249,41 @@ def rotation_vector(aim: Float[np.ndarray, "4"], present: Float[np.ndarray, "4"]
     `q` and `-q` are the same orientation; without choosing the sign the tool would turn the long way round.
     """
     return (Rotation.from_quat(aim) * Rotation.from_quat(present).inv()).as_rotvec()
+
+
+RATE = 240
+"""Rows per second."""
+
+
+def recorded(
+    scenario: str,
+    config: Any,
+    model: Model,
+    motion: Mapping[str, np.ndarray],
+    truth: Mapping[str, np.ndarray],
+    metadata: Mapping[str, Any] | None = None,
+) -> Dataset:
+    """Rows of `config.episodes` episodes of equal length: q, v, u and the true a of `motion`, which gets its noise.
+
+    The noise has a stream of its own for each episode, so that it leaves the motion of a seed as it is. Rows are
+    1 / RATE apart, unless `motion` has their time.
+    """
+    nv, steps = model.robot.nv, len(motion["a"]) // config.episodes
+    streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
+    noise = np.concatenate([stream.standard_normal((steps, nv)) for stream in streams])
+    return Dataset(
+        **{
+            "time": np.tile(np.arange(steps) / RATE, config.episodes),
+            **motion,
+            "a": motion["a"] + config.noise * noise,
+        },
+        episode=np.repeat(np.arange(config.episodes), steps),
+        units=units_for(model.robot),
+        model=model,
+        noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
+        truth={"a": motion["a"], **truth},
+        metadata={
+            **{"scenario": scenario, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}},
+            **(metadata or {}),
+        },
+    )
