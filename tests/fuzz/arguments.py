@@ -285,7 +285,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
             "dataset": INPUTS.data,
             "evidence": None,
             **FIT,
-            "hyperprior": True,
             "start": None,
             "engine": "exact",
             "learning_points": None,

@@ -182,7 +182,7 @@ WRONG = {
     "fit ": {"start": 1},
     "fit  ": {"start": ["a"]},
     "fit   ": {"learning_points": "10"},
-    "fit    ": {"hyperprior": torch.ones(3)},
+    "fit    ": {"restarts": torch.ones(3)},
     "fit     ": {"engine": np.zeros(3, [("a", "f8")])},
     "Noise": {"learn": torch.ones(3)},
     "Noise ": {"acceleration": torch.ones(3, device="meta")},

@@ -76,7 +76,6 @@ def fit(
     restarts: int | None = None,
     seed: int = 0,
     jobs: int | Executor = 1,
-    hyperprior: bool = True,
     options: OptimizerOptions | None = None,
     start: Mapping[str, Tensor] | Posterior | None = None,
     engine: Engine | str = "auto",
@@ -86,9 +85,9 @@ def fit(
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
     Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
-    kernels and noise by marginal likelihood; where both are open, each kernel at its best numbers. Then functions are
-    conditioned on the rows. The result is a `Posterior`: `posterior.parameters["viscous.joint_1"]`,
-    `posterior.predict(q, v, u)`.
+    kernels and noise by marginal likelihood times the priors that they carry, which keeps few points calibrated; where
+    both are open, each kernel at its best numbers. Then functions are conditioned on the rows. The result is a
+    `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
 
     Parameters
     ----------
@@ -109,8 +108,6 @@ def fit(
     seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
     jobs: restarts at once, in as many processes of this machine, or an executor in which they run, such as Dask's
         `client.get_executor()`. Results do not depend on it.
-    hyperprior: maximise the marginal likelihood times the priors that kernels and learned noise carry (type-II
-        maximum a posteriori), which keeps few points calibrated; False is plain type-II maximum likelihood.
     options: the search itself; None is `fit.search.default_options`, which is content sooner beyond 400 points.
     start: hyper-parameters at which the first search begins instead of moments, for example
         `posterior.hyperparameters` of a fit to fewer points; those that are missing start from moments. With
@@ -153,7 +150,7 @@ def fit(
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
-        search = Search(checked_jobs(jobs), restarts, seed, hyperprior, options, start, progress)
+        search = Search(checked_jobs(jobs), restarts, seed, options, start, progress)
         posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points, rest)
     if refinement is None:
         return posterior
@@ -272,12 +269,12 @@ class _Functions:
             all_rows = rows
         rows = learning_rows(rows, self.learning_points, ordered=ordered)
         described = described_rows(all_rows, dataset)
-        hyperprior, progress = self.search.hyperprior, self.search.progress
+        progress = self.search.progress
         own = replace(self, search=replace(self.search, start=self._continuation(rows, dataset)))
-        fitted = widened(own._with_numbers(rows, dataset), hyperprior)
+        fitted = widened(own._with_numbers(rows, dataset))
         warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
         report = None if progress is None else partial(progress, ALL_ROWS)
-        return on_all_rows(fitted, all_rows, chosen, described, hyperprior, report)
+        return on_all_rows(fitted, all_rows, chosen, described, report)
 
     def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> Posterior:
         """From windows: hyper-parameters and the posterior from all of them."""
@@ -291,9 +288,7 @@ class _Functions:
         fitted = own._with_numbers(windows, dataset)
         reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
         described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
-        return widened(fitted, self.search.hyperprior).with_settings(
-            **described, engine=Exact().to_dict(), engine_reason=reason
-        )
+        return widened(fitted).with_settings(**described, engine=Exact().to_dict(), engine_reason=reason)
 
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
@@ -379,10 +374,10 @@ class _Functions:
         described["forces"] = [described_force(force) for force in model.forces]
         learned_noise, fixed = likelihood.split_noise
         kernels = likelihood.kernels
-        if beside is not None and self.search.hyperprior:
+        if beside is not None:
             kernels, described["log_variance_spread"] = with_variance_priors(kernels), LOG_VARIANCE_SPREAD
         searched = likelihood if beside is None else beside(likelihood)
-        objective = FitObjective(searched, kernels, noise, fixed, self.search.hyperprior)
+        objective = FitObjective(searched, kernels, noise, fixed)
         starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
         result, of_search = self.search.best(objective, starts)
         found = result.parameters | fixed, result, {**described, **of_search}

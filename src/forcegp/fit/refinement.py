@@ -111,7 +111,6 @@ def on_all_rows(
     rows: Dataset,
     engine: Engine | None,
     described: Mapping[str, Any],
-    hyperprior: bool,
     report: Iteration | None = None,
 ) -> Posterior:
     """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
@@ -143,14 +142,14 @@ def on_all_rows(
         settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
-        return refined(posterior, hyperprior, report)
+        return refined(posterior, report)
 
 
 TOLERANCE = 1e-6
 """Fraction of the bound by which an iteration must lower it for the search to go on."""
 
 
-def refined(posterior: Posterior, hyperprior: bool, report: Callable[[int, float], None] | None = None) -> Posterior:
+def refined(posterior: Posterior, report: Callable[[int, float], None] | None = None) -> Posterior:
     """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
 
     Where physical parameters were learned they and all others stay, for their standard errors belong together. Warns
@@ -165,7 +164,7 @@ def refined(posterior: Posterior, hyperprior: bool, report: Callable[[int, float
         noise, (_, fixed) = posterior.likelihood.noise, posterior.likelihood.split_noise
         held = {name: posterior.hyperparameters[name] for name in fixed}
         start = {name: value for name, value in posterior.hyperparameters.items() if name not in held}
-        objective = FitObjective(likelihood, kernels, noise, held, hyperprior, points=latent.features)
+        objective = FitObjective(likelihood, kernels, noise, held, points=latent.features)
         options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
         result = minimize_objective(objective, start, options, report)
         parameters = {**posterior.hyperparameters, **result.parameters}

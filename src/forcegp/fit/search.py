@@ -212,7 +212,7 @@ Starts = Callable[[int], Mapping[str, Tensor]]
 class FitObjective:
     """The objective as a function of the free hyper-parameters alone; a class so that processes can receive it.
 
-    With `hyperprior` kernels (see also `with_variance_priors`) and learned noise have their priors. With inducing
+    Kernels (see also `with_variance_priors`) and learned noise have their priors. With inducing
     `points` the bound through them stands for the likelihood.
     """
 
@@ -220,7 +220,6 @@ class FitObjective:
     kernels: LatentKernels
     noise: Noise
     fixed: Mapping[str, Tensor]
-    hyperprior: bool
     points: Sequence[Tensor] | None = None
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
@@ -233,9 +232,7 @@ class FitObjective:
         return value - self.log_prior(parameters)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
-        """Log density of the hyper-parameters' priors; 0 without `hyperprior`."""
-        if not self.hyperprior:
-            return torch.zeros((), dtype=torch.float64)
+        """Log density of the hyper-parameters' priors."""
         return self.kernels.log_prior(parameters) + self.noise.log_prior(parameters)
 
 
@@ -264,7 +261,6 @@ class Search:
     jobs: Jobs
     restarts: int | None
     seed: int
-    hyperprior: bool
     options: OptimizerOptions | None
     start: Mapping[str, Tensor] | None
     progress: FitProgress | None
@@ -272,7 +268,6 @@ class Search:
     @usable_arguments("fit")
     def __post_init__(self) -> None:
         check_search_numbers(1 if self.restarts is None else self.restarts, self.seed)
-        require_type("hyperprior", self.hyperprior, bool)
         if self.options is not None:
             require_type("options", self.options, OptimizerOptions)
 
@@ -310,7 +305,6 @@ class Search:
             "warm_start": self.start is not None,
             "seed": self.seed,
             "optimizer": asdict(options),
-            "hyperprior": self.hyperprior,
             "restart_objective": [each.value if isinstance(each, OptimizationResult) else None for each in results],
             "restart_status": [each.status if isinstance(each, OptimizationResult) else str(each) for each in results],
         }

@@ -44,7 +44,7 @@ NEGLIGIBLE = 1e-6
 """Standard deviation, as a fraction of the largest, below which a constraint leaves nothing open."""
 
 
-def widened(posterior: Posterior, hyperprior: bool) -> Posterior:
+def widened(posterior: Posterior) -> Posterior:
     """The posterior with its `widening`, at least 1; without latents, itself."""
     if not len(posterior.kernels.kernels):
         return posterior
@@ -53,7 +53,7 @@ def widened(posterior: Posterior, hyperprior: bool) -> Posterior:
         assert isinstance(posterior.latent, FactorizedPosterior), "fits are exact"
         factor = states.content_factor(posterior.latent)
         if len(posterior.training) <= MOST_POINTS_FOR_RESTARTS:  # beyond, parameters are known well, and searches long
-            factor *= states.mixture_factor(posterior, hyperprior)
+            factor *= states.mixture_factor(posterior)
     return posterior.with_settings(widening=factor)
 
 
@@ -86,12 +86,12 @@ class _States:
         inside = torch.quantile((drawn[open_ones] / std[open_ones, None]).abs(), CONTENT, dim=0)
         return max(1.0, float(torch.quantile(inside, CONFIDENCE)) / DEVIATIONS)
 
-    def mixture_factor(self, posterior: Posterior, hyperprior: bool) -> float:
+    def mixture_factor(self, posterior: Posterior) -> float:
         """Standard deviations with the hyper-parameters unknown, over those with them known; at least 1."""
         likelihood, kernels = posterior.likelihood, posterior.kernels
         _, fixed = likelihood.split_noise
         free = {name: value for name, value in posterior.hyperparameters.items() if name not in fixed}
-        objective = FitObjective(likelihood, kernels, likelihood.noise, fixed, hyperprior)
+        objective = FitObjective(likelihood, kernels, likelihood.noise, fixed)
 
         here = float(objective(free))
         mean, variance = self._moments(posterior.latent)

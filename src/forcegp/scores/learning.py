@@ -94,7 +94,6 @@ def learn(
     engine: Any = "auto",
     learning_points: int | None = None,
     iterations: int | None = None,
-    hyperprior: bool = True,
     report: Report | None = None,
     **search: Any,
 ) -> tuple[Posterior, list[str]]:
@@ -127,11 +126,11 @@ def learn(
         if not model.unknown_forces:
             search = {**search, "restarts": 1}  # its starts are all the same
         restarts = search.get("restarts") or default_restarts(points)
-        how |= {"hyperprior": hyperprior, "options": options, **search}
+        how |= {"options": options, **search}
         progress = _progress(report, restarts, options.iterations)
         posterior = fit(model, dataset, others, baseline=baseline, points=points, progress=progress, **how)
         if everything:
-            posterior, note = allowing_for_correlation(posterior, dataset, hyperprior)
+            posterior, note = allowing_for_correlation(posterior, dataset)
             notes += [] if note is None else [note]
     if motions:
         recording = dataset if recording is None else recording
@@ -203,9 +202,7 @@ def with_force_noise(model: Model, dataset: Dataset) -> Model:
     return replace(model, noise=replace(noise, force=tuple(forces.tolist())))
 
 
-def allowing_for_correlation(
-    posterior: Posterior, dataset: Dataset, hyperprior: bool = True
-) -> tuple[Posterior, str | None]:
+def allowing_for_correlation(posterior: Posterior, dataset: Dataset) -> tuple[Posterior, str | None]:
     """The posterior from all rows of a log, learned from them as the independent rows that they are worth; and a note.
 
     Errors of filtered and resampled logs resemble each other from row to row; taken for independent, 20,000 rows would
@@ -225,5 +222,5 @@ def allowing_for_correlation(
         given = posterior.training, posterior.hyperparameters, posterior.result, settings, posterior.engine
         posterior = posterior.conditioned(posterior.trained, *given, estimates=posterior.estimates)
     if isinstance(posterior.engine, Inducing):
-        posterior = refined(replace(posterior, engine=replace(posterior.engine, refine=Inducing.refine)), hyperprior)
+        posterior = refined(replace(posterior, engine=replace(posterior.engine, refine=Inducing.refine)))
     return posterior, f"errors resemble each other over {k:.0f} rows, which count as one" if k > 1.0 else None
