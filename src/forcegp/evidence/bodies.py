@@ -49,7 +49,6 @@ _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 # which of alpha, d1-3, s12, s23, s13, t1-3 each part of a body moves: a mass keeps the inertia about its centre
 PARTS = {"mass": np.zeros((1, 10)), "center_of_mass": np.eye(10)[7:], "inertia": np.eye(10)[1:7]}
 PARTS["mass"][0, :4] = 1.0, -1.0, -1.0, -1.0
-REPORTED = {"mass": slice(0, 1), "center_of_mass": slice(1, 4), "inertia": slice(4, 10)}
 
 
 class Bodies:

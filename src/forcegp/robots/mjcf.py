@@ -6,23 +6,31 @@ Several joints of one body are a chain of links without mass. Positions q are Mu
 `ref`; but quaternions are x, y, z, w here and w, x, y, z there, and the linear velocity of a free body has the axes of
 the body here and of the world there.
 
-What changes accelerations and has no place in a robot (springs, tendons, gains of actuators ...) is noted by name.
+What changes accelerations and has no place in a robot (tendons, gains of actuators ...) is noted by name.
+
+A robot is written with bodies of the names of its links, also of those without mass, so that every frame keeps its
+name. MuJoCo moves no body without mass: of a chain of joints between such links, all go to the link at its end.
 """
 
+import math
 import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.errors import MalformedMjcf, NonPhysicalInertia, UnreadableRobotFile, required_extra
-from forcegp.robots.inertia import physical_objection
-from forcegp.robots.mjcf_model import WORLD, CompiledModel, Translation
+from forcegp.errors import MalformedMjcf, NonPhysicalInertia, RobotModelError, UnreadableRobotFile, required_extra
+from forcegp.robots.inertia import inverse, physical_objection, rotation_of_z_onto, transform
+from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
+from forcegp.robots.manifold import MOTIONS
+from forcegp.robots.mjcf_model import WORLD, CompiledModel, LoopDescription, Translation
 from forcegp.robots.problems import Problems
-from forcegp.robots.urdf import MOST_TAGS, parse_xml, well_formed
+from forcegp.robots.structure import RobotStructure
+from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml, well_formed
 from forcegp.robots.urdf_file import IN_THE_FILE, nearest_inertia, read_text
 
 DEEPEST = 300
@@ -173,3 +181,194 @@ def _repair(spec: Any, nearest: bool, problems: Problems) -> None:
         else:
             advice = f"{IN_THE_FILE}, or take the nearest inertia that a body has."
             problems.errors.append(NonPhysicalInertia(seen, advice, {"inertias": "nearest"}))
+
+
+SMALLEST = 2e-15
+"""kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
+KINDS = {"floating": "free", "spherical": "ball", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
+
+
+class _Axis(NamedTuple):
+    """One <joint> of a body: where it is in the frame of the body."""
+
+    attributes: str
+    pose: np.ndarray
+    axis: tuple[float, float, float] | None  # none: it may turn about every one
+
+
+class MjcfWriter:
+    """The text of one robot; `left_out` are frames that it lacks."""
+
+    def __init__(self, robot: RobotStructure, loops: Sequence[LoopDescription] = ()) -> None:
+        self.robot, description = robot, robot.description
+        self.held, _ = followed(description, robot.locked, Problems(robot.source))
+        self.groups = {group.name: group for group in robot.layout.groups}
+        self.moving = {joint.name for joint in robot.layout.bodies} | set(self.groups)
+        self.children: dict[str, list[Joint]] = {link: [] for link in description.links}
+        for joint in description.joints:
+            self.children[joint.parent].append(joint)
+        self.rotors = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
+        self.lines: list[str] = []
+        self.left_out: list[str] = []
+        self.sites: dict[str, list[str]] = {}
+        self.equalities = self._couplings()
+        for loop in loops:  # sites: the anchors of bodies would be taken from the posture at q = 0
+            for end, link, point in zip("12", loop.frames, loop.points, strict=True):
+                name = quoteattr(f"{loop.name}_{end}")
+                self.sites.setdefault(link, []).append(f'<site name={name} pos="{numbers(point)}"/>')
+            ends = " ".join(f"site{end}={quoteattr(f'{loop.name}_{end}')}" for end in "12")
+            tag = "weld" if loop.turning else "connect"
+            self.equalities.append(f"    <{tag} name={quoteattr(loop.name)} {ends}/>")
+
+    def text(self) -> str:
+        """The whole file."""
+        robot, root = self.robot, next(iter(self.robot.layout.links))
+        named = {joint.name for joint in robot.description.joints}
+        if BASE in self.groups and self.groups[BASE].kind == robot.base and BASE not in named:
+            self._chain(free_joint(BASE, robot.base, OUTSIDE, root), np.eye(4), 2)
+        elif root == "world" and not self._mass(root):
+            self.lines += [f"    {site}" for site in self.sites.get(root, ())]
+            self._below(root, 2)
+        else:
+            self._body(root, np.eye(4), [], 2)
+        motors = [f"    <motor name={quoteattr(name)} joint={quoteattr(name)}/>" for name in robot.single_joint_names]
+        return "\n".join(
+            [
+                f"<mujoco model={quoteattr(robot.name)}>",
+                '  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>',
+                f'  <option gravity="{numbers(robot.gravity.tolist())}"/>',
+                "  <worldbody>",
+                *self.lines,
+                "  </worldbody>",
+                *_block("equality", self.equalities),
+                *_block("actuator", motors),
+                "</mujoco>\n",
+            ]
+        )
+
+    def _mass(self, link: str) -> float:
+        inertial = self.robot.description.links[link]
+        return inertial.mass if inertial else 0.0
+
+    def _body(self, link: str, pose: np.ndarray, joints: Sequence[_Axis], depth: int) -> None:
+        """One body, and what hangs on it."""
+        space = "  " * depth
+        self.lines.append(f"{space}<body name={quoteattr(link)}{_placed(pose)}>")
+        for joint in joints:
+            place = "" if joint.axis is None else _axis(joint)
+            self.lines.append(f"{space}  <joint {joint.attributes}{place}/>")
+        inertial = self.robot.description.links[link]
+        if inertial is not None and inertial.mass > 0.0:
+            self.lines.append(f"{space}  {_inertial(inertial.mass, inertial.center_of_mass, inertial.inertia)}")
+        self.lines += [f"{space}  {site}" for site in self.sites.get(link, ())]
+        self._below(link, depth + 1)
+        self.lines.append(f"{space}</body>")
+
+    def _below(self, link: str, depth: int) -> None:
+        for joint in self.children[link]:
+            self._chain(joint, joint.origin, depth)
+
+    def _chain(self, joint: Joint, pose: np.ndarray, depth: int) -> None:
+        """The body that a joint moves, with the joints above it that move no mass."""
+        if joint.name not in self.moving:
+            self._body(joint.child, pose @ joint_motion(joint, self.held.get(joint.name, 0.0)), [], depth)
+            return
+        joints = self._axes(joint)
+        while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
+            below = self._next(joint.child)
+            if len(below) != 1 or joint.type in ("floating", "spherical"):
+                raise RobotModelError(
+                    f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
+                    "two joints of one degree of freedom; give it a mass."
+                )
+            self.left_out += self._rigid(joint.child)
+            step, joint = below[0]
+            joints = [each._replace(pose=inverse(step) @ each.pose) for each in joints] + self._axes(joint)
+            pose = pose @ step
+        free = joint.type == "floating"
+        if free and (depth != 2 or not np.array_equal(pose, np.eye(4))):
+            raise RobotModelError(
+                f"{self.robot.source}: joint {joint.name!r} floats beside the origin of the world, which MuJoCo does "
+                "not take; move its origin there."
+            )
+        self._body(joint.child, pose, joints, depth)
+
+    def _rigid(self, link: str) -> dict[str, np.ndarray]:
+        """The links that move together, with their poses in the first one."""
+        found = {link: np.eye(4)}
+        for name in (names := [link]):
+            for joint in self.children[name]:
+                if joint.name not in self.moving:
+                    still = joint.origin @ joint_motion(joint, self.held.get(joint.name, 0.0))
+                    found[joint.child] = found[name] @ still
+                    names.append(joint.child)
+        return found
+
+    def _next(self, link: str) -> list[tuple[np.ndarray, Joint]]:
+        """The joints that move against these links, and the frames of their children."""
+        return [
+            (pose @ joint.origin, joint)
+            for name, pose in self._rigid(link).items()
+            for joint in self.children[name]
+            if joint.name in self.moving
+        ]
+
+    def _axes(self, joint: Joint) -> list[_Axis]:
+        """A joint as MuJoCo's; a planar one is two slides and a hinge."""
+        if joint.type == "planar":
+            parts = (("x", "slide", (1.0, 0.0, 0.0)), ("y", "slide", (0.0, 1.0, 0.0)), ("rz", "hinge", (0.0, 0.0, 1.0)))
+            pose = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
+            return [_Axis(self._attributes(joint, f"{joint.name}.{x}", kind), pose, axis) for x, kind, axis in parts]
+        kind = KINDS[joint.type]
+        name = joint.name
+        first = f"{name}.{MOTIONS[joint.type].velocities[-1]}" if joint.type in MOTIONS else name
+        axis = None if joint.type in MOTIONS else joint.axis
+        return [_Axis(self._attributes(joint, name, kind, first), np.eye(4), axis)]
+
+    def _attributes(self, joint: Joint, name: str, kind: str, rotor: str | None = None) -> str:
+        given = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}
+        given["frictionloss"] = joint.friction
+        parts = [f'{key}="{value!r}"' for key, value in given.items() if value]
+        if joint.lower < joint.upper and not math.isinf(joint.upper - joint.lower):
+            parts.append(f'range="{joint.lower!r} {joint.upper!r}"')
+        if 0.0 < joint.effort_limit < math.inf and kind in ("hinge", "slide"):
+            parts.append(f'actuatorfrcrange="{-joint.effort_limit!r} {joint.effort_limit!r}"')
+        return " ".join([f'name={quoteattr(name)} type="{kind}"', *parts])
+
+    def _couplings(self) -> list[str]:
+        return [
+            f"    <joint joint1={quoteattr(joint.name)} joint2={quoteattr(joint.mimics.joint)} "
+            f'polycoef="{numbers((joint.mimics.offset, joint.mimics.multiplier, 0.0, 0.0, 0.0))}"/>'
+            for joint in self.robot.description.joints
+            if joint.mimics is not None and joint.name in self.moving
+        ]
+
+
+def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:
+    """With principal moments, which MuJoCo keeps to the last digit."""
+    moments, axes = np.linalg.eigh(inertia)
+    axes = axes * np.sign(np.linalg.det(axes))
+    moments = np.maximum(moments, SMALLEST)
+    moments[2] = min(moments[2], (moments[0] + moments[1]) * (1.0 - 1e-15))
+    pose = _placed(transform(axes, center))
+    pose = pose if "pos" in pose else f' pos="0 0 0"{pose}'
+    return f'<inertial{pose} mass="{mass!r}" diaginertia="{numbers(moments)}"/>'
+
+
+def _axis(joint: _Axis) -> str:
+    position = joint.pose[:3, 3]
+    place = f' pos="{numbers(position)}"' if position.any() else ""
+    return f'{place} axis="{numbers(joint.pose[:3, :3] @ np.array(joint.axis))}"'
+
+
+def _placed(pose: np.ndarray) -> str:
+    """Attributes pos and quat, where they are not the default."""
+    from scipy.spatial.transform import Rotation
+
+    quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
+    position = f' pos="{numbers(pose[:3, 3])}"' if pose[:3, 3].any() else ""
+    return position + ("" if np.array_equal(pose[:3, :3], np.eye(3)) else f' quat="{numbers(quaternion)}"')
+
+
+def _block(tag: str, lines: Sequence[str]) -> list[str]:
+    return [f"  <{tag}>", *lines, f"  </{tag}>"] if lines else []

@@ -28,9 +28,8 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import BaseChoice, check_base, check_choice, lay_out
-from forcegp.robots.mjcf import is_mjcf, translate
+from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
-from forcegp.robots.mjcf_writer import MjcfWriter
 from forcegp.robots.problems import Problems
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure
 from forcegp.robots.tree import bodies_without_inertia, compile_tree
