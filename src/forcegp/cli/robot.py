@@ -80,6 +80,8 @@ class Robot(Command):
 def _content(robot: forcegp.Robot) -> dict[str, Any]:
     links = [robot.link(name) for name in robot.link_names]
     joints = [asdict(joint) | {"armature": x} for joint, x in zip(robot.joints, robot.armature.tolist(), strict=True)]
+    for joint in joints:  # places are those of the file; what mimics stands below
+        del joint["origin"], joint["mimics"]
     mimics = {
         body.name: {**drive._asdict(), "joint": robot.joint_names[drive.joint]}
         for body, drive in zip(robot.layout.bodies, robot.layout.drives, strict=True)

@@ -156,7 +156,7 @@ class Rollout:
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
         """Lower and upper ends (..., T+1, nv) of the 95 % interval.
 
-        Of a model with calibrated intervals (`Posterior.calibrated_on_motions`) those, centred on the mean; else the
+        Of a model with calibrated intervals (`forcegp.fit.calibrated`) those, centred on the mean; else the
         quantiles of the samples. Where a base moves, ends of q are steps from q: another motion lies within where
         `low <= robot.difference(rollout.q, other) <= high`. Raises InvalidInput where there is neither.
         """
