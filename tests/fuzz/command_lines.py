@@ -171,5 +171,5 @@ def check(case: Line, folder: Path) -> None:
     require_ended_well(words, folder)
 
 
-WORDS_TARGET = Target(lines(), check_words, fast=12, nightly=2000)
-TARGET = Target(lines(), check, fast=13, nightly=3000)
+WORDS_TARGET = Target(lines(), check_words, fast=10, nightly=2000)
+TARGET = Target(lines(), check, fast=10, nightly=3000)

@@ -186,5 +186,5 @@ SYSTEMS_TARGET = Target(
     fast=20,
     nightly=2000,
 )
-COMMANDS_TARGET = Target(CASES, check_commands, fast=5, nightly=1500)
-TARGET = Target(CASES, check, fast=30, nightly=4000)
+COMMANDS_TARGET = Target(CASES, check_commands, fast=4, nightly=1500)
+TARGET = Target(CASES, check, fast=24, nightly=4000)
