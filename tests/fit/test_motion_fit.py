@@ -10,8 +10,8 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, JointFriction, Model, Robot, load_posterior, save_posterior
 from forcegp.data.views import all_motions, recorded_motions
-from forcegp.errors import InvalidInput, NumericalError
-from forcegp.evidence import Motions, Torques
+from forcegp.errors import DataWarning, InvalidInput, NumericalError
+from forcegp.evidence import Motions, Torques, Windows
 from forcegp.fit import fit as fit_model
 from forcegp.fit.motion_fit import MotionFit
 from forcegp.fit.motion_unknowns import Unknowns
@@ -240,3 +240,22 @@ def test_a_model_without_motions_near_the_recorded_ones_is_refused(along_the_law
     posterior = fit_model(model.with_forces(noise=QUIET), along_the_law, points=20, restarts=1)
     with pytest.raises(NumericalError, match="give fewer seconds"):
         refined(posterior, along_the_law, 1.0)
+
+
+def test_a_model_without_open_numbers_stays_as_it_is():
+    found = fit_model(slide(3.0, 4.0), recording(line, 1, 2.0), Torques())
+    assert not found.parameters
+    assert [law for law in found.model.laws if isinstance(law, Viscous)] == [Viscous(3.0)]
+
+
+@pytest.mark.parametrize("evidence", [Motions(0.5), Windows(0.2, nodes=4)], ids=str)
+def test_a_recording_that_is_there_twice_counts_once(evidence):
+    log = recording(line, 1, 2.0)
+    columns = {name: np.concatenate([getattr(log, name)] * 2) for name in ("q", "v", "u", "a", "time")}
+    twice = Dataset(**columns, episode=np.repeat([0, 1], len(log)), model=log.model, noise_std=log.noise_std)
+    model = slide(1.0, 1.0) if isinstance(evidence, Motions) else slide(1.0, 1.0).with_forces(JointForces(("v",)))
+    with pytest.warns(DataWarning, match="200 of 400 rows equal another one and count once"):
+        found = fit_model(model, twice, evidence, restarts=1)
+    alone = fit_model(model, log, evidence, restarts=1)
+    assert len(found.training) == len(alone.training)
+    assert [each.std for each in found.parameters.values()] == [each.std for each in alone.parameters.values()]

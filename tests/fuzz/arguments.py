@@ -620,4 +620,4 @@ def require_numbers(result: Any) -> None:
                 raise DefectError("numbers that are not finite")
 
 
-TARGET = Target(CASES, check, fast=150, nightly=8000)
+TARGET = Target(CASES, check, fast=80, nightly=8000)

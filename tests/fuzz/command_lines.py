@@ -172,5 +172,5 @@ def check(case: Line, folder: Path) -> None:
     require_ended_well(words, folder)
 
 
-WORDS_TARGET = Target(lines(), check_words, fast=40, nightly=2000)
-TARGET = Target(lines(), check, fast=20, nightly=3000)
+WORDS_TARGET = Target(lines(), check_words, fast=10, nightly=2000)
+TARGET = Target(lines(), check, fast=10, nightly=3000)

@@ -189,5 +189,5 @@ def check_commands(case: DataFile, folder: Path) -> None:
     require_ended_well(words[number % 4].split(), folder)
 
 
-TARGET = Target(CASES, check, fast=50, nightly=3000)
-COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=1500)
+TARGET = Target(CASES, check, fast=25, nightly=3000)
+COMMANDS_TARGET = Target(CASES, check_commands, fast=5, nightly=1500)

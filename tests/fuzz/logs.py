@@ -160,4 +160,4 @@ def npy(values: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-TARGET = Target(CASES, check, fast=25, nightly=2000)
+TARGET = Target(CASES, check, fast=9, nightly=2000)

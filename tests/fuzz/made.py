@@ -78,7 +78,7 @@ def make(folder: Path) -> None:
     )
     INPUTS.folder, INPUTS.data, INPUTS.posterior, INPUTS.free = folder, data, plain, free
     INPUTS.other = dataset()
-    INPUTS.moving = simulate_quadrotor(QuadrotorConfig(seconds=0.3))
+    INPUTS.moving = simulate_quadrotor(QuadrotorConfig(seconds=0.1))
     INPUTS.moving.save(folder / "moving.h5")
     (folder / "drone.xml").write_text(QUADROTOR)
     (folder / "arm.armature.json").write_text('{"pan": 0.1}')

@@ -107,4 +107,4 @@ def check(case: Mapping, folder: Path) -> None:
     require_no_code(folder)
 
 
-TARGET = Target(CASES, check, fast=60, nightly=3000)
+TARGET = Target(CASES, check, fast=40, nightly=3000)

@@ -108,4 +108,4 @@ def check(case: RobotFile, folder: Path) -> None:
     require_no_code(folder)
 
 
-TARGET = Target(CASES | NEW, check, fast=100, nightly=3000)
+TARGET = Target(CASES | NEW, check, fast=40, nightly=3000)

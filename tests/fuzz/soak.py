@@ -16,7 +16,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior
 
 BUDGET = 8
-POOL = 400
+POOL = 80
 """Rows that are shown again and again, each time in a different company."""
 
 

@@ -183,8 +183,8 @@ def check_system(case: StoredSystem, folder: Path) -> None:
 SYSTEMS_TARGET = Target(
     st.builds(StoredSystem, st.integers(0, 1), st.lists(JSON_EDITS, min_size=1, max_size=3)),
     check_system,
-    fast=30,
+    fast=20,
     nightly=2000,
 )
-COMMANDS_TARGET = Target(CASES, check_commands, fast=10, nightly=1500)
-TARGET = Target(CASES, check, fast=70, nightly=4000)
+COMMANDS_TARGET = Target(CASES, check_commands, fast=4, nightly=1500)
+TARGET = Target(CASES, check, fast=24, nightly=4000)

@@ -7,12 +7,14 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from tests.cli.test_import import FLAGS
 from tests.durability.commands import FEW
 from tests.fuzz.arguments import CALLS
 from tests.fuzz.datasets import OTHERS
 from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import require_ended_well
+from tests.fuzz.stored import CHANGES, TENSORS
 from tests.posterior.arm import URDF
 
 import forcegp
@@ -65,7 +67,7 @@ def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, wh
     assert require_ended_well(words, place) == 2
 
 
-CASES = [(name, other) for name in ("check", "import", "fit") for other in OTHERS[:: 9 if name == "fit" else 1]]
+CASES = [*zip(("fit", *("check", "import") * len(OTHERS)), OTHERS, strict=False)]
 
 
 @pytest.mark.parametrize(("command", "stated"), CASES, ids=json.dumps)
@@ -125,7 +127,8 @@ def test_systems_of_any_shape_are_refused(text):
     "stated",
     [{"data": {"episodes": value}} for value in (5, [[]], ["x"], {"a": 1}, None)]
     + [{"widening": value} for value in ("x", -1.0, float("nan"), None)]
-    + [{"rows_added": "x"}],
+    + [{"rows_added": "x"}, {"correlated_rows": "2"}, {"steady_forces": {"0": [1.0]}}, {"air": {"wind": [0.0] * 3}}]
+    + [{"motion_intervals": {"horizons": [1.0], "rms": [[[1.0]] * 2], "factors": [[[[1.0]] * 2]] * 2}}],
     ids=str,
 )
 def test_settings_of_another_kind_are_refused(tmp_path, stated):
@@ -136,6 +139,22 @@ def test_settings_of_another_kind_are_refused(tmp_path, stated):
     (run / "model.json").write_text(json.dumps(document))
     write_digests(run)
     with pytest.raises(FileFormatError, match=r"model\.json"):
+        forcegp.load_posterior(run)
+
+
+TENSORS_OF = ("training.q", "training.v", "parameters.noise.log_force")
+CHANGED = [(name, how) for name in TENSORS_OF for how in ("longer", "float32", "nan")] + [("training.v", "fewer rows")]
+
+
+@pytest.mark.parametrize(("name", "how"), CHANGED)
+def test_tensors_of_other_shapes_and_kinds_are_refused(tmp_path, name, how):
+    run = tmp_path / "run"
+    shutil.copytree(INPUTS.folder / "structured", run)
+    file = run / TENSORS
+    tensors = load_file(file)
+    save_file(tensors | {name: CHANGES[how](tensors[name]).contiguous()}, file)
+    write_digests(run)
+    with pytest.raises(FileFormatError, match="fit the model again"):
         forcegp.load_posterior(run)
 
 

@@ -82,6 +82,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
     except Exception as error:  # the last resort: one line also for a defect of ours, with its own exit code
+        if isinstance(error, ImportError) and "shared object" in str(error):
+            remedy = "raise the limit of memory (ulimit -v), or install forcegp again"
+            return _fail(f"a library cannot be loaded: {error}; {remedy}.", USER_ERROR, debug)
         what = f"{type(error).__name__}: {error}"
         return _fail(f"an error in forcegp itself, {what} (--debug shows where)", INTERNAL_ERROR, debug)
     finally:  # a program that calls this goes on as it was

@@ -333,7 +333,7 @@ def _minimized(
         step = np.zeros_like(here.x)
         diagonal = np.diag(curvature.diagonal() + 1e-12)
         step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
-        step /= max(1.0, float((abs(step) / longest).max()))
+        step /= float((abs(step) / longest).max(initial=1.0))
         step = np.clip(here.x + step, low, high) - here.x
         expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
         first = expected if first is None else first

@@ -182,7 +182,10 @@ def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start:
 
 
 def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
-    """The log, if it has what the evidence needs; of rows that are equal the first alone, with a warning."""
+    """The log, if it has what the evidence needs; of rows that are equal the first alone, with a warning.
+
+    Where rows follow each other, as in windows and motions, those of an episode go together or not at all.
+    """
     remedy = "; the model comes first, as in fit(model, dataset)"
     require_rows("dataset", dataset, model.robot.joint_names, "the robot", remedy)
     if len(dataset) < 2:
@@ -191,18 +194,20 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
         if each is not None:
             each.check(dataset)
     dataset = with_memory(dataset, model)
-    if isinstance(evidence, Windows) or refinement is not None or model.memory.names:
-        return dataset
     _, first = np.unique(np.hstack([dataset.q, dataset.v, dataset.u, dataset.a]), axis=0, return_index=True)
-    if len(first) == len(dataset):
+    again = ~np.isin(np.arange(len(dataset)), first)
+    if isinstance(evidence, Windows) or refinement is not None or model.memory.names:
+        for number in dataset.episodes:
+            again[dataset.episode == number] &= again[dataset.episode == number].all()
+    if not again.any():
         return dataset
     warnings.warn(
-        f"{len(dataset) - len(first)} of {len(dataset)} rows equal another one and count once: a row written twice is "
+        f"{again.sum()} of {len(dataset)} rows equal another one and count once: a row written twice is "
         "no second measurement.",
         DataWarning,
         stacklevel=4,
     )
-    return dataset.rows(np.sort(first))
+    return dataset.rows(np.flatnonzero(~again))
 
 
 def _of_numbers(

@@ -1,9 +1,9 @@
 """Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
 
-`SHA256SUMS` holds the digest of each: a flipped bit would hardly ever be noticed otherwise, and what is as it was
-written need not be checked entry by entry. A model that was carried to another one (`with_model`) has `target.urdf`,
-too, the robot there. The folder holds the training points and parameters; loading runs the same conditioning as
-fitting, so predictions are the same.
+`SHA256SUMS` holds the digest of each: a flipped bit would hardly ever be noticed otherwise. Another program may have
+written both, so what is read must have the shapes that the model needs. A model that was carried to another one
+(`with_model`) has `target.urdf`, too, the robot there. The folder holds the training points and parameters; loading
+runs the same conditioning as fitting, so predictions are the same.
 """
 
 import json
@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
@@ -31,6 +32,20 @@ FORMAT_VERSION = 1
 RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
 """What is stored of a search."""
 ROWS = ("q", "v", "u", "a", "noise_std", "weights")
+SETTINGS: dict[str, tuple[int | str, ...]] = {
+    **dict.fromkeys(("widening", "correlated_rows", "rows_added", "learned_until"), ()),
+    "data.episodes": ("episodes",),
+    "motion_intervals.horizons": ("horizons",),
+    "motion_intervals.rms": ("horizons", 2, "nv"),
+    "motion_intervals.factors": (2, "horizons", 2, "nv"),
+    "air.coefficients": (6, 20),
+    "air.deviations": (6,),
+    "air.wind": (3,),
+}
+"""Shapes of the numbers in the settings of a model that are read after loading."""
+POSITIVE = ("widening", "correlated_rows", "horizons", "deviations")
+UNUSABLE = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
+UNUSABLE += (SafetensorError, ForceGPError)
 SOLUTION = "latent.solution"
 TRAINING, REFERENCE, PARAMETERS = "training.", "reference.", "parameters."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
@@ -107,15 +122,19 @@ def load_posterior(path: str | Path) -> Posterior:
     require_unchanged(path, "fit the model again")
     try:
         tensors = load_file(path / "tensors.safetensors")
+        for name, value in tensors.items():
+            if value.dtype != torch.float64 or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} is {value.dtype} or has values that are not finite")
         model = _model(path / ROBOT, document["model"])
-        training = _rows(TRAINING, tensors)
+        training = _rows(TRAINING, tensors, model)
         if any(name.startswith(REFERENCE) for name in tensors):
-            training = replace(training, reference=_rows(REFERENCE, tensors))
+            training = replace(training, reference=_rows(REFERENCE, tensors, model))
         parameters = {
             name.removeprefix(PARAMETERS): value for name, value in tensors.items() if name.startswith(PARAMETERS)
         }
         found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
         engine, settings = document["engine"], dict(document["settings"])
+        _require_numbers(settings, model.robot.nv)
         posterior = Posterior.conditioned(
             model,
             training,
@@ -126,10 +145,12 @@ def load_posterior(path: str | Path) -> Posterior:
             tensors.get(SOLUTION),
             Estimates.from_dict(document["estimates"]),
         )
+        if posterior.likelihood.parameter_shapes != {name: tuple(value.shape) for name, value in parameters.items()}:
+            raise ValueError("its parameters are not those of its model")
         if "target" in document:
             posterior = posterior.with_model(_model(path / TARGET, document["target"]))
             posterior = posterior.with_settings(**settings)  # as it was stored
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError, ForceGPError) as error:
+    except UNUSABLE as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
     return posterior
 
@@ -138,9 +159,35 @@ def _model(urdf: Path, stored: Mapping[str, Any]) -> Model:
     return Model.from_dict({**stored, "urdf": urdf.read_bytes().decode("utf-8")})
 
 
-def _rows(prefix: str, tensors: Mapping[str, torch.Tensor]) -> TrainingData:
+def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> TrainingData:
+    """Raises ValueError, or what Python does, for tensors of other shapes than the rows of the model have."""
     given: dict[str, Any] = {name: tensors[prefix + name] for name in ROWS if prefix + name in tensors}
+    count, columns = len(given["q"]), dict(zip("qvu", model.sizes, strict=True))
+    for name, value in given.items():
+        fits = value.shape == (count, columns.get(name, model.robot.nv))
+        if not (value.dim() == 2 and value.numel() == count if name == "weights" else fits):
+            raise ValueError(f"{prefix}{name} has shape {tuple(value.shape)}, which is not that of {count} rows")
+    if "noise_std" in given and not bool((given["noise_std"] > 0.0).all()):
+        raise ValueError(f"{prefix}noise_std has values that are not positive")
     return TrainingData(**given)
+
+
+def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
+    """Raises ValueError, or what Python does, where settings that are read later are not numbers of their shape."""
+    sizes = {"nv": nv}
+    forces = {f"steady_forces.{number}": (3,) for number in settings.get("steady_forces") or ()}
+    for name, shape in (SETTINGS | forces).items():
+        group, _, key = name.rpartition(".")
+        holder = settings.get(group) if group else {key: settings.get(key, 1.0)}
+        if holder is None:
+            continue
+        value = holder.get(key) if isinstance(holder, Mapping) else holder
+        given = np.asarray(value)
+        same = given.ndim == len(shape) and given.dtype.kind in "if" and np.isfinite(given).all()
+        for asked, size in zip(shape, given.shape, strict=False):
+            same = same and size == (sizes.setdefault(asked, size) if isinstance(asked, str) else asked)
+        if not same or (key in POSITIVE and not (given > 0.0).all()):
+            raise ValueError(f"model.json has settings in which {name} is {str(value)[:60]}")
 
 
 def _document(path: Path) -> dict[str, Any]:
