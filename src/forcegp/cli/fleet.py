@@ -168,7 +168,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def fleet_of(command: str, words: Sequence[str]) -> Fleet:
     """The run that the words of a command ask for with `FLAG`. Raises InvalidInput."""
-    own = _taken(words, (FLAG, *OWN))
+    own, common = _split([word for word in words if word not in SWITCHES], (FLAG, *OWN))
     if "--out" not in own:
         raise InvalidInput(
             f"{FLAG} needs --out FOLDER, which gets a folder for each log. See forcegp {command} --help."
@@ -176,7 +176,6 @@ def fleet_of(command: str, words: Sequence[str]) -> Fleet:
     jobs = own.get("--jobs", "1")
     if not jobs.isdigit() or jobs == "0":
         raise InvalidInput(f"--jobs is {jobs}; give the number of logs at once, at least 1.")
-    common = _without([word for word in words if word not in SWITCHES], (FLAG, *OWN))
     switches = {word.removeprefix("--"): word in words for word in SWITCHES}
     return Fleet(
         command=command,
@@ -204,7 +203,7 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
             stem = Path(logs[0]).name.partition(".")[0] if logs else f"line-{number}"
             name = stem if stem not in lines else f"{stem}-{number}"
             differing = [word.partition("=")[0] for word in given if word.startswith("--")]
-            lines[name] = [*_without(common, differing), *given]
+            lines[name] = [*_split(common, differing)[1], *given]
             parsed([command, *lines[name], "--out", str(out / name)])
         except (InvalidInput, ValueError) as error:
             raise InvalidInput(f"line {number} of {path}: {error}") from None
@@ -213,24 +212,18 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
     return lines
 
 
-def _taken(words: Sequence[str], flags: Sequence[str]) -> dict[str, str]:
-    """Values of these options, written with a blank or "="."""
-    found = {}
-    for place, word in enumerate(words):
-        flag, equals, value = word.partition("=")
-        if flag in flags:
-            found[flag] = value if equals else (words[place + 1] if place + 1 < len(words) else "")
-    return found
-
-
-def _without(words: Sequence[str], flags: Sequence[str]) -> list[str]:
-    left, skip = [], False
+def _split(words: Sequence[str], flags: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Values of these options, written with a blank or "=", and the words that are left."""
+    found, left, open_ = dict[str, str](), list[str](), ""
     for word in words:
-        flag, equals, _ = word.partition("=")
-        if not skip and flag not in flags:
+        flag, equals, value = word.partition("=")
+        if open_:
+            found[open_], open_ = word, ""
+        elif flag not in flags:
             left.append(word)
-        skip = not skip and flag in flags and not equals
-    return left
+        else:
+            found[flag], open_ = value, "" if equals else flag
+    return found, left
 
 
 def _stamp(path: Path) -> tuple[int, int]:

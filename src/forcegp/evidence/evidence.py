@@ -394,12 +394,6 @@ EVIDENCE: dict[str, type[Evidence]] = {
 """Kinds by the name that commands and files have for them. Add yours: EVIDENCE["mine"] = Mine."""
 
 
-def evidence_class(name: str) -> Any:
-    """The kind of this name. Raises InvalidInput."""
-    require_known("evidence", name, "forcegp", EVIDENCE)
-    return EVIDENCE[name]
-
-
 @usable_arguments("parse_evidence")
 def parse_evidence(words: str | Sequence[str]) -> tuple[Evidence, ...]:
     """The evidence of a text or of its parts: `NAME[:VALUE][:FIELD=VALUE...]` with commas: "torques,motions:1"."""
@@ -409,4 +403,5 @@ def parse_evidence(words: str | Sequence[str]) -> tuple[Evidence, ...]:
 
 def _one(word: str) -> Evidence:
     name, *options = word.split(":")
-    return called(f"evidence {name!r}", evidence_class(name), options)
+    require_known("evidence", name, "forcegp", EVIDENCE)
+    return called(f"evidence {name!r}", EVIDENCE[name], options)
