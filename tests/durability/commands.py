@@ -51,7 +51,7 @@ COMMANDS = {
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
     "identification": Writing("fit air.h5 --forces bodies,viscous --no-checks --out OUT"),
     "check": Writing("check train.h5 --out OUT"),
-    "demo": Writing("demo --seconds 2 --points 10 --iterations 2 --out OUT", again=""),
+    "demo": Writing("demo --seconds 2 --points 10 --iterations 2 --out OUT"),
     "score": Writing(f"score train.h5 {SCORE} --out OUT", "store", again=""),
 }
 KILLED = ("simulate", "import", "fit", "identification", "score")

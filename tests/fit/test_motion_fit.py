@@ -245,7 +245,7 @@ def test_a_model_without_motions_near_the_recorded_ones_is_refused(along_the_law
 def test_a_model_without_open_numbers_stays_as_it_is():
     found = fit_model(slide(3.0, 4.0), recording(line, 1, 2.0), Torques())
     assert not found.parameters
-    assert [law for law in found.model.laws if isinstance(law, Viscous)] == [Viscous(3.0)]
+    assert found.description == "analytical model"
 
 
 @pytest.mark.parametrize("evidence", [Motions(0.5), Windows(0.2, nodes=4)], ids=str)
