@@ -78,7 +78,9 @@ class Fleet(Command):
         kind = f"forcegp {self.command} {FLAG}"
         store = JobStore.open(self.out, kind, {"command": self.command}, overwrite=self.overwrite)
         for name, words in lines.items():
-            stamps = {word: _stamp(Path(word)) for word in words if not word.startswith("-") and Path(word).is_file()}
+            # size and time of files, by which a row is known to be of them
+            files = {word: Path(word).stat() for word in words if not word.startswith("-") and Path(word).is_file()}
+            stamps = {word: [found.st_size, found.st_mtime_ns] for word, found in files.items()}
             spec = {"command": self.command, "words": words, "out": str(self.out / name), "files": stamps}
             work.append(Job(name, f"{__name__}:one", spec))
             if store.place(name).exists() and store.result(name)["error"]:
@@ -224,8 +226,3 @@ def _split(words: Sequence[str], flags: Sequence[str]) -> tuple[dict[str, str], 
         else:
             found[flag], open_ = value, "" if equals else flag
     return found, left
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    """Size and time of a file, by which a row is known to be of it."""
-    return path.stat().st_size, path.stat().st_mtime_ns

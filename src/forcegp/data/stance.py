@@ -126,7 +126,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     motion, asked = _motion_and_force(dataset, model, names)
     speed, force = (np.empty((len(dataset), len(names))) for _ in range(2))
     noise = np.empty(len(names))
-    widths = [_width(dataset.time[rows]) for rows in episodes]
+    times = [dataset.time[rows] for rows in episodes]
+    widths = [2 * int(0.5 * WINDOW / np.median(np.diff(t))) + 1 if len(t) > 1 else 1 for t in times]
     for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
         smooth = np.empty_like(own)
         for rows, width in zip(episodes, widths, strict=True):
@@ -172,11 +173,6 @@ def _motion_and_force(
 
     both = in_blocks(dataset, found, model.robot.device)
     return both[: len(names)], both[len(names) :]
-
-
-def _width(time: Float[np.ndarray, " rows"]) -> int:
-    """Rows of a window."""
-    return 2 * int(0.5 * WINDOW / np.median(np.diff(time))) + 1 if len(time) > 1 else 1
 
 
 def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], strides: list[int]) -> float:

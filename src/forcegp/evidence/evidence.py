@@ -397,11 +397,9 @@ EVIDENCE: dict[str, type[Evidence]] = {
 @usable_arguments("parse_evidence")
 def parse_evidence(words: str | Sequence[str]) -> tuple[Evidence, ...]:
     """The evidence of a text or of its parts: `NAME[:VALUE][:FIELD=VALUE...]` with commas: "torques,motions:1"."""
-    given = words.split(",") if isinstance(words, str) else words
-    return tuple(_one(word.strip()) for word in given)
-
-
-def _one(word: str) -> Evidence:
-    name, *options = word.split(":")
-    require_known("evidence", name, "forcegp", EVIDENCE)
-    return called(f"evidence {name!r}", EVIDENCE[name], options)
+    found = []
+    for word in words.split(",") if isinstance(words, str) else words:
+        name, *options = word.strip().split(":")
+        require_known("evidence", name, "forcegp", EVIDENCE)
+        found.append(called(f"evidence {name!r}", EVIDENCE[name], options))
+    return tuple(found)

@@ -23,7 +23,7 @@ from forcegp.evidence.least_squares import LEAST, Fit, NoiseLevels, weighted_lea
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
 from forcegp.fit.equations import Equations, most_likely, possible_links
-from forcegp.forces import Payload, RigidBodies
+from forcegp.forces import Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior.estimates import STRETCHES, Estimates
@@ -69,7 +69,8 @@ def fit_physical(
     progress: Progress | None = None,
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone."""
-    robot, thick = thickened(model.robot) if _estimates_bodies(model) else (model.robot, ())
+    bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
+    robot, thick = thickened(model.robot) if bodies else (model.robot, ())
     model = replace(model, robot=robot)
     most = rows_at_most(robot) if rows is None else rows
     logs = [log.rows(evenly(log, most)) for log in logs]
@@ -189,12 +190,6 @@ def _weak_directions(space: ParameterSpace, information: np.ndarray, prior: np.n
         weak = np.linalg.eigvalsh(information[own, own]) < np.linalg.eigvalsh(prior[own, own]).mean()
         out[each.name] = int(weak.sum())
     return {name: count for name, count in sorted(out.items(), key=lambda entry: -entry[1]) if count}
-
-
-def _estimates_bodies(model: Model) -> bool:
-    return any(isinstance(law, RigidBodies) and law.learn for law in model.laws) or any(
-        isinstance(law, Payload) and not law.known for law in model.laws
-    )
 
 
 def rows_at_most(robot: Robot) -> int:
