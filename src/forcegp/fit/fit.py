@@ -182,10 +182,7 @@ def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start:
 
 
 def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
-    """The log, if it has what the evidence needs; of rows that are equal the first alone, with a warning.
-
-    Where rows follow each other, as in windows and motions, those of an episode go together or not at all.
-    """
+    """The log, if it has what the evidence needs; of equal rows, or episodes of rows in order, the first alone."""
     remedy = "; the model comes first, as in fit(model, dataset)"
     require_rows("dataset", dataset, model.robot.joint_names, "the robot", remedy)
     if len(dataset) < 2:

@@ -38,9 +38,7 @@ SETTINGS: dict[str, tuple[int | str, ...]] = {
     "motion_intervals.horizons": ("horizons",),
     "motion_intervals.rms": ("horizons", 2, "nv"),
     "motion_intervals.factors": (2, "horizons", 2, "nv"),
-    "air.coefficients": (6, 20),
-    "air.deviations": (6,),
-    "air.wind": (3,),
+    **{"air.coefficients": (6, 20), "air.deviations": (6,), "air.wind": (3,)},
 }
 """Shapes of the numbers in the settings of a model that are read after loading."""
 POSITIVE = ("widening", "correlated_rows", "horizons", "deviations")
@@ -167,8 +165,8 @@ def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> Tra
         fits = value.shape == (count, columns.get(name, model.robot.nv))
         if not (value.dim() == 2 and value.numel() == count if name == "weights" else fits):
             raise ValueError(f"{prefix}{name} has shape {tuple(value.shape)}, which is not that of {count} rows")
-    if "noise_std" in given and not bool((given["noise_std"] > 0.0).all()):
-        raise ValueError(f"{prefix}noise_std has values that are not positive")
+        if name == "noise_std" and bool((value <= 0.0).any()):
+            raise ValueError(f"{prefix}{name} has values that are not positive")
     return TrainingData(**given)
 
 
@@ -178,11 +176,9 @@ def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
     forces = {f"steady_forces.{number}": (3,) for number in settings.get("steady_forces") or ()}
     for name, shape in (SETTINGS | forces).items():
         group, _, key = name.rpartition(".")
-        holder = settings.get(group) if group else {key: settings.get(key, 1.0)}
-        if holder is None:
+        if (holder := settings.get(group) if group else {key: settings.get(key, 1.0)}) is None:
             continue
-        value = holder.get(key) if isinstance(holder, Mapping) else holder
-        given = np.asarray(value)
+        given = np.asarray(value := holder.get(key) if isinstance(holder, Mapping) else holder)
         same = given.ndim == len(shape) and given.dtype.kind in "if" and np.isfinite(given).all()
         for asked, size in zip(shape, given.shape, strict=False):
             same = same and size == (sizes.setdefault(asked, size) if isinstance(asked, str) else asked)
