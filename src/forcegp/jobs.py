@@ -46,12 +46,13 @@ def code_digest(*modules: str) -> str:
     for module in modules:
         with suppress(ImportError):  # of a package that is no longer there: the job fails where it is computed
             found = sys.modules.get(module) or import_module(module)
-            if module.partition(".")[0] != package.name and found.__file__ is not None:
-                places.add(Path(found.__file__).parent if found.__package__ else Path(found.__file__))
+            file = getattr(found, "__file__", None)  # which __main__ of a notebook lacks
+            if module.partition(".")[0] != package.name and file is not None:
+                places.add(Path(file).parent if found.__package__ else Path(file))
     for place in sorted({package, *places}):
-        for file in [place] if place.is_file() else sorted(place.rglob("*")):
-            if file.suffix in CODE:
-                digest.update(f"{file.relative_to(place)}\0".encode() + file.read_bytes())
+        for source in [place] if place.is_file() else sorted(place.rglob("*")):
+            if source.suffix in CODE:
+                digest.update(f"{source.relative_to(place)}\0".encode() + source.read_bytes())
     return digest.hexdigest()
 
 

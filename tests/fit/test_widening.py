@@ -79,7 +79,7 @@ def test_an_unknown_variance_widens_as_the_closed_form_does():
     total = 0.5 * sum((m - mean) ** 2 + v for m, v in sides)
     expected = math.sqrt(max(1.0, total / variance))
     states = widening._States(posterior)
-    assert states.mixture_factor(posterior, True) == pytest.approx(expected, rel=1e-6)
+    assert states.mixture_factor(posterior) == pytest.approx(expected, rel=1e-6)
     assert expected > 1.01
 
 
