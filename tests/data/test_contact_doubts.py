@@ -32,6 +32,7 @@ def sliding() -> Dataset:
 def test_a_point_two_centimetres_sideways_is_measured(sliding):
     """The tool keeps its orientation, so that |A a - b| does not change: the place of the force does."""
     assert kinds(sliding) == []
+    assert kinds(sliding, sliding.model.without_mean()) == [], "a model without physics has nothing to compare"
     for shift in ((0.02, 0.0, 0.0), (0.0, -0.02, 0.0)):
         (doubt,) = contact_doubts(moved(sliding, shift))
         assert doubt.numbers["kind"] == "point"

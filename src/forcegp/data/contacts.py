@@ -176,10 +176,11 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
     say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere) or
-    "no force". Not for contacts that hold several points of one body, nor for robots with closed loops.
+    "no force". Not for contacts that hold several points of one body, closed loops, nor models without `RigidBodies`.
     """
     model = dataset.model if model is None else model
-    if model is None or not model.contacts or model.loops or len(dataset) < FEWEST_ROWS or not dataset.u.any():
+    few = len(dataset) < FEWEST_ROWS or not dataset.u.any()
+    if few or model is None or not model.contacts or model.loops or model.carries_known_forces:
         return Doubts()
     seen = [white_noise(dataset, signal=name) if move_on(dataset) else None for name in ("v", "a")]
     noise = tuple(np.zeros(dataset.nv) if each is None else np.nan_to_num(each) for each in seen)
