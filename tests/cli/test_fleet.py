@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.cli.fleet import fleet, numbers_of
+from forcegp.cli.fleet import fleet, lines_of, numbers_of
 from forcegp.cli.main import main
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
@@ -51,6 +51,8 @@ def test_each_log_is_a_row_and_one_that_fails_says_so(listed, capsys):
     with Path("out/fleet.csv").open() as file:
         rows = {row["log"]: row for row in csv.DictReader(file)}
     assert list(rows) == ["robot0", "robot1", "robot2", "robot3", "broken"]
+    header = Path("out/fleet.csv").read_text().splitlines()[0].split(",")
+    assert len(set(header)) == len(header)
     assert [rows[name]["points"] for name in rows] == ["8", "8", "6", "8", ""]
     assert "not an HDF5 file" in rows["broken"]["error"]
     assert Path("out/robot1/model.json").is_file()
@@ -88,8 +90,20 @@ def test_a_wrong_list_is_refused_in_one_line(listed, capsys, text, given, messag
 def test_words_without_a_list_are_refused(listed):
     with pytest.raises(InvalidInput, match="needs --out FOLDER"):
         fleet(["fit", "--logs-from", "list.txt"])
+    with pytest.raises(InvalidInput, match="needs --out FOLDER"):
+        fleet(["fit", "--out", "out", "--logs-from"])
     with pytest.raises(InvalidInput, match="name no list of logs"):
         fleet(["fit", "a.h5", "--out", "out"])
+
+
+def test_logs_of_one_name_and_of_the_folder_of_rows_have_folders_of_their_own(listed, logs):
+    options = ["--robot", "a.urdf"]
+    text = "--robot b.urdf x/a.h5\ny/a.h5\na-2.h5\njobs.h5"
+    listed.write_text(text)
+    found = lines_of("fit", options, listed, Path("out"))
+    assert list(found) == ["a", "a-2", "a-2-3", "jobs-4"]
+    assert found["a"] == ["--robot", "b.urdf", "x/a.h5"]
+    assert found["a-2"] == [*options, "y/a.h5"]
 
 
 def test_numbers_of_a_result_are_flat():

@@ -21,7 +21,7 @@ from forcegp.cli.arguments import COMMANDS, command_class, parsed
 from forcegp.cli.command import Command, options_of
 from forcegp.cli.terminal import Terminal, facts
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
-from forcegp.jobs import Job, JobStore, run_jobs
+from forcegp.jobs import JOBS, Job, JobStore, run_jobs
 from forcegp.parallel import Jobs
 
 FLAG = "--logs-from"
@@ -157,8 +157,8 @@ def numbers_of(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows as CSV: log, folder, error and time, then every number that any of them has."""
-    numbers = list(dict.fromkeys(name for row in rows for name in row["numbers"]))
     own = ["log", "folder", "error", "cpu_seconds"]
+    numbers = list(dict.fromkeys(name for row in rows for name in row["numbers"] if name not in own))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*own, "warnings", *numbers])
@@ -171,9 +171,9 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
 def fleet_of(command: str, words: Sequence[str]) -> Fleet:
     """The run that the words of a command ask for with `FLAG`. Raises InvalidInput."""
     own, common = _split([word for word in words if word not in SWITCHES], (FLAG, *OWN))
-    if "--out" not in own:
+    if not (own.get("--out") and own.get(FLAG)):
         raise InvalidInput(
-            f"{FLAG} needs --out FOLDER, which gets a folder for each log. See forcegp {command} --help."
+            f"{FLAG} LIST needs --out FOLDER, which gets a folder for each log. See forcegp {command} --help."
         )
     jobs = own.get("--jobs", "1")
     if not jobs.isdigit() or jobs == "0":
@@ -201,12 +201,13 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
             given = shlex.split(line, comments=True)
             if not given:
                 continue
-            logs = [word for word in given if not word.startswith("-")]
-            stem = Path(logs[0]).name.partition(".")[0] if logs else f"line-{number}"
-            name = stem if stem not in lines else f"{stem}-{number}"
             differing = [word.partition("=")[0] for word in given if word.startswith("--")]
-            lines[name] = [*_split(common, differing)[1], *given]
-            parsed([command, *lines[name], "--out", str(out / name)])
+            words = [*_split(common, differing)[1], *given]
+            asked: Any = parsed([command, *words, "--out", str(out)])
+            name = (asked.logs[0] if hasattr(asked, "logs") else asked.log).name.partition(".")[0]
+            while not name or name in lines or name == JOBS:  # the last is where rows are kept
+                name += f"-{number}"
+            lines[name] = words
         except (InvalidInput, ValueError) as error:
             raise InvalidInput(f"line {number} of {path}: {error}") from None
     if not lines:

@@ -23,7 +23,7 @@ LEAP = 0.3  # median step of a position over its standard deviation, from which 
 
 def tensors(rows: Dataset, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """q, v, u and a of the rows."""
-    return tuple(torch.tensor(getattr(rows, name), device=device) for name in "qvua")  # type: ignore[return-value]
+    return tuple(torch.tensor(getattr(rows, name), device=device) for name in "qvua")  # type: ignore[return-value]  # four
 
 
 def in_blocks(

@@ -90,7 +90,7 @@ class Equations:
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         self.held = _stacked([part.held for part in self.parts])
         seconds = evidence.mean if isinstance(evidence, Torques) else None
-        self.windows = None if seconds is None else Windows(logs, seconds)
+        self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
 
@@ -106,10 +106,8 @@ class Equations:
         """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
         r, Y, in_terms = zip(*parts, strict=True)
         if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
-            self._stays, self._regressor = (
-                Y,
-                Regressor(np.concatenate(Y).reshape(*self.a.shape, 10 * len(self.space.carried))),
-            )
+            flat = np.concatenate(Y).reshape(*self.a.shape, 10 * len(self.space.carried))
+            self._stays, self._regressor = Y, Regressor(flat)
         slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
         return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
 
@@ -171,7 +169,7 @@ class Equations:
         return [(nv * each[:, None] + np.arange(nv)).ravel() for each in rows if len(each)]
 
 
-class Windows:
+class WindowMeans:
     """Means over windows of time, times the root of their rows, so that white noise keeps its size."""
 
     def __init__(self, logs: Sequence[Dataset], seconds: float) -> None:
