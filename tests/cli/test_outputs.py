@@ -103,8 +103,9 @@ def test_two_commands_do_not_write_to_one_place(folder, no_work, monkeypatch, ca
     Path("link").symlink_to("new")
     with parse_arguments(filled(name, "link")).alone():
         assert "another command of forcegp is writing" in refused(filled(name, "new"), capfd)
-        with parse_arguments(filled(name, "elsewhere")).alone():
-            pass
+        if name != "mapping":  # its other output is the same
+            with parse_arguments(filled(name, "elsewhere")).alone():
+                pass
     with parse_arguments(filled(name, "new")).alone():
         pass
     assert not hidden(folder)
