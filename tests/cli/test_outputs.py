@@ -112,7 +112,8 @@ def test_two_commands_do_not_write_to_one_place(folder, no_work, monkeypatch, ca
 
 
 def test_locks_of_another_user_are_not_used(folder, no_work, monkeypatch, capfd):
-    monkeypatch.setattr(os, "getuid", lambda own=os.getuid(): own + 1)
+    mine = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: mine + 1)
     assert "belongs to another user; set TMPDIR" in refused(filled("fit", "new"), capfd)
 
 
