@@ -45,7 +45,7 @@ class CasadiLoops:
 
     def _loop(self, quantity: str, *given: np.ndarray) -> Callable[[], list[np.ndarray]]:
         inputs, outputs = self._expressions(quantity)
-        function = ca.Function("f", inputs, ca.cse(outputs))
+        function: Any = ca.Function("f", inputs, ca.cse(outputs))
         code = ca.CodeGenerator(f"{quantity}.c")
         code.add(function)
         code.generate(f"{self.folder}/")
