@@ -13,12 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
+import casadi as untyped
 import numpy as np
 
 from forcegp.robots import Robot
 from forcegp.robots.unrolled import UnrolledRobot
 
+ca: Any = untyped
 QUANTITIES = ("mass_bias", "fd")
 LOOP = """
 void loop(long n, const double *const *a, double *const *o) {
@@ -45,7 +46,7 @@ class CasadiLoops:
 
     def _loop(self, quantity: str, *given: np.ndarray) -> Callable[[], list[np.ndarray]]:
         inputs, outputs = self._expressions(quantity)
-        function: Any = ca.Function("f", inputs, ca.cse(outputs))
+        function = ca.Function("f", inputs, ca.cse(outputs))
         code = ca.CodeGenerator(f"{quantity}.c")
         code.add(function)
         code.generate(f"{self.folder}/")
