@@ -192,7 +192,7 @@ def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
     report = preparation_report(metadata)
     if not report:
         return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
-    settings = {each.name: report.get(each.name) for each in fields(Preparation)}
+    settings = {each.name: report.get(each.name) for each in fields(Preparation) if each.name != "why"}
     given = ", ".join(f"{name} {value}" for name, value in settings.items() if name == "cutoff" or np.any(value))
     lines = [f"Preparation: {given}."]
     for quantity, reason in dict(report.get("why") or {}).items():
