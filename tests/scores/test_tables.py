@@ -69,7 +69,8 @@ def test_one_model_by_joint(scores):
 def test_models_side_by_side(scores):
     header, rows = overall(scores, "**")
     assert header == [
-        "model", "MAE [rad/s²]", "nRMSE", "force error [Nm or N]", "NLPD [nats]", "in 95 %", "in 50 %", "q after 0.5 s [rad]",
+        "model", "MAE [rad/s²]", "nRMSE", "force error [Nm or N]", "NLPD [nats]", "in 95 %", "in 50 %",
+        "q after 0.5 s [rad]",
     ]  # fmt: skip
     urdf, ls, gp = rows
     assert urdf[:2] == ["urdf", "0.8000 (0.8000–0.8000)"]
