@@ -61,8 +61,8 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
         named_model(drones[0], ("gp:aerodynamic", "gp:joint-friction"))
 
 
-@pytest.mark.nightly
-def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):
+def test_rows_that_resemble_each_other_are_worth_less(bare, tmp_path):
+    log = recording(bump, 1, seconds=6.0)
     model = bare.with_forces(JointFriction(), noise=Noise(0.5))
     fitted = fit(model, log, restarts=1)
     assert allowing_for_correlation(fitted, log) == (fitted, None), "white noise"
@@ -70,7 +70,7 @@ def test_rows_that_resemble_each_other_are_worth_less(log, bare, tmp_path):
     slow = replace(log, a=log.a + 4.0 * smooth[:, None])
     wide, note = allowing_for_correlation(fit(model, slow, restarts=1), slow)
     k = wide.settings["correlated_rows"]
-    assert 3.0 < k < 12.0, "of 9 rows that share their noise"
+    assert 2.0 < k < 12.0, "of 9 rows that share their noise"
     assert f"over {k:.0f} rows" in note
     # nine rows that share their noise are one: the posterior of rows that are noisier by the root of k
     noisier = {**wide.hyperparameters, ACCELERATION: wide.hyperparameters[ACCELERATION] + 0.5 * np.log(k)}
