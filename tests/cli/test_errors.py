@@ -11,7 +11,7 @@ import pytest
 from tests.cli.one_line import assert_refused
 from tests.posterior.arm import URDF, arm_data, arm_model
 
-import forcegp
+from forcegp import scores
 from forcegp.cli.main import main
 from forcegp.data import Dataset, units_for
 from forcegp.model import Model
@@ -164,8 +164,8 @@ def test_being_terminated_ends_with_the_exit_code_of_the_signal(folder, monkeypa
     assert end.value.code == 128 + signal.SIGTERM
 
 
-def test_what_others_print_is_not_among_the_json(folder, monkeypatch, capfd):
-    own = forcegp.scores.learn
+def test_what_others_print_is_not_among_the_json(forcegp, folder, monkeypatch):
+    own = scores.learn
 
     def noisy(*given, **more):
         os.write(1, b"of a library in C")
@@ -173,11 +173,10 @@ def test_what_others_print_is_not_among_the_json(folder, monkeypatch, capfd):
         return own(*given, **more)
 
     monkeypatch.setattr("forcegp.scores.learn", noisy)
-    assert main(["fit", "arm.h5", *QUICK, "--out", "run", "--json"]) == 0
-    told = capfd.readouterr()
-    assert json.loads(told.out)["data"] == "arm.h5"
-    assert "of a library in C" in told.err
-    assert "of Python" in told.err
+    done = forcegp("fit", "arm.h5", *QUICK, "--out", "run", "--json", folder=folder)
+    assert json.loads(done.stdout)["run"] == "run"
+    assert "of a library in C" in done.stderr
+    assert "of Python" in done.stderr
 
 
 def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypatch, capfd):
