@@ -170,7 +170,7 @@ class Law(Force):
     def _has_prior(self) -> bool:
         return any(isinstance(getattr(self, name), Normal | LogNormal) for name in list(self.coefficients)[:1])
 
-    def with_values(self: AnyLaw, values: Mapping[str, Tensor]) -> AnyLaw:
+    def with_values(self: AnyLaw, values: Mapping[str, Any]) -> AnyLaw:
         """The same law with these coefficients, which are known then."""
         return replace(self, **values)  # type: ignore[type-var]  # laws are dataclasses
 
