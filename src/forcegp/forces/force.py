@@ -26,7 +26,7 @@ from forcegp.mechanics.gauss_principle import Contact, State
 from forcegp.robots import Robot
 from forcegp.robots.arguments import by_joint
 
-PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
+PerJoint = float | Sequence[float] | Mapping[str, float] | np.ndarray | Tensor
 Number = PerJoint | Normal | LogNormal | None
 """A number of a law: given (one, one per joint, or by joint name), or estimated under a prior; None: a weak one."""
 AnyForce = TypeVar("AnyForce", bound="Force")
