@@ -165,6 +165,7 @@ def poor(mae, known, inside=(0.95, 0.95), rows=400) -> list[str]:
     return [doubt.about for doubt in poor_scores(JOINTS, range(rows), table)]
 
 
+@pytest.mark.usefixtures("unchecked")  # its model is none
 def test_a_model_is_worse_from_a_percent_on_in_the_mean_and_a_fifth_at_a_joint():
     assert poor((5.0, 5.0), (5.0, 5.0)) == poor((5.04, 5.04), (5.0, 5.0)) == []
     assert poor((5.08, 5.08), (5.0, 5.0)) == ["error"]
@@ -174,6 +175,7 @@ def test_a_model_is_worse_from_a_percent_on_in_the_mean_and_a_fifth_at_a_joint()
     assert poor((0.21, 4.0), (0.1, 5.0)) == ["error"]
 
 
+@pytest.mark.usefixtures("unchecked")  # its model is none
 def test_intervals_miss_below_nine_tenths_in_the_mean_or_fifteen_hundredths_at_a_joint():
     assert poor((1.0, 1.0), (5.0, 5.0), (0.91, 0.91)) == []
     assert poor((1.0, 1.0), (5.0, 5.0), (0.89, 0.89)) == ["coverage"]
@@ -194,6 +196,7 @@ class Rows:
         return len(self.q)
 
 
+@pytest.mark.usefixtures("unchecked")  # its model is none
 @pytest.mark.parametrize(
     ("q", "beyond"), [(1.6, False), (1.8, True), (-0.6, False), (-0.8, True)], ids=["near", "far", "low", "lower"]
 )
