@@ -25,6 +25,7 @@ from benchmarks.force_recordings import (
     Law,
     across_the_strip,
     fitted,
+    on_a_rough_strip,
     plane_of,
     recording,
     roughness,
@@ -114,7 +115,7 @@ def joint_friction() -> Any:
 def tool_forces() -> Any:
     """Left: the two friction curves. Right: a force that depends on the place."""
     plain = fitted(recording(1), ToolForces(), 20)
-    rough = recording(1, patch_factor=4.0)
+    rough = on_a_rough_strip()
     kernel = "matern-3/2"
     posterior = fitted(rough, ToolForces(inputs=("velocity", "position"), kernel=kernel), 300)
     figure = new_figure(10.0, 3.2)
@@ -244,7 +245,7 @@ def normal_force() -> Any:
 
 def friction_map() -> Any:
     """Viscous friction with a rough strip, under two kernels."""
-    rough = recording(1, patch_factor=4.0)
+    rough = on_a_rough_strip()
     figure = new_figure(7.5, 3.2)
     grid = figure.subplots(1, 2)
     x, place = across_the_strip()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from forcegp import Dataset, KukaSurfaceConfig, Model, Robot, fit, simulate_kuka_surface
+from forcegp import ContactFriction, Dataset, KukaSurfaceConfig, Model, Robot, fit, simulate_kuka_surface
 from forcegp.forces import Unknown
 from forcegp.mechanics import surface_axes
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
@@ -78,8 +78,12 @@ def across_the_strip() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def roughness(x: torch.Tensor) -> torch.Tensor:
-    """Viscous coefficient in N/(m/s) of a patch of factor 4."""
+    """Viscous coefficient in N/(m/s), four times as much on a strip."""
     return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25))
+
+
+def on_a_rough_strip() -> Dataset:
+    return with_force(recording(1), ContactFriction(viscous=True, inputs=("position",)), roughness)
 
 
 def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:

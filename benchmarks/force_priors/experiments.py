@@ -1,4 +1,4 @@
-"""The experiments on force priors: data efficiency, friction as it is, other contacts, one that opens."""
+"""The experiments on force priors: data efficiency, friction as it is, other contacts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +21,6 @@ from benchmarks.force_priors.trials import (
     trials_on,
 )
 from benchmarks.paper import published
-from benchmarks.paper.experiment import medians
 from benchmarks.paper.figures import draw_range
 from forcegp.jobs import JobStore
 from forcegp.posterior import load_posterior
@@ -256,38 +255,3 @@ class Transfer(ForceExperiment):
                 rows.append([trial["label"], str(trial["points"]), *cells])
             parts += [f"**{title}**", markdown_table(["model", "points", *tests], rows)]
         return "\n\n".join(parts)
-
-
-MODELS = {
-    "known physics alone": KNOWN_PHYSICS,
-    "independent GP": BLACK_BOX,
-    **{label: TOOL[label] for label in (JOINT_FORCES, "tool friction", "contact friction", "load friction")},
-}
-
-
-@dataclass(frozen=True)
-class UnilateralContact(ForceExperiment):
-    """Trained on rows that the data show to be in contact."""
-
-    name, title = "unilateral-contact", "A contact that opens and closes"
-
-    @override
-    def trials(self) -> list[Trial]:
-        return [Trial(label, "bullet", prior, points) for label, prior in MODELS.items() for points in self.points]
-
-    @override
-    def summary(self, results: JobStore) -> dict[str, Any]:
-        found = [results.result(self.data_job("bullet", seed, training=True).name) for seed in self.seeds]
-        return super().summary(results) | medians(found, ("in_contact_truth", "in_contact_detected"))
-
-    @override
-    def section(self, summary: Mapping[str, Any]) -> str:
-        columns = ("mae", "mae_noise_free", "mae_touching", "mae_in_the_air", "coverage_95", "normal_force_error")
-        return (
-            "PyBullet's unilateral contact with Coulomb friction, from which the tool lifts now and then: "
-            f"{formatted(summary['in_contact_truth'], 3)} of the rows are in contact, "
-            f"{formatted(summary['in_contact_detected'], 3)} are found to be so from positions, velocities and "
-            f"accelerations alone (`forcegp.data.rows_in_contact`); models are trained on these. "
-            f"{len(self.seeds)} seeds. All models but the independent GP hold the contact for an ideal one, so in "
-            "the air they are wrong, and where the tool lands or takes off nothing predicts the blow.\n\n"
-        ) + score_table(summary["trials"], columns)

@@ -11,7 +11,7 @@ from benchmarks.paper.data import farthest, simulated
 from benchmarks.paper.fits import MODEL, search_report
 from benchmarks.plants import JointFrictionLaw, PlantConfig
 from benchmarks.scores import scores_of
-from forcegp.data import Dataset, rows_in_contact
+from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit as fit_model
@@ -70,12 +70,10 @@ def _joint_law(config: KukaSurfaceConfig, robot: Robot, joint: int) -> Law | Non
 
 
 def _tool_law(config: KukaSurfaceConfig, load: bool) -> Law | None:
-    if config.contact != "ideal":
-        return None  # PyBullet's solver has no law with a curve
     law = tool_friction_of(config)
     if isinstance(law, DryFriction) and load:
         return law.coefficient
-    if isinstance(law, ViscousFriction) and not load and config.patch_factor == 1.0:
+    if isinstance(law, ViscousFriction) and not load:
         return lambda speed: law.coefficient * np.asarray(speed)
     return None
 
@@ -88,24 +86,14 @@ Coulomb's and viscous friction of every joint by maximum likelihood, with the sm
 
 
 def simulate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """One trajectory of a scenario: its `rows` that lie farthest apart, or every `every`-th.
-
-    Where contacts can open, training rows are those that the data show to be in contact.
-    """
+    """One trajectory of a scenario: its `rows` that lie farthest apart, or every `every`-th."""
     everything = simulated(spec["seed"], spec["seconds"], **spec["scenario"])
-    counts: dict[str, Any] = {"rows_available": len(everything)}
-    opens = "in_contact" in everything.truth
-    if opens:
-        counts["in_contact_truth"] = float(everything.truth["in_contact"].mean())
     if spec["rows"] is None:
         kept = everything.rows(slice(None, None, spec["every"]))
     else:
-        usable = rows_in_contact(everything) if opens else everything
-        if opens:
-            counts["in_contact_detected"] = len(usable) / len(everything)
-        kept = farthest(usable, spec["rows"], spec["seconds"])
+        kept = farthest(everything, spec["rows"], spec["seconds"])
     kept.save(folder / FILE)
-    return counts | {"rows": len(kept)}
+    return {"rows_available": len(everything), "rows": len(kept)}
 
 
 def load(results: JobStore, name: str) -> Dataset:
@@ -157,11 +145,6 @@ def scores(posterior: Any, test: Dataset) -> dict[str, Any]:
     kept = {name: out[name] for name in names}
     if "a" in test.truth:  # what nothing can be better than on these rows
         kept["mae_of_truth"] = float(np.abs(test.truth["a"] - test.a).mean())
-    if "in_contact" in test.truth:
-        open_contacts = (np.asarray(test.truth["in_contact"]) == 0.0).sum(axis=1)
-        for name, where in (("touching", open_contacts == 0), ("in_the_air", open_contacts > 0)):
-            chosen = np.flatnonzero(where)
-            kept[f"mae_{name}"] = scores_of(posterior, test.rows(chosen))["mae"] if chosen.size else None
     if posterior.is_black_box:
         return kept
     kept |= {name: value for name, value in out.items() if name.startswith(("force_mae.", "normal_force"))}

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.force_priors.experiments import (
-    DataEfficiency,
-    Friction,
-    OtherLaws,
-    Transfer,
-    UnilateralContact,
-)
+from benchmarks.force_priors.experiments import DataEfficiency, Friction, OtherLaws, Transfer
 from benchmarks.force_priors.trials import ForceExperiment
 from benchmarks.paper.experiment import DataSettings
 from benchmarks.paper.fits import FitSettings
@@ -31,11 +25,10 @@ PRESETS: dict[str, tuple[ForceExperiment, ...]] = {
         Friction(points=(200,), **FORCES),
         OtherLaws(points=(200,), **{**FORCES, "seeds": SEEDS[:3]}),
         Transfer(points=(100,), **FORCES),
-        UnilateralContact(points=(200,), **FORCES),
     ),
     TRIAL: (
         DataEfficiency(points=(10, 20), region_points=20, **SMALL),
-        *(kind(points=(20,), **SMALL) for kind in (Friction, OtherLaws, Transfer, UnilateralContact)),
+        *(kind(points=(20,), **SMALL) for kind in (Friction, OtherLaws, Transfer)),
     ),
 }
 

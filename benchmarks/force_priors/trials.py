@@ -41,8 +41,6 @@ _SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             "drift": "dry friction that falls by 30 % as the gears warm up",
         }.items()
     },
-    "bullet": ("PyBullet's unilateral contact", {"contact": "bullet"}),
-    "patch": ("viscous, four times as much on a strip", {"patch_factor": 4.0}),
 }
 SCENARIOS = {name: fields for name, (_, fields) in _SCENARIOS.items()}
 """Name -> fields of `KukaSurfaceConfig`."""
@@ -170,8 +168,6 @@ COLUMNS = {
     "normal_force_error": ("normal force, relative RMSE", 4),
     "normal_force_coverage": ("normal force in 95 % band", 3),
     "component_sum_error": ("sum of components [Nm]", 4),
-    "mae_touching": ("MAE touching", 4),
-    "mae_in_the_air": ("MAE in the air", 4),
 }
 """Score -> heading and decimals."""
 

@@ -80,7 +80,6 @@ def test_scores_are_what_they_say(rubbing):
         own = components[name].joint_force.mean.numpy()
         assert found[f"force_mae.{name}"] == pytest.approx(np.abs(own - test.truth[truth]).mean(), rel=1e-9)
     assert found["force_mae.joint-friction"] != found["force_mae.load-friction"]
-    assert "mae_touching" not in found
 
 
 def test_a_force_of_everything_is_not_compared_with_a_part(rubbing):
@@ -88,18 +87,6 @@ def test_a_force_of_everything_is_not_compared_with_a_part(rubbing):
     _, test = rubbing
     posterior = fit(test.model.with_forces(JointForces()), test, restarts=1, options=OptimizerOptions(iterations=0))
     assert not [name for name in force_jobs.scores(posterior, test) if name.startswith("force_mae")]
-
-
-def test_rows_in_the_air_are_scored_by_themselves(rubbing):
-    posterior, test = rubbing
-    touching = np.arange(len(test)) % 3 > 0
-    marked = replace(test, truth={**test.truth, "in_contact": touching[:, None].astype(float)})
-    found = force_jobs.scores(posterior, marked)
-    error = np.abs(posterior.predict(test.q, test.v, test.u).mean.numpy() - test.a)
-    assert found["mae_touching"] == pytest.approx(error[touching].mean(), rel=1e-9)
-    assert found["mae_in_the_air"] == pytest.approx(error[~touching].mean(), rel=1e-9)
-    everywhere = replace(test, truth={**test.truth, "in_contact": np.ones((len(test), 1))})
-    assert force_jobs.scores(posterior, everywhere)["mae_in_the_air"] is None
 
 
 def test_forces_are_scored_under_the_contacts_of_the_test(rubbing):
@@ -178,13 +165,3 @@ def test_data_jobs_hold_the_rows_they_promise(results, motion, tmp_path):
     assert np.array_equal(kept.q, motion.q[::12])
     force_jobs.simulate(results, spec | {"rows": 9}, tmp_path)
     assert np.array_equal(Dataset.load(tmp_path / force_jobs.FILE).q, farthest_rows(motion, 9).q)
-
-
-def test_training_rows_of_a_contact_that_opens_are_in_contact(results, tmp_path):
-    pytest.importorskip("pybullet")
-    spec = {"scenario": {"contact": "bullet"}, "seed": 2, "seconds": 4, "rows": 60, "every": 12}
-    told = force_jobs.simulate(results, spec, tmp_path)
-    kept = Dataset.load(tmp_path / force_jobs.FILE)
-    assert 0.5 < told["in_contact_truth"] < 1.0
-    assert abs(told["in_contact_detected"] - told["in_contact_truth"]) < 0.05
-    assert float(kept.truth["in_contact"].mean()) > 0.98

@@ -3,7 +3,7 @@
 import io
 
 import pytest
-from benchmarks.force_priors.experiments import Transfer, UnilateralContact
+from benchmarks.force_priors.experiments import Transfer
 from benchmarks.force_priors.trials import (
     TEST_SEED,
     ForceExperiment,
@@ -103,20 +103,6 @@ def test_transfer_is_told_relative_to_where_it_was_learned(results):
     assert f"| tool friction | 10 | {plane} | {tilted} | 0.4800 (0.4200–0.5400) [3.00] |" in page
     assert page.count(f"| {plane} |") == 5
     assert page.count("[4.00]") == 2  # free motion, for both models of joint friction
-
-
-def test_shares_of_contact_are_medians_over_seeds(results):
-    bullet = experiment(UnilateralContact)
-    for seed, share in ((7, 0.8), (8, 0.9), (9, 0.7)):
-        job = bullet.data_job("bullet", seed, training=True)
-        keep(results, job.name, {}, {"in_contact_truth": share, "in_contact_detected": share - 0.1})
-        for trial in bullet.trials():
-            store(results, trial, seed, {"bullet": {"mae": 0.5, "mae_in_the_air": None}})
-    summary = bullet.summary(results)
-    assert summary["in_contact_truth"]["median"] == 0.8
-    page = bullet.section(summary)
-    assert "0.800 (0.700–0.900) of the rows are in contact, 0.700 (0.600–0.800) are found" in page
-    assert "| tool friction | 10 | 0.5000 (0.5000–0.5000) | – | – | – | – | – |" in page
 
 
 def trial(label, **tests):

@@ -79,8 +79,6 @@ def test_joints_without_friction_resist_nothing(curves):
     [
         (ContactFriction(), {"friction": "stribeck"}),  # not proportional to the load
         (ContactFriction(load=True, expected=0.2), {}),  # viscous friction does not grow with it
-        (ContactFriction(), {"patch_factor": 4.0}),
-        (ContactFriction(), {"contact": "bullet"}),
         (ContactFriction(axes="two-axis"), {}),
         (ContactFriction(viscous=True, inputs=("position",)), {}),
         (ToolForces(), {}),

@@ -232,7 +232,7 @@ WRONG = {
     "ColumnMapping": {"step": "x"},
     "ColumnMapping ": {"unit": 5},
     "ImportOptions": {"gap": "x"},
-    "KukaSurfaceConfig": {"patch_factor": None},
+    "KukaSurfaceConfig": {"tool_mass": None},
     "Windows": {"signal": np.ones(3)},
     "JointFriction": {"joints": torch.tensor(5.0)},
 }

@@ -40,8 +40,7 @@ def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
 def test_velocity_and_acceleration_of_the_bent_path_are_derivatives(kind):
     config = KukaSurfaceConfig(surface=kind)
     start = np.array([0.1, 0.5, 0.3])
-    generators = np.random.default_rng(3), np.random.default_rng(4)
-    path = PathOverTable.random(config, table_of(config), start, 4.0, *generators)
+    path = PathOverTable.random(config, table_of(config), start, 4.0, np.random.default_rng(3))
     np.testing.assert_allclose(path.sample(np.array([0.0]))[0][0], start, atol=1e-14)
     time, step = np.linspace(0, 4, 1001)[1:-1], 1e-6
     before, after = path.sample(time - step), path.sample(time + step)

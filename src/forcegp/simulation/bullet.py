@@ -20,7 +20,7 @@ class BulletArm:
     and `joints` (link numbers) are PyBullet's module and its names for this simulation.
 
     Everything else that PyBullet would add is off: joint motors, joint limits and joint damping of the URDF, damping of
-    links; collisions need shapes in the URDF and a second body (`BulletContact`). Without them one step is
+    links. So one step is
     `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`. Use it as a context manager; leaving it
     disconnects. Raises MissingExtra without PyBullet, and SimulationError for a link whose inertia is not along its
     axes.

@@ -19,17 +19,13 @@ from forcegp.robots import Robot
 from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.contact_forces import (
-    BulletContact,
     DryFriction,
     IdealContact,
-    NoContact,
     PointFriction,
-    RoughPatch,
     ViscousFriction,
-    with_tool_sphere,
 )
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, recorded, table_of
+from forcegp.simulation.trajectory import PathOverTable, TaskSpaceController, recorded, table_of
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
@@ -100,7 +96,7 @@ multiplier), and in_contact, gap [m] and saturated."""
 
 
 def random_stream(config: KukaSurfaceConfig, episode: int, stream: int) -> np.random.Generator:
-    """Stream 0 draws way-points, 1 noise, 2 lifts: independent of each other and of other episodes and seeds."""
+    """Stream 0 draws way-points, 1 noise: independent of each other and of other episodes and seeds."""
     return np.random.default_rng([config.seed, episode, stream])
 
 
@@ -115,15 +111,12 @@ def simulate_episode(
     limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
     joint_law = config.joint_law(robot)
     columns: dict[str, np.ndarray] = {}
-    if config.contact == "bullet":
-        urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
-
     with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
         arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))
-        contact = _contact(config, table, arm)
-        streams = (random_stream(config, episode, stream) for stream in (0, 2))
+        law = None if config.surface == "none" else tool_friction_of(config)
+        contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
         tool = arm.tool(np.zeros(7))[0]
-        path = PathOverTable.random(config, table, tool, steps * config.time_step, *streams)
+        path = PathOverTable.random(config, table, tool, steps * config.time_step, random_stream(config, episode, 0))
         reference = path.sample(config.time_step * np.arange(steps))
         for step in range(steps):
             aim = reference[0][step], reference[1][step], reference[2][step]
@@ -164,15 +157,6 @@ def simulate_episode(
     columns["a"] = np.diff(columns["v"], axis=0, append=last_v[None]) / config.time_step
     columns["time"] = config.time_step * np.arange(steps)
     return {name: values[settle:] for name, values in columns.items()}
-
-
-def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> NoContact | IdealContact | BulletContact:
-    if config.surface == "none":
-        return NoContact()
-    if config.contact == "bullet":
-        return BulletContact(arm, table, config.coulomb_coefficient)
-    patch = None if config.patch_factor == 1.0 else RoughPatch(*config.patch_x, factor=config.patch_factor)
-    return IdealContact(table, tool_friction_of(config), config.baumgarte_omega, config.baumgarte_zeta, patch)
 
 
 def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
@@ -232,7 +216,7 @@ def _require_useful(config: KukaSurfaceConfig, robot: Robot, motion: Motion, epi
     """Refuse rows that an ideal robot on an ideal plane would not give."""
     remedy = "Use the published constants, or slower segments (segment_seconds) and way-points within reach."
     gap = float(np.abs(motion["gap"]).max())
-    if config.surface != "none" and config.contact == "ideal" and not gap < LARGEST_GAP:
+    if config.surface != "none" and not gap < LARGEST_GAP:
         raise SimulationError(f"episode {episode}: the tool leaves the surface by {gap:.3g} m. {remedy}")
     lower, upper = np.array([(joint.lower, joint.upper) for joint in robot.joints]).T
     excess = np.maximum(lower - motion["q"], motion["q"] - upper).max(axis=0)
@@ -250,9 +234,7 @@ def _model(config: KukaSurfaceConfig, robot: Robot) -> Model:
     contacts = ()
     if config.surface != "none":
         contacts = (Contact(TOOL_LINK, config.tool_point, table_of(config).surface()),)
-    # PyBullet's contact does not follow Baumgarte's law.
-    stabilised = contacts and config.contact == "ideal"
-    baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if stabilised else None
+    baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if contacts else None
     return Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
 
 
@@ -263,8 +245,6 @@ def _truth(config: KukaSurfaceConfig, column: Callable[[str], np.ndarray]) -> di
         truth["lambda"] = column("multiplier")[:, None]
         parts["Q_U.tool-friction"] = column("tool_torques")
         truth["force.tool-friction"] = column("tool_force")
-    if config.contact == "bullet":
-        truth["in_contact"] = column("in_contact")[:, None].astype(np.float64)
     if config.joint_friction != "none":
         parts["Q_U.joint-friction"] = column("joint_torques")
     return {**truth, **parts, "Q_U": sum(parts.values(), np.zeros_like(truth["a"]))}

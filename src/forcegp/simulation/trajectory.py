@@ -168,12 +168,11 @@ class PathOverTable:
         start: Float[np.ndarray, "3"],
         seconds: float,
         rng: np.random.Generator,
-        lifts: np.random.Generator,
     ) -> PathOverTable:
         """`random_path` over the table, from the true place `start` [m]."""
         origin = np.array(start, dtype=np.float64)
         origin[2] -= table.height(origin[None, :2])[0][0]
-        return cls(random_path(config, origin, seconds, rng, lifts), table)
+        return cls(random_path(config, origin, seconds, rng), table)
 
     def sample(self, time: Float[np.ndarray, " times"]) -> Motions:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; z and h by the chain rule."""
@@ -188,23 +187,14 @@ class PathOverTable:
 
 
 def random_path(
-    config: KukaSurfaceConfig,
-    start: Float[np.ndarray, "3"],
-    seconds: float,
-    rng: np.random.Generator,
-    lifts: np.random.Generator | None = None,
+    config: KukaSurfaceConfig, start: Float[np.ndarray, "3"], seconds: float, rng: np.random.Generator
 ) -> SegmentPath:
-    """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s].
-
-    `lifts` draws which of them lie `config.lift_height` higher (none without it); it is a generator of its own so that
-    equal seeds visit equal places with and without lifts.
-    """
+    """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s]."""
     points, durations = [np.asarray(start, dtype=np.float64)], []
     while sum(durations) < seconds:
         durations.append(rng.uniform(*config.segment_seconds))
-        lifted = lifts is not None and lifts.random() < config.share_of_lifts
-        height = config.waypoint_height + (config.lift_height if lifted else 0.0)
-        points.append(np.array([rng.uniform(*config.waypoint_x), rng.uniform(*config.waypoint_y), height]))
+        x, y = rng.uniform(*config.waypoint_x), rng.uniform(*config.waypoint_y)
+        points.append(np.array([x, y, config.waypoint_height]))
     corners, times = np.array(points), np.array(durations)
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     accelerations = np.maximum(config.least_acceleration, 4.0 * lengths / times**2)
