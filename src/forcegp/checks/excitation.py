@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 
-from forcegp.checks.check_input import CheckInput, numbers_of
+from forcegp.checks.check_input import CheckInput
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, ok
 from forcegp.errors import InvalidInput
@@ -55,7 +54,7 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
         yield ok(about="noise", what="the positions show no noise worth a filter.")
         return
-    before, after = (numbers_of(measured[when]) for when in ("before", "after"))
+    before, after = (np.array(measured[when], float) for when in ("before", "after"))
     spread = np.std(inputs.prepared.a, axis=0)
     if np.isfinite(after).any():
         when = " when this dataset was prepared" if inputs.cutoff is None else ""
@@ -89,15 +88,6 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
             do="Move faster, filter lower, or learn from torques instead of accelerations.",
             joints=names,
         )
-
-
-def torque_noise(inputs: CheckInput, noise: np.ndarray) -> np.ndarray | None:
-    """Standard deviation of M times the noise of a [Nm or N]."""
-    if inputs.robot is None:
-        return None
-    with torch.no_grad():
-        M = inputs.robot.mass_matrix(torch.tensor(inputs.rows().q, device=inputs.robot.device)).cpu().numpy()
-    return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
 
 
 WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)

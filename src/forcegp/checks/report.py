@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput, numbers_of
-from forcegp.checks.excitation import excitation_doubts, noise_doubts, stated_noise_doubts, torque_noise
+from forcegp.checks.check_input import CheckInput
+from forcegp.checks.excitation import excitation_doubts, noise_doubts, stated_noise_doubts
 from forcegp.checks.moving_base import (
     base_doubts,
     carried_doubts,
@@ -16,8 +16,8 @@ from forcegp.checks.moving_base import (
     unmeasured_base_doubts,
 )
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
-from forcegp.checks.torque_doubts import Hypothesis, best_hypothesis, not_compared, torque_doubts
-from forcegp.checks.torques import parameter_doubts
+from forcegp.checks.torque_doubts import corrected, not_compared, torque_doubts
+from forcegp.checks.torques import Comparison, parameter_doubts, torque_noise
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -44,7 +44,7 @@ class CheckReport(Summary):
 
     doubts: Doubts
     inputs: CheckInput
-    comparison: Hypothesis | None
+    comparison: Comparison | None
 
     def facts(self) -> dict[str, object]:
         """The subjects of the doubts, by level."""
@@ -58,18 +58,18 @@ class CheckReport(Summary):
         the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
         """
         nothing: list[Any] = [None] * self.inputs.log.nv
-        columns = {"joint": list(self.inputs.names), "unexplained": nothing, "residual": nothing, "factor": nothing}
+        names = ("unexplained", "residual", "factor", "noise_before", "noise_after", "noise_torque")
+        columns = {"joint": list(self.inputs.names), **dict.fromkeys(names, nothing)}
         if self.comparison is not None:
-            fit = self.comparison.fit
+            fit, spread = self.comparison.fit, np.std(self.comparison.rows.u, axis=0)
             columns["unexplained"] = plain(fit.unexplained)
-            predicted = fit.at(self.comparison.robot, self.comparison.tau, self.comparison.rows)
-            columns["residual"] = plain(np.std(self.comparison.rows.u - predicted, axis=0))
+            columns["residual"] = plain(np.sqrt(fit.unexplained) * spread)
             columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
-        report = {} if self.inputs.prepared is None else self.inputs.price
-        noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
-        columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
-        torque = torque_noise(self.inputs, numbers_of(noise["after"])) if self.inputs.prepared is not None else None
-        columns["noise_torque"] = nothing if torque is None else plain(torque)
+        if (noise := self.inputs.price.get("acceleration_noise")) is not None:
+            columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
+            if (robot := self.inputs.robot) is not None:
+                after = np.array(noise["after"], float)
+                columns["noise_torque"] = plain(torque_noise(robot, self.inputs.rows(), after))
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class CheckReport(Summary):
         return {
             "level": self.doubts.level,
             "counts": counts,
-            "cutoff": None if self.inputs.prepared is None else self.inputs.price.get("cutoff"),
+            "cutoff": self.inputs.price.get("cutoff"),
             "joints": self.per_joint(),
             "doubts": [doubt.to_dict() for doubt in self.doubts],
         }
@@ -128,7 +128,7 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
-def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Hypothesis | None]:
+def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Comparison | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
     doubts = [*signal_doubts(inputs), *stated_noise_doubts(inputs)]
     if inputs.log.time_ordered:
@@ -141,11 +141,11 @@ def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Hypot
     if inputs.robot is None or inputs.contacts:
         return [*doubts, not_compared(inputs)], None
     if inputs.log.u.any() and not contacts:
-        comparison, corrections = best_hypothesis(inputs)
-        compared = list(torque_doubts(inputs, comparison))
+        comparison, corrections = corrected(inputs)
+        compared = torque_doubts(inputs, comparison)
         noise = inputs.compared_noise
         if noise is not None and ("torque unit", "wrong") not in {(each.about, each.level) for each in compared}:
-            numbers = parameter_doubts(comparison.robot, comparison.without_laws(comparison.rows), noise)
+            numbers = parameter_doubts(comparison.robot, comparison.changed(inputs.rows()), noise)
             compared = [each for each in compared if not numbers or each.about != "torque unit"] + numbers
         doubts += [*corrections, *compared]
     return doubts, comparison
