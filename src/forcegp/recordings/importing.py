@@ -14,7 +14,7 @@ import forcegp.mechanics
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset, is_dataset
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
-from forcegp.recordings.arrays import ArrayFile, HDF5Arrays, NumpyArchive, matlab_file
+from forcegp.recordings.arrays import ARRAYS, ArrayFile
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.recording import Recording, read_recording
 from forcegp.recordings.ros_bag import RosBag
@@ -271,12 +271,6 @@ class SideBySide(Source):
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")
-ARRAYS: dict[str, Callable[..., ArrayFile]] = {
-    ".npz": NumpyArchive,
-    ".mat": matlab_file,
-    ".h5": HDF5Arrays,
-    ".hdf5": HDF5Arrays,
-}
 TABLES: dict[str, Callable[[Path], Source]] = {
     ".parquet": ParquetFile,
     ".pq": ParquetFile,
@@ -308,7 +302,7 @@ def open_source(
     if kind in ARRAYS:
         if kind != ".npz" and is_dataset(path):
             raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
-        return ARRAYS[kind](path, within=within)
+        return ArrayFile(path, ARRAYS[kind], within=within)
     return RosBag(path) if kind == "ros2" else TABLES[kind](path)
 
 
