@@ -324,8 +324,6 @@ def not_compared(inputs: CheckInput) -> Doubt:
     """The doubt where torques cannot be compared."""
     seen = "not compared with inverse dynamics: "
     if inputs.contacts:
-        seen += (
-            "the robot touches something, and the forces of contacts are not known. Check free motion, too."
-        )
+        seen += "the robot touches something, and the forces of contacts are not known. Check free motion, too."
         return ok(about="torque", what=seen)
     return look(about="torque", what=f"{seen}no robot was given.", do="Give the robot: `model`.")

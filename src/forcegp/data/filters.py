@@ -204,13 +204,16 @@ def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q
     return replace(dataset, **changed, truth=dataset.truth if set(signals) == {"a"} else {}, noise_std=noise_std)
 
 
-def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
-    """The dataset with each actuator's force taken so many seconds later, after a lag [s] where one is given."""
-    ways = [Lag(lag) >> Later(each) for each, lag in zip(seconds, lags or [0.0] * len(seconds), strict=True)]
+def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[int] | None = None) -> Dataset:
+    """The dataset with the forces of actuators taken `delay` s later, after a `lag` [s] of those columns, or of all."""
+    count = actuators(dataset)
+    columns = list(range(count)) if lagging is None else list(lagging)
 
     def acting(rows: Dataset, label: str) -> dict[str, np.ndarray]:
-        moved = [way(rows.u[:, joint], rows.time) for joint, way in enumerate(ways)]
-        return {"u": np.column_stack([*moved, rows.u[:, len(moved) :]])}
+        u = rows.u.copy()
+        u[:, columns] = Lag(lag)(u[:, columns], rows.time)
+        u[:, :count] = Later(delay)(u[:, :count], rows.time)
+        return {"u": u}
 
     return replace(dataset, **by_episode(dataset, acting), truth={})
 

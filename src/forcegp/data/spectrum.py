@@ -230,7 +230,7 @@ def _judged(
         return differentiated(low_pass(log, frequency, signals=signals), source)
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), robot).common)  # the best guess, sure or not
-    log = shifted(log, np.full(log.nv, delay))
+    log = shifted(log, float(delay))
     away = SETTLED / tried[0] + abs(delay)
     times = [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
