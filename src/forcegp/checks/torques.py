@@ -38,13 +38,14 @@ class TorqueFit:
 
     `unexplained` is the share of the torque's variance that is left, NaN for a torque that never changes; `friction`
     that without inverse dynamics and armature, `plain` that without armature, whose s is `factor`: where tau is nearly
-    proportional to a, s and I cannot be separated.
+    proportional to a, s and I cannot be separated. `coefficients` (nv, 5) are s, I, d, c, o.
     """
 
     unexplained: Float[np.ndarray, " nv"]
     friction: Float[np.ndarray, " nv"]
     plain: Float[np.ndarray, " nv"]
     factor: Float[np.ndarray, " nv"]
+    coefficients: Float[np.ndarray, "nv 5"]
 
     @property
     def rests_on_robot(self) -> Bool[np.ndarray, " nv"]:
@@ -72,9 +73,13 @@ class Comparison:
 
     def changed(self, dataset: Dataset) -> Dataset:
         """Other rows after the same changes, whose u lacks what the known laws need."""
+        dataset = self._changed(dataset)
+        return replace(dataset, u=dataset.u - _torques_of_laws(self, dataset)) if self.laws else dataset
+
+    def _changed(self, dataset: Dataset) -> Dataset:
         for change in self.changes:
             dataset = change(dataset)
-        return replace(dataset, u=dataset.u - _torques_of_laws(self, dataset)) if self.laws else dataset
+        return dataset
 
     @cached_property
     def tau(self) -> Float[np.ndarray, "rows nv"]:
@@ -96,7 +101,13 @@ class Comparison:
         every, plain, friction = np.array(
             [_fitted(self.columns[:, k], u[:, k], (0, 1, 2, 3), (0, 2, 3), (2, 3)) for k in range(self.rows.nv)]
         ).transpose(1, 2, 0)
-        return TorqueFit(unexplained=every[0], friction=friction[0], plain=plain[0], factor=plain[1])
+        shares = {"unexplained": every[0], "friction": friction[0], "plain": plain[0]}
+        return TorqueFit(**shares, factor=plain[1], coefficients=every[1:].T)
+
+    def at(self, dataset: Dataset) -> tuple["Comparison", Float[np.ndarray, "rows nv"]]:
+        """Of other rows after the same changes, and their torques as fitted here."""
+        other = replace(self, rows=self._changed(dataset))
+        return other, (other.columns * self.fit.coefficients[:, :4]).sum(-1) + self.fit.coefficients[:, 4]
 
     def shares(self) -> Float[np.ndarray, "nv nv"]:
         """Share of each torque (column) that tau, v and a of each joint (row) leave; NaN if constant."""
@@ -123,15 +134,15 @@ def _torques_of_laws(log: Comparison, rows: Dataset) -> Float[np.ndarray, "rows 
 
 def _fitted(
     columns: Float[np.ndarray, "rows 4"], u: Float[np.ndarray, " rows"], *choices: tuple[int, ...]
-) -> list[tuple[float, float]]:
-    """For each choice of columns: the unexplained share, and the factor of the first column.
+) -> list[np.ndarray]:
+    """For each choice of columns (6,): the unexplained share, their coefficients, and the constant.
 
     The free constant takes the means out of both sides.
     """
     centered, target = columns - columns.mean(axis=0), u - u.mean()
     size, spread, found = np.linalg.norm(centered, axis=0), float(np.square(target).sum()), []
     for chosen in choices:
-        factor, share = 0.0, 1.0
+        solution, share = np.append(np.zeros(4), u.mean()), 1.0
         used = [column for column in chosen if size[column] > 1e-9 * max(float(size.max()), 1e-300)]
         if not spread > CONSTANT * max(float(np.square(u).sum()), 1e-300):
             share = np.nan
@@ -139,9 +150,10 @@ def _fitted(
             basis, triangle = np.linalg.qr(centered[:, used] / size[used])
             right = basis.T @ target
             factors, left = nnls(triangle, right)
-            factor = float(factors[0] / size[0]) if used[0] == 0 else 0.0
+            solution[used] = factors / size[used]
+            solution[4] -= float(columns.mean(axis=0) @ solution[:4])
             share = float((left**2 + np.square(target - basis @ right).sum()) / spread)
-        found.append((share, factor))
+        found.append(np.append(share, solution))
     return found
 
 
