@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from forcegp.data import Dataset, Preparation, farthest_rows, resample, units_for
+from forcegp.data import Dataset, Preparation, farthest_rows, resample
 from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import DataWarning, NumericalWarning
 from forcegp.evidence import Windows
@@ -116,8 +116,7 @@ def _dataset(model: Model, episodes: list[tuple[np.ndarray, np.ndarray, np.ndarr
     time, q, u = (np.concatenate(parts) for parts in zip(*episodes, strict=True))
     v = np.concatenate([np.gradient(q, time, axis=0) for time, q, _ in episodes])
     numbers = np.concatenate([np.full(len(time), k) for k, (time, *_) in enumerate(episodes)])
-    robot = model.robot
-    return Dataset(q=q, v=v, u=u, a=np.zeros_like(q), time=time, episode=numbers, units=units_for(robot), model=model)
+    return Dataset(q=q, v=v, u=u, a=np.zeros_like(q), time=time, episode=numbers, model=model)
 
 
 def coarse(rig: Rig, counts: int) -> Rig:

@@ -132,41 +132,21 @@ def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
 # ---------------------------------------------------------------- units and model
 
 
-@pytest.mark.parametrize(
-    ("units", "message"),
-    [
-        ({}, "must name exactly"),
-        ({**REVOLUTE_UNITS, "force": "N"}, "must name exactly"),
-        ({**REVOLUTE_UNITS, "q": "deg"}, "deg.*Convert"),
-        ({**REVOLUTE_UNITS, "q": "m"}, "joint 'shoulder' has units"),
-        ({**REVOLUTE_UNITS, "time": "ms"}, "only 's'"),
-        ({**REVOLUTE_UNITS, "q": ("rad",)}, "one text or 2 of them"),
-    ],
-)
-def test_units_that_do_not_fit_are_refused(units, message):
-    with pytest.raises(DatasetError, match=message):
-        dataset(units=units)
-
-
 def test_units_may_differ_between_joints():
-    units = {
-        "q": ("rad", "m"),
-        "v": ("rad/s", "m/s"),
-        "u": ("Nm", "N"),
-        "a": ("rad/s^2", "m/s^2"),
-        "time": "s",
-    }
-    assert dataset(units=units).units == units
-    assert units_for(model("prismatic").robot) == units
-    assert units_for(model().robot) == REVOLUTE_UNITS
+    units = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "u": ("Nm", "N"), "a": ("rad/s^2", "m/s^2"), "time": "s"}
+    assert dataset(sliding=("elbow",)).units == units_for(model("prismatic").robot) == units
+    assert dataset().units == units_for(model().robot) == REVOLUTE_UNITS
+    assert dataset(model=model("prismatic")).sliding == ("elbow",)
+    with pytest.raises(DatasetError, match=r"sliding joints are \['wrist'\]; joints are"):
+        dataset(sliding=("wrist",))
 
 
 def test_a_system_must_have_the_same_joints_and_units():
     assert dataset(model=model()).model is not None
     with pytest.raises(DatasetError, match="in the robot's order"):
         dataset(model=model(), joint_names=("elbow", "shoulder"))
-    with pytest.raises(DatasetError, match="joint types of 'slider'"):
-        dataset(model=model("prismatic"))
+    with pytest.raises(DatasetError, match=r"sliding joints are \[\]; those of '.*' are \['elbow'\]"):
+        dataset(model=model("prismatic"), sliding=())
     with pytest.raises(DatasetError, match="3 columns; the model has 0 contacts"):
         dataset(model=model(), truth={"lambda": np.zeros((40, 3))})
 

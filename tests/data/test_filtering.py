@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from tests.data.samples import arrays, dataset
 
 from forcegp.data import (
-    REVOLUTE_UNITS,
     Dataset,
     Lag,
     Later,
@@ -36,7 +35,6 @@ def motion(time: np.ndarray = TIME, **changes: object) -> Dataset:
         "u": np.stack([np.cos(time), np.sin(time)], 1),
         "time": time,
         "joint_names": ("one", "two"),
-        "units": REVOLUTE_UNITS,
         **changes,
     }
     return Dataset(**fields)

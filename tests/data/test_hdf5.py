@@ -29,8 +29,7 @@ def test_everything_comes_back(file):
 
 
 def test_a_sample_out_of_order_and_units_per_joint_come_back(tmp_path):
-    units = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "u": ("Nm", "N"), "a": ("rad/s^2", "m/s^2"), "time": "s"}
-    data = dataset(units=units, truth={"lambda": np.zeros((40, 0))}).rows([9, 2, 30])
+    data = dataset(sliding=("elbow",), truth={"lambda": np.zeros((40, 0))}).rows([9, 2, 30])
     data.save(tmp_path / "log.h5")
     assert_equal(Dataset.load(tmp_path / "log.h5"), data)
 

@@ -11,7 +11,6 @@ from tests.data.samples import assert_equal, dataset
 from tests.posterior.arm import arm_model
 
 from forcegp.data import (
-    REVOLUTE_UNITS,
     Dataset,
     Lag,
     Preparation,
@@ -41,7 +40,7 @@ def noisy(seconds: float = 12.0, seed: int = 0, sigma: float = SIGMA, rate: floa
     time = np.arange(round(seconds * rate)) / rate
     q, _, a = swings(time, seed)
     measured = q + sigma * np.random.default_rng(seed + 100).normal(size=q.shape)
-    raw = Dataset(q=measured, v=0 * q, u=q, a=0 * q, time=time, joint_names=("one", "two"), units=REVOLUTE_UNITS)
+    raw = Dataset(q=measured, v=0 * q, u=q, a=0 * q, time=time, joint_names=("one", "two"))
     return differentiated(raw, "q"), a
 
 

@@ -168,7 +168,7 @@ WRONG = {
     "predictor": {"tolerance": "0.1"},
     "predictor()": {"q": "abc"},
     "rollout": {"baumgarte": 3},
-    "Dataset": {"units": 5},
+    "Dataset": {"sliding": 5},
     "Dataset ": {"model": ()},
     "Dataset.rows": {"index": torch.ones(3, requires_grad=True)},
     "Dataset.load": {"path": 7},

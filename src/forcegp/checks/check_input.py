@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
@@ -78,7 +77,7 @@ class CheckInput:
     @property
     def rotates(self) -> Bool[np.ndarray, " nv"]:
         """Whether a joint turns; others slide."""
-        return _angular(self.log)
+        return self.log.turns
 
     def named(self, joints: Iterable[int] | np.ndarray) -> tuple[str, ...]:
         """The names of the joints with these numbers."""
@@ -161,9 +160,8 @@ def _mended(dataset: Dataset) -> dict[str, Any]:
     mended = replace(dataset, **changed, truth={}) if changed else dataset
     change = np.abs(np.diff(mended.q, axis=0, append=mended.q[-1:]))
     change[~consecutive(mended)] = 0.0
-    angular = _angular(mended)
-    wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & angular
-    jumps = (change > np.pi) & angular & ~wraps
+    wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & mended.turns
+    jumps = (change > np.pi) & mended.turns & ~wraps
     return {"mended": mended, "dropped": dropped, "wraps": wraps, "jumps": jumps}
 
 
@@ -185,10 +183,6 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
-
-
-def _angular(dataset: Dataset) -> np.ndarray:
-    return np.array(unit_of_each("q", dataset.units["q"], dataset.nv)) == "rad"
 
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:

@@ -9,7 +9,6 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.delay import lowest
 from forcegp.data.views import consecutive, runs
 from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
@@ -326,8 +325,7 @@ def _differences(
         if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
         elif level == "wrong" and unit is not None and len(joints) == count:
-            now = unit_of_each("v", inputs.log.units["v"], inputs.log.nv)
-            units = [unit if joint in fits else own for joint, own in enumerate(now)]
+            units = [unit if joint in fits else own for joint, own in enumerate(inputs.log.unit_of_each("v"))]
             correction = {"unit": {"v": tuple(units[:1] if len(set(units)) == 1 else units)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}

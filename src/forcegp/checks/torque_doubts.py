@@ -15,7 +15,6 @@ from scipy.optimize import linear_sum_assignment
 from forcegp.checks.check_input import DEGREE, QUICK_ROWS, CheckInput
 from forcegp.checks.torques import Change, Comparison, TorqueFit, estimated_gravity, with_gravity
 from forcegp.data import Dataset, estimate_delay
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.summary import plain
@@ -192,7 +191,7 @@ def _of_gravity(now: Comparison) -> Iterator[Explanation]:
 
 def _degrees(given: Dataset, signal: str, turned: np.ndarray) -> tuple[str, ...]:
     """The unit of the signal of every joint, with degrees where `turned`."""
-    each = zip(unit_of_each(signal, given.units[signal], given.nv), turned, strict=True)
+    each = zip(given.unit_of_each(signal), turned, strict=True)
     return tuple(unit.replace("rad", "deg") if degrees else unit for unit, degrees in each)
 
 

@@ -14,7 +14,6 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.data.configurations import actuators, continuous, rates, space_of, through
 from forcegp.data.dataset import Dataset
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
@@ -344,8 +343,7 @@ def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
     space = space_of(rows)
     continuous(space, rows.q)
-    units = unit_of_each("q", rows.units["q"], rows.nv)
-    angular = [units[k] == "rad" for k in space.single_rows]
+    angular = rows.turns[space.single_rows]
     jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi
     if jumps.any():
         row, column = np.argwhere(jumps)[0]

@@ -95,7 +95,7 @@ def import_recordings(
     plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
-        if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):
+        if (other.joints, other.sliding, other.logged) != (plan.joints, plan.sliding, plan.logged):
             raise InvalidInput(
                 f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
             )
@@ -121,7 +121,7 @@ def import_recordings(
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
-    return Dataset(**columns, joint_names=plan.joints, units=plan.units, model=model, metadata={"import": done})
+    return Dataset(**columns, joint_names=plan.joints, sliding=plan.sliding, model=model, metadata={"import": done})
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.mechanics
 from forcegp import __version__
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.scenarios import KukaSurfaceConfig
@@ -268,7 +268,6 @@ def recorded(
             "a": motion["a"] + config.noise * noise,
         },
         episode=np.repeat(np.arange(config.episodes), steps),
-        units=units_for(model.robot),
         model=model,
         noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
         truth={"a": motion["a"], **truth},
