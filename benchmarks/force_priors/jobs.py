@@ -22,8 +22,7 @@ from forcegp.posterior import save_posterior
 from forcegp.posterior.prediction import Curve
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.contact_forces import DryFriction, ViscousFriction
-from forcegp.simulation.kuka_surface import tool_friction_of
+from forcegp.simulation.kuka_surface import DryFriction, ViscousFriction, tool_friction_of
 
 Law = Callable[[np.ndarray], np.ndarray]
 TRAIN_X, TEST_X = 0.0, 0.1  # training rows have their tool at x below the first, test rows above the second [m]

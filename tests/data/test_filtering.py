@@ -205,12 +205,3 @@ def test_resampling_of_uneven_rows():
     np.testing.assert_allclose(even.q, exact.q, atol=1e-6)
     np.testing.assert_allclose(even.v, exact.v, atol=1e-5)
     low_pass(even, 50.0)  # what the error message promises
-
-
-def test_resampling_keeps_the_rows_where_the_step_fits():
-    data = dataset(40, time=np.tile(0.01 * np.arange(20), 2), noise_std=np.ones(2), truth={"a": np.zeros((40, 2))})
-    again = resample(data, 0.01)
-    np.testing.assert_allclose(again.q, data.q, atol=1e-12)
-    np.testing.assert_array_equal(again.episode, data.episode)
-    assert again.truth == {}
-    assert again.noise_std is None
