@@ -130,7 +130,7 @@ ARMS = {
     "control/informative_motions",
     "forces/columns",
     "simulation/bullet",
-    "simulation/trajectory",
+    "simulation/joint_friction",
     "simulation/kuka_motion",
 }
 """Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""

@@ -15,8 +15,8 @@ from forcegp.forces.force import JointLaw
 from forcegp.forces.parameters import Coefficient
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.kuka_surface import DryFriction, ViscousFriction, multiplier_with_friction
-from forcegp.simulation.trajectory import LawsOfJoints
 
 STRIBECK = DryFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
 ROBOT = Robot.from_urdf_text(

@@ -10,8 +10,9 @@ from forcegp.data import Dataset
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.model import Model
 from forcegp.robots import Robot
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import FreeArmConfig
-from forcegp.simulation.trajectory import RATE, LawsOfJoints, recorded
+from forcegp.simulation.trajectory import RATE, recorded
 
 FINE = 4  # steps between two rows
 STIFFNESS = 100.0  # of the controller in 1/s^2, critically damped

@@ -20,8 +20,9 @@ from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import QuadrupedConfig
-from forcegp.simulation.trajectory import RATE, LawsOfJoints, recorded
+from forcegp.simulation.trajectory import RATE, recorded
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 STANCE = (0.0, 0.75, -1.5)  # roll, hip pitch and knee in rad

@@ -164,7 +164,7 @@ class KukaSurfaceConfig(CommonConfig):
 
     def joint_laws(self, robot: Any) -> Any:
         """The laws that `joint_friction` names (`LawsOfJoints`), with the numbers above where it gives none."""
-        from forcegp.simulation.trajectory import LawsOfJoints
+        from forcegp.simulation.joint_friction import LawsOfJoints
 
         more = tuple(near - level for near, level in zip(self.joint_static, self.joint_coulomb, strict=True))
         numbers: dict[str, Any] = {"damping": self.joint_viscous, "level": self.joint_coulomb, "breakaway": more}
