@@ -1,7 +1,6 @@
 """Pieces of work whose results are kept: `Job`, `JobStore`, a folder of finished jobs, and `run_jobs`.
 
-What decides a result is digested: the settings of a job, its inputs, all code of forcegp, and the files in the package
-of the task's own module where that is another. Other libraries are not; their versions stand in `machine`.
+What decides a result is digested: settings, inputs, all code of forcegp, and the package of the task's own module.
 """
 
 import hashlib

@@ -1,7 +1,6 @@
 """Doubts of the comparison of torques with inverse dynamics: wrong signs, joints, units; factor; delay; what is left.
 
-Each explanation corrects one error in a log. That under which inverse dynamics fits the torques best is reported if it
-leaves far less unexplained than the log as it is; then the next is sought, on top of it.
+The correction of one error that leaves far less unexplained is reported; then the next is sought, on top of it.
 """
 
 from collections.abc import Iterator
@@ -125,10 +124,7 @@ def _of_torques(now: Comparison, inputs: CheckInput) -> Iterator[Explanation]:
 
 
 def _of_motion(now: Comparison, inputs: CheckInput) -> Iterator[Explanation]:
-    """Angles in degrees; one joint in the other direction; two joints in each other's place.
-
-    Of many joints only those that fit badly are tried: an error in their own motion is possible.
-    """
+    """Angles in degrees; a joint in the other direction; two exchanged; of many joints those that fit badly."""
     nv, largest = len(inputs.names), np.abs(now.rows.q * inputs.rotates).max()
     few, places = nv <= ALL_TRIED, np.arange(nv)
 

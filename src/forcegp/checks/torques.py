@@ -1,12 +1,7 @@
 """Measured torques against inverse dynamics: how much of each the robot explains, by what factor, with which numbers.
 
-For every joint, `u = s tau(q, v, a) + I a + d v + c tanh(v / w) + o` with tau the inverse dynamics of the URDF, the
-laws of a rotor, viscous and dry friction (`forcegp.forces.columns`), and s, I, d, c >= 0, by non-negative least squares
-(Lawson & Hanson 1974): friction always brakes, and a robot that needs a negative factor was logged with a wrong sign.
-
-Inverse dynamics is a polynomial of each number of a robot, of degree 1 (masses, gravity, torque constants) or 2
-(lengths), and a trigonometric one of degree 2 in the zero of a turning joint. So a few evaluations give the torques for
-every value, and the value is found that leaves least of all torques unexplained, with s = 1.
+`u = s tau(q, v, a) + I a + d v + c tanh(v / w) + o` with s, I, d, c >= 0 (Lawson & Hanson 1974): friction always
+brakes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -135,10 +130,7 @@ def _torques_of_laws(log: Comparison, rows: Dataset) -> Float[np.ndarray, "rows 
 def _fitted(
     columns: Float[np.ndarray, "rows 4"], u: Float[np.ndarray, " rows"], *choices: tuple[int, ...]
 ) -> list[np.ndarray]:
-    """For each choice of columns (6,): the unexplained share, their coefficients, and the constant.
-
-    The free constant takes the means out of both sides.
-    """
+    """For each choice of columns (6,): the unexplained share, their coefficients, and the free constant."""
     centered, target = columns - columns.mean(axis=0), u - u.mean()
     size, spread, found = np.linalg.norm(centered, axis=0), float(np.square(target).sum()), []
     for chosen in choices:

@@ -1,9 +1,4 @@
-"""In which rows of a log a contact acts, and whether the rows bear out where it is and that it pushes.
-
-How the point moves shows whether it stays on its surface. Where the force acts shows in what is left of the
-accelerations once friction is fitted, by linear least squares: it is compared with the same under other contacts, with
-the point moved, or without any.
-"""
+"""In which rows of a log a contact acts, and whether motion and accelerations bear out where it is."""
 
 from __future__ import annotations
 
@@ -272,10 +267,7 @@ def _forces(rows: Dataset, model: forcegp.Model) -> list[Doubt]:
 
 
 class _Residual:
-    """What joint forces of friction (rows, nv, k), and points `moved` by STEP, leave of `a` under a model's contacts.
-
-    `grams` (blocks, nv, k, k) are products of all columns, the residual last, for successive blocks of rows.
-    """
+    """What friction (rows, nv, k), and points `moved` by STEP, leave of `a`, as products of all columns."""
 
     def __init__(
         self, rows: Dataset, model: forcegp.Model, friction: Tensor, moved: Sequence[forcegp.Model] = ()

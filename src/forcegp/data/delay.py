@@ -1,7 +1,4 @@
-"""How late forces are: torques that are logged later than they act (a delay), thrusters that act later (a lag).
-
-Of both, the number of seconds is taken at which inverse dynamics fits best.
-"""
+"""How late forces are: torques logged later than they act, thrusters that act later than their commands."""
 
 from __future__ import annotations
 

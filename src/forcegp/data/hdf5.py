@@ -1,7 +1,4 @@
-"""The dataset file: HDF5, version 1, described in docs/how-to/data-format.md.
-
-Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
-"""
+"""The dataset file: HDF5 (docs/how-to/data-format.md): numbers, texts and JSON, of which nothing is executed."""
 
 import json
 from collections.abc import Iterator, Mapping

@@ -139,10 +139,7 @@ BEYOND_BASE = 8.0
 
 
 def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, str]:
-    """What the spectrum shows and, where torques can tell, what they make of it [Hz]; and why.
-
-    Of a robot whose base stands on contacts, no joint counts far beyond the base.
-    """
+    """What the spectrum shows, not far beyond a base on contacts, and what torques make of it [Hz]; and why."""
     spectrum, model = motion_spectrum(dataset, source), dataset.model
     fastest = decisive = spectrum.cutoff
     for group in model.robot.layout.groups[:1] if model is not None and model.touching else ():

@@ -1,12 +1,4 @@
-"""Where motion ends and noise begins: power spectra of a log, its noise floor, and the cut-off that follows from them.
-
-Spectra are Welch's (1967, "The use of fast Fourier transform for the estimation of power spectra"), over segments of
-all episodes. Positions are differenced first and the spectrum divided by the gain of the differences, so that the
-slow, strong motion does not leak into the band of the noise (prewhitening; Percival & Walden 1993, section 6.5).
-
-Why the knee of the differentiated spectrum, the floor above it and the cut-off belong together:
-docs/how-to/checking.md.
-"""
+"""Where motion ends and noise begins: spectra (Welch 1967), noise floor and cut-off; see docs/how-to/checking.md."""
 
 from __future__ import annotations
 

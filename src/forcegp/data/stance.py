@@ -1,11 +1,6 @@
 """Which contacts with a switch act in which rows: from the motion of what they hold, and from the forces that it needs.
 
-A contact that acts holds `A v = 0`. The force that the rows ask of all contacts together is that of least squares,
-
-    lambda = argmin |L^-1 (M a - Q_K - A^T lambda)|,    M = L L^T,
-
-Gauss' principle turned round: where the base has no actuator, only feet explain its acceleration. Forces of feet that
-clearly move show what friction, loads and noise make of zero; feet at rest show what standing is.
+What the rows ask of all contacts is lambda = argmin |L^-1 (M a - Q_K - A^T lambda)|, M = L L^T: Gauss' principle.
 """
 
 from __future__ import annotations

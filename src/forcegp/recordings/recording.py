@@ -103,10 +103,7 @@ def read_recording(
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
-    """Seconds since the first row, and its stamp in s.
-
-    Whole numbers are subtracted as such: a float64 has no epochs in ns to 1 ns.
-    """
+    """Seconds since the first row, and its stamp in s; whole numbers are subtracted as such, to the last ns."""
     if plan.time is None:
         assert plan.step is not None
         return np.arange(rows) * plan.step, 0.0
@@ -230,9 +227,8 @@ def _stretches(
 ) -> tuple[Any, ...]:
     """Rows between gaps, their median step, its worst deviation, repeated stamps, gaps, and rows left out.
 
-    Rows in a pause of one topic of several are left out. Of rows with the same stamp the first is kept: what comes
-    after it is a sample that was sent again, or one whose time is not known. Raises DatasetError for time that runs
-    backwards, and for rates that no robot is logged at.
+    Of rows with the same stamp the first is kept. Raises DatasetError for time that runs backwards and impossible
+    rates.
     """
     begins = episodes[:, 1]
     steps = np.diff(time)

@@ -229,10 +229,7 @@ def _signals(
     joints: Sequence[str],
     turned: Collection[str],
 ) -> Iterator[JointSignal]:
-    """One signal in the order of the Dataset. `columns`: name and SI unit, in the order of the log.
-
-    `turned` are entries of bases that change sign.
-    """
+    """One signal in the order of the Dataset; `columns` (name, SI unit) in that of the log; `turned` change sign."""
     names = list(columns)
     plain = set(names) <= set(joints)
     if len(expressions) == 1 and len(names) > 1 and not expressions[0].weights:
