@@ -30,19 +30,14 @@ DISTANCE_DEVIATIONS = 20.0
 def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
     """Whether each contact of `dataset.model` acts in each row, from q, v and a alone; `truth` is not looked at.
 
-    A row counts if its point
-
-    1. moves along the surface: the velocity along the normal is at most 2 % of that along the surface plus 2 mm/s, plus
-       `omega |distance|` where the motion has Baumgarte's terms, which pull the point back;
-    2. follows the constraint: `|A a - b|` is at most 4.5 standard deviations, by `noise_std` or, where that is larger
-       or not known, by 1.48 times the median deviation of the rows that pass 1, but not less than 0.05 m/s^2;
-    3. is where contact happens: not farther than 5 mm from the surface, and not farther from the median distance of the
-       rows that pass 1 and 2 than 1 mm or 20 robust standard deviations of them, whichever is more.
-
-    Rows of an impact break 2 and do not count. A point at rest, or gliding along just above its surface, cannot be
-    distinguished from one in contact. A closed loop acts in every row, and a contact with a switch where its flag is.
-
-    Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
+    A row counts if its point moves along the surface (across it at most 2 % of that and 2 mm/s, plus what Baumgarte's
+    terms
+    recover), `|A a - b|` is at most 4.5 standard deviations (stated, or robust ones of these rows) or 0.05 m/s^2, and
+    it is
+    within 5 mm of the surface and where the other rows are (1 mm, or 20 robust standard deviations). A point at rest or
+    gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact with a switch
+    where
+    its flag is. Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
     model = dataset.model
     if model is None or not model.contacts:

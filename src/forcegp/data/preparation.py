@@ -108,11 +108,12 @@ class Preparation:
     def apply(self, dataset: Dataset) -> Dataset:
         """The prepared Dataset, with its price under "preparation" in the metadata.
 
-        The price holds the settings; "why" for what was chosen; "rows" and "sample_rate" [Hz] before and after; per
-        joint "acceleration_noise" before and after the filter [rad/s^2 or m/s^2] (None where the log shows no noise
-        floor); and the price that was paid "earlier". `truth` and `noise_std` are dropped as `low_pass` and
-        `differentiated` drop them. Raises DatasetError for rows that are out of order, sampled unevenly or too few, and
-        InvalidInput for a cut-off above half the sample rate.
+        The price holds the settings; "why"; "rows" and "sample_rate" [Hz] before and after; per joint
+        "acceleration_noise"
+        before and after the filter [rad/s^2 or m/s^2] (None without a noise floor); and the price that was paid
+        "earlier".
+        Raises DatasetError for rows out of order, uneven or too few, InvalidInput for a cut-off above half the sample
+        rate.
         """
         chosen = self.resolved(dataset)
         prepared, found = _prepared(chosen, dataset)

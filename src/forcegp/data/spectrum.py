@@ -188,14 +188,10 @@ def held_out_cutoff(
 ) -> tuple[float, dict[float, float]]:
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
-    A low cut-off smears dry friction and takes a part of what rotors need; a high one leaves noise in the acceleration,
-    under which every inertia looks too small (errors in variables). So a linear model of the torque is fitted behind
-    each cut-off, and all are judged alike: the model sees signals behind the highest one, in which friction is sharp,
-    and both its torque and the measured one then pass the lowest, which takes the noise (parallel filtering; Gautier,
-    "Dynamic identification of robots with power model", ICRA 1997).
-
-    Shares are geometric means over the joints, in time that was held out and below the lowest cut-off. `source` is
-    that of `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
+    A low cut-off smears dry friction, a high one leaves noise that makes inertias look too small. So a linear model is
+    learned behind each, and all are judged alike: signals behind the highest, torques behind the lowest (parallel
+    filtering; Gautier, ICRA 1997), in time that was held out, by geometric means over the joints. `source` is that of
+    `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
     """
     best, shares = _judged(dataset, robot, cutoff, source)
     if best in (min(shares), max(shares)):  # the best may lie beyond

@@ -23,17 +23,12 @@ from forcegp.recordings.source import Columns, Source
 class Recording:
     """What was read of one table.
 
-    Fields
-    ------
-    label: what people call it, a file or an array in it.
-    signals: those that were logged, (rows, entries) in SI, in the order of a Dataset.
-    time: (rows,) [s] from its first row on.
-    begin: the stamp of the log at the first row, in s.
-    stretches: episode number of the log and numbers of the rows, without gaps.
-    step: the median of the steps between rows that are used [s]; `worst` the largest relative deviation from it within
-        a stretch; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` [s].
-    jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
-        seen, and what to do.
+    `label` is what people call it; `signals` those that were logged, (rows, entries) in SI, in the order of a Dataset;
+    `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too far.
+    `stretches`
+    are episode number and rows without gaps, `step` their median step [s] and `worst` the largest relative deviation
+    from
+    it; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` in s.
     """
 
     label: str

@@ -312,15 +312,13 @@ LARGEST_SATURATED_SHARE = 0.01
 def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None = None) -> Dataset:
     """Simulate the scenario and return what was measured, with the ground truth.
 
-    Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded torque minus joint damping), and
-    the acceleration `(v[k+1] - v[k]) / time_step`, which PyBullet's integrator takes as constant over the step. So in
-    every row, with the true "a", "lambda" and "Q_U", `M(q) a + bias(q, v) = u + Q_U + A^T lambda` and `A a = b`.
-    All rows are in contact: the approach (`settle_seconds`) is left out. Nothing is cut at the end (the paper drops the
-    edge of its last segment; here the recording ends in mid-motion). Every episode is one continuous motion with its
-    own way-points; equal `seed` and episode number give equal motion, whatever `noise`, `seconds` and `episodes` are.
-
-    Raises MissingExtra without PyBullet, and SimulationError if the motion diverges, loses the surface, leaves the
-    joint limits or saturates the torques, which the published constants do not do.
+    Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded minus joint damping), and the
+    acceleration of the step. So with the true "a", "lambda" and "Q_U", `M(q) a + bias(q, v) = u + Q_U + A^T lambda` and
+    `A a = b` in every row. The approach (`settle_seconds`) is left out. Equal `seed` and episode number give equal
+    motion,
+    whatever `noise`, `seconds` and `episodes` are. Raises MissingExtra without PyBullet, and SimulationError if the
+    motion
+    diverges, loses the surface, leaves the joint limits or saturates the torques.
     """
     urdf = kuka_urdf(config)
     robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
