@@ -84,7 +84,7 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         windows = _Windows.of(dataset, own[[k for k, free in enumerate(group.motion.free) if free > 2]])
         q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
         at, v, a = q[:, group.places], v[:, group.rows], a[:, group.rows]
-        yield from _of_velocity(windows, group, at, v, _stated_axes(dataset), _stated_order(dataset))
+        yield from _of_velocity(windows, group, at, v, *_stated(dataset))
         each = v.unflatten(0, windows.rows.shape)
         change = (each[:, -1] - each[:, 0]) / windows.step
         error, size = _rms(change - windows.mean(a)), _rms(change)
@@ -111,11 +111,10 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
 
 
 def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
-    """A base that no foot, wheel, thruster or known force of the model moves, although it does not fall or drives."""
+    """A base that no foot, thruster or known force of the model carries, although it does not fall."""
     robot, groups = model.robot, model.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
-    planar = bool(groups) and groups[0].kind == "planar"
-    if not planar and (not groups or groups[0].kind != "floating" or not weight):
+    if not groups or groups[0].kind != "floating" or not weight:
         return
     complete, feet = dataset.u.shape[1] == len(model.inputs), {contact.switch for contact in model.touching}
     if None in feet or (feet and not complete):
@@ -124,35 +123,23 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     if flags.any(1).mean() > 0.5:  # the median window shows less of flight
         return
     group = groups[0]
-    linear = 2 if planar else 3
-    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][linear:], MOST_FORCES)
+    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][3:], MOST_FORCES)
     inputs = dataset.u if complete else np.zeros((len(dataset), len(model.inputs)))
     q, v, u, a = (windows.of_signal(x).to(robot.device) for x in (dataset.q, dataset.v, inputs, dataset.a))
 
     def missing(inputs: Tensor) -> Tensor:
         """The linear part of M a less what the model knows of, in the axes of the base, in N."""
         dynamics = model.dynamics(q, v, inputs)
-        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :linear].cpu()
+        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :3].cpu()
 
     def size(force: Tensor) -> float:
         return float(torch.linalg.vector_norm(windows.mean(force), dim=-1).median())
 
     found, thrusters = size(missing(u)), sorted(thruster_columns(model)) if complete else []
-    if planar:
-        needed = size(robot.mass * a[:, group.rows][:, :linear].cpu())
-        if found > CARRIED * needed:
-            yield look(
-                about="base force",
-                what=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
-                f"(its acceleration takes {needed:.3g} N); masses found from this log would be wrong.",
-                do="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
-                "For the arm alone, record it while the base stands, and leave out --base and the columns of the base.",
-                numbers={"force": found, "needed": needed},
-            )
-        return
     if found <= CARRIED * weight:
         return
     numbers, weighs = {"force": found, "weight": weight}, f"(the robot weighs {weight:.3g} N)"
+    kind, correction = wrong, dict[str, dict[str, tuple[str, ...]]]()
     if not thrusters:
         remedy = (
             "Describe them in Python (docs/how-to/moving-bases.md), write model.to_json() into a file, and take it in "
@@ -165,46 +152,39 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
             remedy = f"Let forcegp import --feet name what stands, and compare {named} with heights."
         seen = (
             f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, no foot "
-            f"that stands and no thruster {weighs}."
+            f"that stands and no thruster {weighs}"
         )
-        yield wrong(about="base force", what=seen, do=remedy, numbers=numbers)
-        return
-    seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
-    still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
-    still[:, thrusters], slower[:, thrusters] = 0.0, RPM * u[:, thrusters]
-    needed, upright = missing(still), torch.eye(3, dtype=at.dtype)
-    turned = pose(group.kind, _reordered(group, at))[0].mT @ pose(group.kind, at)[0]
-    order, unit = {"orientation": {"q": ("wxyz",)}}, {"unit": {"u": ("rpm",)}}
-    readings = {
-        "rotor speeds in rpm": (upright, slower, unit),
-        "a quaternion w, x, y, z": (turned, u, order),
-        "a quaternion w, x, y, z and rotor speeds in rpm": (turned, slower, order | unit),
-    }
-    kind, correction = look, dict[str, dict[str, tuple[str, ...]]]()
-    remedy = "Check the unit of u, the mass, coefficients of thrust and the axes of a; leave out rows on the ground."
-    for what, (rotation, speeds, stated) in readings.items():
-        left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
-        if left < CLEARLY * min(found, weight):
-            kind, correction, remedy = wrong, stated, ""
-            numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
-            break
+    else:
+        seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
+        still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
+        still[:, thrusters], slower[:, thrusters] = 0.0, RPM * u[:, thrusters]
+        needed, upright = missing(still), torch.eye(3, dtype=at.dtype)
+        turned = pose(group.kind, _reordered(group, at))[0].mT @ pose(group.kind, at)[0]
+        order, unit = {"orientation": {"q": ("wxyz",)}}, {"unit": {"u": ("rpm",)}}
+        kind, remedy = look, "Check the unit of u, the mass, coefficients of thrust and the axes of a."
+        for what, rotation, speeds, stated in (
+            ("rotor speeds in rpm", upright, slower, unit),
+            ("a quaternion w, x, y, z", turned, u, order),
+            ("a quaternion w, x, y, z and rotor speeds in rpm", turned, slower, order | unit),
+        ):
+            left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
+            if left < CLEARLY * min(found, weight):
+                kind, correction, remedy = wrong, stated, ""
+                numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
+                break
     yield kind(about="base force", what=f"{seen}.", do=remedy, correction=correction, numbers=numbers)
 
 
-def _stated_axes(dataset: Dataset) -> tuple[str, str]:
-    """Of linear and angular velocities in the log file, as its import was given them."""
-    with contextlib.suppress(AttributeError, TypeError, KeyError, ValueError):  # somebody else's metadata
-        given = dataset.metadata["import"]["mapping"]["axes"]["v"]  # one word, or one for each part
-        *_, linear, angular = 2 * ((given,) if isinstance(given, str) else tuple(given))
-        return str(linear), str(angular)
-    return "body", "body"
-
-
-def _stated_order(dataset: Dataset) -> str:
-    """Of quaternions in the log file, as its import was given it."""
+def _stated(dataset: Dataset) -> tuple[tuple[str, str], str]:
+    """Axes of linear and angular velocities, and the order of quaternions, in the log file, as its import was told."""
+    axes, order = ("body", "body"), "xyzw"
     with contextlib.suppress(AttributeError, TypeError, KeyError):  # somebody else's metadata
-        return str(dataset.metadata["import"]["mapping"]["orientation"])
-    return "xyzw"
+        mapping = dataset.metadata["import"]["mapping"]
+        order = str(mapping.get("orientation", order))
+        given = mapping["axes"]["v"]  # one word, or one for each part
+        *_, linear, angular = 2 * ((given,) if isinstance(given, str) else tuple(given))
+        axes = str(linear), str(angular)
+    return axes, order
 
 
 def _of_velocity(

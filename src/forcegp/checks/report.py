@@ -207,12 +207,10 @@ def stated_noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
 
 
 def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Noise of the acceleration before and after the filter, in rad/s^2 and, with the mass matrix, in Nm."""
+    """Noise of the acceleration before and after the filter, in rad/s^2 or m/s^2."""
     if inputs.prepared is None:
         return
-    report = inputs.price
-    cutoff = report.get("cutoff")
-    measured = report.get("acceleration_noise", {})
+    cutoff, measured = inputs.price.get("cutoff"), inputs.price.get("acceleration_noise", {})
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
         yield ok(about="noise", what="the positions show no noise worth a filter.")
         return
@@ -221,19 +219,18 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     if np.isfinite(after).any():
         when = " when this dataset was prepared" if inputs.cutoff is None else ""
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
-        unit = "rad/s²" if inputs.rotates[worst] else "m/s²"
+        unit, levels = "rad/s²" if inputs.rotates[worst] else "m/s²", f"{before[worst]:.3g} to {after[worst]:.2g}"
+        what = f"a filter at {cutoff:.3g} Hz{when} takes the noise of the acceleration of {inputs.names[worst]}, the worst"
         yield ok(
             about="noise",
-            what=f"a filter at {cutoff:.3g} Hz{when} takes the noise of the acceleration of "
-            f"{inputs.names[worst]}, the worst, from {before[worst]:.3g} to {after[worst]:.2g} {unit}.",
+            what=f"{what}, from {levels} {unit}.",
             numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
         )
-    raw = "preparation" not in inputs.log.metadata
     with np.errstate(invalid="ignore"):
-        loud = np.flatnonzero(before > MUCH * spread)
-        left = np.flatnonzero(after > MUCH * spread)
+        loud, left = np.flatnonzero(before > MUCH * spread), np.flatnonzero(after > MUCH * spread)
     # a log may hold better accelerations than differences
-    if raw and (np.std(inputs.log.a, axis=0)[loud] > np.hypot(1.0, MUCH) * spread[loud]).any():
+    noisy = np.std(inputs.log.a, axis=0)[loud] > np.hypot(1.0, MUCH) * spread[loud]
+    if "preparation" not in inputs.log.metadata and noisy.any():
         yield look(
             about="noise",
             what=f"the acceleration in this dataset is not filtered: its noise is up to "
@@ -243,13 +240,9 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         )
     if len(left):
         names = inputs.named(left)
-        yield look(
-            about="noise",
-            what=f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of "
-            f"{', '.join(names)}.",
-            do="Move faster, filter lower, or learn from torques instead of accelerations.",
-            joints=names,
-        )
+        what = f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of {', '.join(names)}."
+        remedy = "Move faster, filter lower, or learn from torques instead of accelerations."
+        yield look(about="noise", what=what, do=remedy, joints=names)
 
 
 WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)

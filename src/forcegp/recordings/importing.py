@@ -13,6 +13,7 @@ from typing_extensions import override
 import forcegp.mechanics
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset, is_dataset
+from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
 from forcegp.recordings.arrays import ARRAYS, ArrayFile
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
@@ -112,11 +113,11 @@ def import_recordings(
             for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
                 for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
-                    raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
+                    raise DatasetError(f"{recording.told['name']}: {seen} at {where}; {remedy}")
             piece = recording.rows(rows, step)
             count, stamp = len(piece["time"]), recording.begin + float(recording.time[rows[0]])
             pieces.append(piece | {"episode": np.full(count, len(pieces))})
-            told = {"recording": recording.label, "number": number, "row": int(rows[0]), "begin": stamp}
+            told = {"recording": recording.told["name"], "number": number, "row": int(rows[0]), "begin": stamp}
             done["episodes"].append(told | {"rows": count})
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
@@ -163,7 +164,7 @@ def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float
             )
         return 1.0 / options.rate
     alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in recordings)
-    if options.rate == "log" or (alike and all(own.even for own in recordings)):
+    if options.rate == "log" or (alike and all(own.worst <= JITTER for own in recordings)):
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
@@ -193,20 +194,7 @@ def _what_was_done(
             name: f"logged and {made[name]}" if name in lacking else "logged" if name in plan.logged else made[name]
             for name in SIGNALS
         },
-        "recordings": [
-            {
-                "name": recording.label,
-                "rows": len(recording.time),
-                "seconds": float(sum(np.ptp(recording.time[rows]) for _, rows in recording.stretches)),
-                "median_step": recording.step,
-                "largest_deviation_of_a_step": recording.worst,
-                "repeated_stamps_dropped": recording.repeated,
-                "gaps": list(recording.gaps),
-                "rows_in_stretches_too_short": recording.dropped,
-                "notes": list(recording.notes),
-            }
-            for recording in recordings
-        ],
+        "recordings": [recording.told for recording in recordings],
         "resampled_to_step": step,
         "unwrapped": options.unwrap,
         "start": options.start,

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from scipy.interpolate import make_interp_spline
 
 import forcegp.robots
-from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.moving_base import Jumps, Layout, read_poses
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
@@ -21,35 +20,23 @@ from forcegp.recordings.source import Columns, Source
 
 @dataclass(frozen=True)
 class Recording:
-    """What was read of one table.
+    """What was read of one table: `signals` (rows, entries) in SI, in the order of a Dataset, and `time` (rows,) [s].
 
-    `label` is what people call it; `signals` those that were logged, (rows, entries) in SI, in the order of a Dataset;
-    `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too far.
-    `stretches`
-    are episode number and rows without gaps, `step` their median step [s] and `worst` the largest relative deviation
-    from
-    it; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` in s.
+    `told` says how, for people: name, notes, what was left out. `begin` is the stamp of the first row [s]; `jumps` are
+    rows before which something turns too far; `stretches` episode number and rows without gaps, `step` [s] the median
+    of their steps, from which they deviate by `worst` of it.
     """
 
-    label: str
+    told: dict[str, Any]
     source: Source
     signals: Mapping[str, Float[np.ndarray, "rows entries"]]
     time: Float[np.ndarray, " rows"]
     begin: float
     jumps: tuple[Jumps, ...]
     layout: Layout
-    notes: tuple[str, ...]
     stretches: tuple[tuple[int, Int[np.ndarray, " rows"]], ...]
     step: float
     worst: float
-    repeated: int
-    gaps: tuple[float, ...]
-    dropped: int
-
-    @property
-    def even(self) -> bool:
-        """Is every step within 1 % of the median?"""
-        return self.worst <= JITTER
 
     def rows(self, used: Int[np.ndarray, " rows"], step: float | None) -> dict[str, np.ndarray]:
         """Time and the signals q, v, u, a of these rows, `step` [s] apart, or for None at the times of the log."""
@@ -93,8 +80,11 @@ def read_recording(
     signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
     signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
     layout = replace(plan.layout, held=read.held or plan.layout.held)
-    stretches = _stretches(label, source, time, episodes, read, options)
-    return Recording(label, source, signals, time, begin, (*jumps, *turned), layout, (*read.notes, *told), *stretches)
+    stretches, step, worst, left_out = _stretches(label, source, time, episodes, read, options)
+    seconds = float(sum(np.ptp(time[rows]) for _, rows in stretches))
+    about = {"name": label, "rows": rows, "seconds": seconds, "median_step": step, "largest_deviation_of_a_step": worst}
+    about |= {**left_out, "notes": [*read.notes, *told]}
+    return Recording(about, source, signals, time, begin, (*jumps, *turned), layout, stretches, step, worst)
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
@@ -219,8 +209,8 @@ SLOWEST, FASTEST = 2.0, 2e5
 
 def _stretches(
     label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
-) -> tuple[Any, ...]:
-    """Rows between gaps, their median step, its worst deviation, repeated stamps, gaps, and rows left out.
+) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
+    """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 
     Of rows with the same stamp the first is kept. Raises DatasetError for time that runs backwards and impossible
     rates.
@@ -267,8 +257,9 @@ def _stretches(
             "a longer `gap` may be right."
         )
     worst = float(np.abs(between[inside] / step - 1.0).max())
-    dropped = len(used) - sum(len(rows) for _, rows in stretches)
-    return tuple(stretches), step, worst, repeated, tuple(between[same & ~inside].tolist()), dropped
+    left_out = {"repeated_stamps_dropped": repeated, "gaps": between[same & ~inside].tolist()}
+    left_out["rows_in_stretches_too_short"] = len(used) - sum(len(rows) for _, rows in stretches)
+    return tuple(stretches), step, worst, left_out
 
 
 def _require_rate(label: str, step: float) -> None:

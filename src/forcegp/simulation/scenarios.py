@@ -39,15 +39,6 @@ def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
         raise InvalidInput(f"{allowed}.")
 
 
-def usual_dry_friction(config: Any) -> None:
-    """Put the law that most joints need in the place of None, and check others."""
-    if config.joint_friction is None:
-        from forcegp.forces.registry import USUAL_DRY
-
-        object.__setattr__(config, "joint_friction", USUAL_DRY)
-    require_joint_friction(config.joint_friction)
-
-
 Surface = Literal["plane", "tilted", "sphere", "none"]
 
 PRESS_FOR_DRY_FRICTION = 15.0  # N
@@ -216,18 +207,18 @@ _RANGES: dict[str, Range] = {
 class FreeArmConfig(CommonConfig):
     """PD control with gravity compensation along sines of random size and rate, two per joint, about a posture.
 
-    `joint_friction` names laws of `forcegp.forces`, or "none"; None is dry friction with more near rest. With viscous
-    friction as well. Numbers that the name does not give are in proportion to the largest torque of a joint. `noise`
-    in rad/s^2. Raises InvalidInput naming the field and its range.
+    `joint_friction` names laws of `forcegp.forces`, or "none"; viscous friction comes with them. Numbers that the name
+    does not give are in proportion to the largest torque of a joint. `noise` in rad/s^2. Raises InvalidInput naming the
+    field and its range.
     """
 
     arm: Literal["ur5-free", "double-pendulum"]
-    joint_friction: str | None = None
+    joint_friction: str = "stribeck"
 
     @usable_arguments("FreeArmConfig")
     def __post_init__(self) -> None:
         self._check()
-        usual_dry_friction(self)
+        require_joint_friction(self.joint_friction)
         require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
 
 
@@ -242,12 +233,12 @@ class QuadrupedConfig(CommonConfig):
     seconds: float = 30.0
     payload: float = 2.0
     lift: bool = True
-    joint_friction: str | None = None
+    joint_friction: str = "stribeck"
 
     @usable_arguments("QuadrupedConfig")
     def __post_init__(self) -> None:
         self._check(payload=NOT_NEGATIVE)
-        usual_dry_friction(self)
+        require_joint_friction(self.joint_friction)
 
 
 @dataclass(frozen=True, kw_only=True)
