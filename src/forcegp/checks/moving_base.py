@@ -90,24 +90,25 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         error, size = _rms(change - windows.mean(a)), _rms(change)
         measured = in_base(group, at, a, ("imu", "body"), v, model.robot.gravity)
         specific = _rms(change - windows.mean(measured))
-        if error > 2.0 * size and specific < CLEARLY * error:
-            yield wrong(
-                about="base acceleration",
-                what=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
-                f"velocity it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}.",
-                do="Differentiate v.",
-                correction=IMU,
-                numbers={"error": error, "specific": specific, "size": size},
+        if error <= 2.0 * size:  # noise of the velocities alone makes both large
+            continue
+        numbers = {"error": error, "specific": specific, "size": size}
+        if specific < CLEARLY * error:
+            seen = (
+                f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its velocity "
+                f"it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}."
             )
-        elif error > 2.0 * size:  # noise of the velocities alone makes both large
-            yield look(
-                about="base acceleration",
-                what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
-                f"which itself is {size:.2g}.",
-                do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
-                "an accelerometer; differentiate v, or add gravity to what an IMU measures.",
-                numbers={"error": error, "size": size},
-            )
+            told = {"about": "base acceleration", "what": seen, "do": "Differentiate v.", "numbers": numbers}
+            yield wrong(**told, correction=IMU)
+            continue
+        yield look(
+            about="base acceleration",
+            what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, which "
+            f"itself is {size:.2g}.",
+            do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of an "
+            "accelerometer; differentiate v, or add gravity to what an IMU measures.",
+            numbers=numbers,
+        )
 
 
 def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:

@@ -220,7 +220,7 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         when = " when this dataset was prepared" if inputs.cutoff is None else ""
         worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
         unit, levels = "rad/s²" if inputs.rotates[worst] else "m/s²", f"{before[worst]:.3g} to {after[worst]:.2g}"
-        what = f"a filter at {cutoff:.3g} Hz{when} takes the noise of the acceleration of {inputs.names[worst]}, the worst"
+        what = f"a filter at {cutoff:.3g} Hz{when} takes the noise of a of {inputs.names[worst]}, the worst"
         yield ok(
             about="noise",
             what=f"{what}, from {levels} {unit}.",

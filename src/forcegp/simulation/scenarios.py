@@ -77,40 +77,27 @@ class KukaSurfaceConfig(CommonConfig):
     """
 
     seconds: float = 200.0
-    time_step: float = 1.0 / 240.0
-    """Step of simulation, control and recording [s]."""
-    settle_seconds: float = 1000.0 / 240.0
-    """Approach and first contact [s], left out of the data as in the paper (its first 1000 rows)."""
-
-    tool_mass: float = 2.0
-    """Mass of link 7 with its tool [kg]."""
-
+    time_step: float = 1.0 / 240.0  # s, of simulation, control and recording
+    settle_seconds: float = 1000.0 / 240.0  # approach and first contact, left out as in the paper (its first 1000 rows)
+    tool_mass: float = 2.0  # kg, of link 7 with its tool
+    # the plane z = surface_height; it tilted about the middle of the way-points' region; the top of a big sphere that
+    # touches it there; or none: free motion above. The contact is a bilateral constraint from the first touch on
     surface: Surface = "plane"
-    """The plane z = surface_height; that plane tilted about the middle of the way-points' region; the top of a big
-    sphere that touches it there; or none: free motion above. The contact is a bilateral constraint from the first touch
-    on."""
-
+    # of the tool on the surface, the force that no model contains: viscous; or a law of dry friction of
+    # `forcegp.forces` by name, which grows with the normal force, and near rest where it has a breakaway
     friction: str = "viscous"
-    """Friction of the tool on the surface, the force that no model contains: viscous; or a law of dry friction of
-    `forcegp.forces` by name, which grows with the normal force, and near rest where it has a breakaway."""
-    viscous_coefficient: float = 1.0
-    """Viscous friction of the tool point on the surface [N/(m/s)]."""
-    coulomb_coefficient: float = 0.3
-    """Dry friction of the sliding tool per normal force."""
-    static_coefficient: float = 0.5
-    """Dry friction near rest per normal force, of laws with a breakaway."""
-    breakaway_velocity: float = 0.15
-    """Speed over which the static coefficient falls to the sliding one [m/s]."""
+    viscous_coefficient: float = 1.0  # of the tool point on the surface [N/(m/s)]
+    coulomb_coefficient: float = 0.3  # dry friction of the sliding tool per normal force
+    static_coefficient: float = 0.5  # near rest, of laws with a breakaway
+    breakaway_velocity: float = 0.15  # m/s, over which the static coefficient falls to the sliding one
+    # m/s, below which dry friction of the tool falls to zero: a smooth sign. The explicit steps oscillate where
+    # `static_coefficient * normal force / friction_smoothing` exceeds some 450 N/(m/s)
     friction_smoothing: float = 0.05
-    """Speed below which dry friction of the tool falls to zero [m/s]: a smooth sign, see `DryFriction`. The explicit
-    steps oscillate where `static_coefficient * normal force / friction_smoothing` exceeds some 450 N/(m/s)."""
+    # of the joints, besides the force at the tool and not part of `u`: viscous friction and laws of `forcegp.forces`,
+    # such as "coulomb", with their own numbers (`parse_forces`) or those below
     joint_friction: str = "none"
-    """Friction of the joints that is not part of `u`, besides the force at the tool: viscous friction and laws of
-    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below."""
-    joint_breakaway_velocity: float = 0.2
-    """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
-    joint_smoothing: float = 0.1
-    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign."""
+    joint_breakaway_velocity: float = 0.2  # rad/s, over which the friction near rest falls to Coulomb's
+    joint_smoothing: float = 0.1  # rad/s, below which it falls to zero: a smooth sign
 
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
