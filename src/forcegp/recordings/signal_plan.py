@@ -236,21 +236,15 @@ def _signals(
         expressions = expressions * len(names)
     if len(expressions) != len(names):
         what = "joints" if plain and names else {"q": "positions", "u": "inputs"}.get(signal, "velocities")
-        remedy = f"name one column per {'joint' if what == 'joints' else 'entry'}."
-        if signal == "q" and not plain:
-            remedy = f"{remedy[:-1]}; `orientation` angles has roll, pitch and yaw instead of a quaternion."
-            if len(expressions) == len(set(names) & set(joints)):
-                remedy = (
-                    "the base was not measured: record its pose by motion capture or a state estimator (position and "
-                    "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
-                )
-        elif signal == "u" and names:
-            remedy = f"{remedy[:-1]}, and 0 for a joint that nothing drives."
-        elif not names:
+        remedy = "name one column for each"
+        if signal == "q" and not plain and len(expressions) == len(set(names) & set(joints)):
             remedy = (
-                "leave u out, or give actuators: motors of an MJCF file, or a file that Model.to_json wrote "
-                "(`identified`)."
+                "the base was not measured: record its pose by motion capture or a state estimator (position and "
+                "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
             )
+        elif signal in "qu":
+            more = {"q": "angles of a base have `orientation` angles", "u": "0 for a joint that nothing drives"}
+            remedy = f"{remedy}; {more[signal]}." if names else "leave u out, or give actuators (`identified`)."
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
