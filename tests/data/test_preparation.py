@@ -81,13 +81,6 @@ def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
     assert error(chosen) < 1e-4 * error(data)
 
 
-def test_a_joint_at_rest_has_no_cutoff_and_hinders_nobody():
-    data, _ = noisy()
-    still = replace(data, q=np.stack([data.q[:, 0], np.zeros(len(data))], 1))
-    assert np.isfinite(motion_spectrum(still).cutoff).tolist() == [True, False]
-    assert Preparation(cutoff="auto").apply(still).metadata["preparation"]["cutoff"] is not None
-
-
 def test_a_peak_above_the_motion_is_no_motion():
     data, _ = noisy()
     hum = replace(data, q=data.q + 3e-5 * np.sin(2 * np.pi * 100 * data.time[:, None]))

@@ -107,19 +107,6 @@ def test_a_hard_sign_differs_by_direction_and_stops_a_joint_without_turning_it_r
     np.testing.assert_allclose(stopped, 0.0, atol=1e-15)
 
 
-def test_friction_under_load_is_larger_where_the_torque_drives():
-    law, v = joint_law("load", joint_smoothing=1e-6), np.full(7, 0.5)
-    expected = C + np.where(U > 0.0, 0.04, 0.015) * np.abs(U) + D * v
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 0.0), -expected, atol=1e-12)
-
-
-def test_friction_falls_as_gears_warm_up():
-    law, v = joint_law("drift", joint_smoothing=1e-6), np.full(7, -0.5)
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 0.0), C - D * v, atol=1e-12)
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 1e4), 0.7 * C - D * v, atol=1e-12)
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 60.0), C * (1.0 - 0.3 * (1.0 - 1.0 / np.e)) - D * v, atol=1e-12)
-
-
 def test_bristles_are_a_spring_before_they_slide_and_follow_the_curve_afterwards():
     """Against `solve_ivp` of the same law (Canudas de Wit et al. 1995) at a velocity that changes its sign."""
     v = 0.05

@@ -103,9 +103,7 @@ class Dataset(Summary):
         own = None if self.model is None else sliding_joints(self.model.robot)
         put("sliding", (own or ()) if self.sliding is None else tuple(self.sliding))
         if not set(self.sliding) <= set(names) or (own is not None and set(self.sliding) != set(own)):
-            allowed = (
-                f"joints are {list(names)}" if own is None else f"those of {self.model.robot.name!r} are {list(own)}"
-            )
+            allowed = f"joints are {list(names)}" if own is None else f"those of the robot are {list(own)}"
             raise DatasetError(f"sliding joints are {list(self.sliding)}; {allowed}.")
         put("noise_std", _noise_std(self.noise_std, names, rows))
         put("truth", _truth(self.truth, names, rows, self.model))
