@@ -30,7 +30,7 @@ from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_
 from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
-ORDER = "a lambda Q_U in_contact"
+ORDER = "a", "lambda", "Q_U", "in_contact"
 TRUTH = re.compile(r"a|lambda|Q_U|in_contact|(Q_U|force)\.[a-zA-Z0-9-]*[a-zA-Z0-9][a-zA-Z0-9-]*")
 """Names of what is true; parts of Q_U and forces on points of the robot have names of their own."""
 
@@ -254,7 +254,7 @@ def _truth(
     if unknown:
         raise DatasetError(f"truth has no {unknown}; allowed: a, lambda, Q_U, in_contact, Q_U.<name>, force.<name>.")
     checked = {}
-    for name in sorted(given, key=lambda name: (name not in ORDER, ORDER.find(name), name)):
+    for name in sorted(given, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER)):
         of_contacts, columns = name in ("lambda", "in_contact"), joint_names
         if not name.startswith(("a", "Q_U")):
             columns = () if of_contacts else ("x", "y", "z")

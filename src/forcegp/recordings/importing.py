@@ -21,7 +21,7 @@ from forcegp.recordings.recording import Recording, read_recording
 from forcegp.recordings.ros_bag import RosBag
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import Columns, Source
-from forcegp.recordings.tables import DelimitedText, ParquetFile
+from forcegp.recordings.tables import DelimitedText
 
 ROUND_RATE = 1e-3  # a median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz
 
@@ -260,8 +260,6 @@ class SideBySide(Source):
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")
 TABLES: dict[str, Callable[[Path], Source]] = {
-    ".parquet": ParquetFile,
-    ".pq": ParquetFile,
     ".bag": RosBag,
     ".mcap": RosBag,
     ".db3": RosBag,
@@ -288,7 +286,7 @@ def open_source(
     if kind in TEXT:
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:
-        if kind != ".npz" and is_dataset(path):
+        if kind in (".h5", ".hdf5", ".mat") and is_dataset(path):
             raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
         return ArrayFile(path, ARRAYS[kind], within=within)
     return RosBag(path) if kind == "ros2" else TABLES[kind](path)
