@@ -21,7 +21,7 @@ from forcegp.robots import Robot
 from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, recorded, table_of
+from forcegp.simulation.trajectory import Table, joint_acceleration, over_table, random_path, recorded, table_of
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
@@ -233,23 +233,24 @@ def simulate_episode(
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
-    limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
+    limits, table = np.array(config.torque_limits), table_of(config)
     joint_law = config.joint_law(robot)
     columns: dict[str, np.ndarray] = {}
     with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
         arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))
         law = None if config.surface == "none" else tool_friction_of(config)
         contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
-        tool = arm.tool(np.zeros(7))[0]
-        path = PathOverTable.random(config, table, tool, steps * config.time_step, random_stream(config, episode, 0))
-        reference = path.sample(config.time_step * np.arange(steps))
+        tool, duration = arm.tool(np.zeros(7))[0], steps * config.time_step
+        flat = tool - [0.0, 0.0, table.height(tool[None, :2])[0][0]]
+        path = random_path(config, flat, duration, random_stream(config, episode, 0))
+        reference = over_table(table, path.sample(config.time_step * np.arange(steps)))
         for step in range(steps):
             aim = reference[0][step], reference[1][step], reference[2][step]
             _require_bounded(config, arm.state()[1], episode, step)
             state = ArmState.of(arm)
             v = state.v
             try:
-                wanted = controller.joint_acceleration(state, aim)
+                wanted = joint_acceleration(config, state, aim)
             except np.linalg.LinAlgError as error:
                 raise SimulationError(
                     f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
