@@ -1,9 +1,13 @@
 import numpy as np
-from scipy.spatial.transform import Rotation
+import pinocchio as pin
 
 from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import joint_acceleration
+
+
+def turned(quaternion: np.ndarray) -> np.ndarray:
+    return pin.Quaternion(quaternion).toRotationMatrix()
 
 
 def test_the_law_is_the_published_one_with_the_pseudo_inverse():
@@ -21,8 +25,7 @@ def test_the_law_is_the_published_one_with_the_pseudo_inverse():
         task = np.concatenate(
             [
                 aim[2] + 2 * 100 * (aim[1] - velocity[:3]) + 1e4 * (aim[0] - position),
-                -2 * 100 * velocity[3:]
-                + 1e4 * (Rotation.from_quat(orientation) * Rotation.from_quat(present).inv()).as_rotvec(),
+                -2 * 100 * velocity[3:] + 1e4 * pin.log3(turned(orientation) @ turned(present).T),
             ]
         )
         inverse = np.linalg.pinv(J)

@@ -31,13 +31,10 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
     """Whether each contact of `dataset.model` acts in each row, from q, v and a alone; `truth` is not looked at.
 
     A row counts if its point moves along the surface (across it at most 2 % of that and 2 mm/s, plus what Baumgarte's
-    terms
-    recover), `|A a - b|` is at most 4.5 standard deviations (stated, or robust ones of these rows) or 0.05 m/s^2, and
-    it is
-    within 5 mm of the surface and where the other rows are (1 mm, or 20 robust standard deviations). A point at rest or
-    gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact with a switch
-    where
-    its flag is. Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
+    terms recover), `|A a - b|` is at most 4.5 standard deviations (stated, or robust ones of these rows) or 0.05 m/s^2,
+    and it is within 5 mm of the surface and where the other rows are (1 mm, or 20 robust standard deviations). A point
+    at rest or gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact with a
+    switch where its flag is. Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
     model = dataset.model
     if model is None or not model.contacts:

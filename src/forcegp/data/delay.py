@@ -93,9 +93,8 @@ def estimate_delay(dataset: Dataset, robot: forcegp.robots.Robot | None = None) 
     For every shift up to .2 s, u is fitted by least squares to the torque regressor of `robot` (default: that of the
     model), acceleration, velocity, smooth signs of it of several widths, a constant, and the model's laws: so it rests
     neither on the robot's parameters nor on one law of friction. The best shift is the vertex of a parabola; its
-    standard
-    deviation comes from leaving out each eighth of the log (block jackknife; Kuensch 1989). Filter q, v, u and a alike
-    before. Raises InvalidInput without a robot, or with contacts; DatasetError for a log shorter than .4 s.
+    standard deviation comes from leaving out each eighth of the log (block jackknife; Kuensch 1989). Filter q, v, u and
+    a alike before. Raises InvalidInput without a robot, or with contacts; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
     near = _estimated(dataset, robot, USUAL_DELAY)
@@ -249,11 +248,10 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
 
     For every T, the force that accelerates the base is fitted by least squares to thrusters (Mahony et al. 2012), air,
-    attitude and bodies beside the base, all without their slow part: wind is slow, and controllers answer it. The
-    least sum
-    of log residuals wins; its deviation is a block jackknife, and half a step of time. Raises InvalidInput without
-    `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag below
-    .3 s.
+    attitude and bodies beside the base, all without their slow part: wind is slow, and controllers answer it. The least
+    sum of log residuals wins; its deviation is a block jackknife, and half a step of time. Raises InvalidInput without
+    `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag below .3
+    s.
     """
     found = thruster_columns(dataset.model)
     if dataset.model is None or not found:

@@ -109,11 +109,9 @@ class Preparation:
         """The prepared Dataset, with its price under "preparation" in the metadata.
 
         The price holds the settings; "why"; "rows" and "sample_rate" [Hz] before and after; per joint
-        "acceleration_noise"
-        before and after the filter [rad/s^2 or m/s^2] (None without a noise floor); and the price that was paid
-        "earlier".
-        Raises DatasetError for rows out of order, uneven or too few, InvalidInput for a cut-off above half the sample
-        rate.
+        "acceleration_noise" before and after the filter [rad/s^2 or m/s^2] (None without a noise floor); and the price
+        that was paid "earlier". Raises DatasetError for rows out of order, uneven or too few, InvalidInput for a cut-
+        off above half the sample rate.
         """
         chosen = self.resolved(dataset)
         prepared, found = _prepared(chosen, dataset)

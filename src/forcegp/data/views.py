@@ -275,10 +275,8 @@ def farthest_point_sampling(
     """Numbers of `count` rows of which each is the farthest from all rows chosen before it, from `start` on.
 
     Greedy k-centre (Gonzalez 1985), Euclidean on columns standardised to mean 0 and deviation 1; deterministic and
-    nested;
-    repeated rows come last. Time O(rows * count * features). Raises InvalidInput if `points` is not a finite table, or
-    for
-    a `count` or `start` outside the rows.
+    nested; repeated rows come last. Time O(rows * count * features). Raises InvalidInput if `points` is not a finite
+    table, or for a `count` or `start` outside the rows.
     """
     table = np.asarray(points)
     if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():

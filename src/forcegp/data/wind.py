@@ -84,8 +84,8 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
 
     Mean wind of every episode and law together, with the law projected out (Kaufman, BIT 1975, with Levenberg-Marquardt
     steps); then the wind follows the rows nearby. Not for bases that do not fly freely, rows out of order, fewer than
-    400,
-    drag that explains no more than its coefficients would of noise, winds beyond 40 m/s or deviations beyond 2 m/s.
+    400, drag that explains no more than its coefficients would of noise, winds beyond 40 m/s or deviations beyond 2
+    m/s.
     """
     if not _flies(dataset) or not dataset.time_ordered:
         return None
@@ -108,8 +108,7 @@ def steady_forces(dataset: Dataset) -> Float[np.ndarray, "rows 3"] | None:
     """The force [N, world] by which each episode differs from the others; None for one, and where no base flies freely.
 
     By the law of air in still air and a constant force in every episode, which share what either would explain; the
-    mean
-    over the rows is left out, for the law holds it. Where wind is not found, this is what different winds leave.
+    mean over the rows is left out, for the law holds it. Where wind is not found, this is what different winds leave.
     """
     numbers, own = np.unique(dataset.episode, return_inverse=True)
     if len(numbers) < 2 or not _flies(dataset) or len(dataset) < FEWEST_ROWS // 2:

@@ -20,11 +20,12 @@ from forcegp.recordings.source import Columns, Source
 
 @dataclass(frozen=True)
 class Recording:
-    """What was read of one table: `signals` (rows, entries) in SI, in the order of a Dataset, and `time` (rows,) [s].
+    """What was read of one table.
 
-    `told` says how, for people: name, notes, what was left out. `begin` is the stamp of the first row [s]; `jumps` are
-    rows before which something turns too far; `stretches` episode number and rows without gaps, `step` [s] the median
-    of their steps, from which they deviate by `worst` of it.
+    `label` is what people call it; `signals` those that were logged, (rows, entries) in SI, in the order of a Dataset;
+    `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too far.
+    `stretches` are episode number and rows without gaps, `step` their median step [s] and `worst` the largest relative
+    deviation from it; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` in s.
     """
 
     told: dict[str, Any]

@@ -42,10 +42,8 @@ class DelimitedText(Source):
     """A table as text. The first line that is not a comment (#) names the columns, unless `headerless` counts them.
 
     path: .csv, .tsv, .txt or .dat, also with .gz. headerless: number of columns of a file without a header, called c1,
-    c2,
-    ...; where every line holds one number, so many lines make a row. delimiter: ",", ";", tab, another single letter,
-    or
-    "blanks" for any run of them; default: detected from the first lines.
+    c2, ...; where every line holds one number, so many lines make a row. delimiter: ",", ";", tab, another single
+    letter, or "blanks" for any run of them; default: detected from the first lines.
     """
 
     def __init__(self, path: Path, *, headerless: int | None = None, delimiter: str | None = None) -> None:

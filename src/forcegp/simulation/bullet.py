@@ -16,11 +16,9 @@ from forcegp.errors import MissingExtra, SimulationError
 class BulletArm:
     """A serial arm of revolute joints whose only forces are gravity, its own inertia and the torques given to `step`.
 
-    One step is `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`: joint motors, limits,
-    damping and
-    collisions are off. `tool_point` [m] is fixed in the frame of the last link; `gravity` [m/s^2] acts along -z;
-    `bullet`,
-    `client`, `body` and `joints` are PyBullet's. A context manager. Raises MissingExtra without PyBullet, and
+    One step is `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`: joint motors, limits, damping
+    and collisions are off. `tool_point` [m] is fixed in the frame of the last link; `gravity` [m/s^2] acts along -z;
+    `bullet`, `client`, `body` and `joints` are PyBullet's. A context manager. Raises MissingExtra without PyBullet, and
     SimulationError for a link whose inertia is not along its axes.
     """
 

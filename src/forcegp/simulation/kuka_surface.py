@@ -316,10 +316,8 @@ def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None =
     Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded minus joint damping), and the
     acceleration of the step. So with the true "a", "lambda" and "Q_U", `M(q) a + bias(q, v) = u + Q_U + A^T lambda` and
     `A a = b` in every row. The approach (`settle_seconds`) is left out. Equal `seed` and episode number give equal
-    motion,
-    whatever `noise`, `seconds` and `episodes` are. Raises MissingExtra without PyBullet, and SimulationError if the
-    motion
-    diverges, loses the surface, leaves the joint limits or saturates the torques.
+    motion, whatever `noise`, `seconds` and `episodes` are. Raises MissingExtra without PyBullet, and SimulationError if
+    the motion diverges, loses the surface, leaves the joint limits or saturates the torques.
     """
     urdf = kuka_urdf(config)
     robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
