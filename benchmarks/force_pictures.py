@@ -73,7 +73,7 @@ def across_the_strip() -> tuple[torch.Tensor, torch.Tensor]:
 
 def roughness(x: torch.Tensor) -> torch.Tensor:
     """Viscous coefficient in N/(m/s), four times as much on a strip."""
-    return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25))
+    return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25)).to(x)
 
 
 def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
