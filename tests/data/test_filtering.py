@@ -66,8 +66,20 @@ def test_a_sine_comes_out_with_the_gain_that_the_filter_states(smooth, accuracy,
     np.testing.assert_allclose(gain, smooth.gain(np.array([frequency]), RATE)[0], atol=accuracy)
 
 
-def test_the_memory_of_noise_is_that_of_the_slowest_filter():
-    assert (LowPass(20.0) >> Lag(0.01) >> LowPass(50.0)).memory == LowPass(20.0).memory == pytest.approx(1 / 60)
+@pytest.mark.parametrize(
+    ("smooth", "memory"),
+    [(Mean(9), 4.5 / RATE), (Lag(0.1), 0.1 * np.log(2.0)), (Later(0.3), 0.5 / RATE), (LowPass(20.0), 1 / 62)],
+)
+def test_the_memory_of_noise_is_where_its_autocorrelation_is_one_half(smooth, memory):
+    """In closed form: 1 - k / n, exp(-t / T), none; and of noise behind the filter."""
+    assert smooth.memory(RATE) == pytest.approx(memory, rel=0.01)
+    both = smooth >> LowPass(30.0)
+    noise = np.random.default_rng(0).normal(size=(200_000, 1))
+    behind = both(noise, np.arange(len(noise)) / RATE)[2000:-2000, 0]
+    at = both.memory(RATE) * RATE
+    correlations = [behind[k:] @ behind[: len(behind) - k] for k in (0, int(at), int(at) + 1)]
+    share = correlations[1] + (at % 1) * (correlations[2] - correlations[1])
+    assert share / correlations[0] == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_straight_line_passes():

@@ -22,7 +22,8 @@ Signal = Literal["q", "v", "u", "a"]
 Values = Float[np.ndarray, "rows columns"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
-PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`Filter.memory`)
+FREQUENCIES = 2**15 + 1
 
 
 class Filter(ABC):
@@ -36,10 +37,16 @@ class Filter(ABC):
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
         """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]."""
 
-    @property
-    def memory(self) -> float:
-        """Time [s] within which noise behind the filter repeats itself: rows closer than that count as one."""
-        return 0.0
+    def memory(self, rate: float) -> float:
+        """Time [s] in which the autocorrelation of white noise at this rate [Hz] falls to one half behind the filter.
+
+        Rows that are closer count as one. By the theorem of Wiener and Khinchin, from the gain.
+        """
+        correlation = np.fft.irfft(np.abs(self.gain(np.linspace(0.0, 0.5 * rate, FREQUENCIES), rate)) ** 2)
+        correlation /= correlation[0]
+        after = int(np.argmax(correlation < 0.5))
+        above, below = correlation[[after - 1, after]]
+        return float(after - (0.5 - below) / (above - below)) / rate
 
     def __rshift__(self, other: Filter) -> Filter:
         return Chain((self, other))
@@ -60,11 +67,6 @@ class Chain(Filter):
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
         """The product."""
         return np.prod([part.gain(frequency, rate) for part in self.parts], axis=0)
-
-    @property
-    def memory(self) -> float:
-        """That of the slowest."""
-        return max(part.memory for part in self.parts)
 
 
 @dataclass(frozen=True)
@@ -109,11 +111,6 @@ class LowPass(Filter):
     def time_constant(self) -> float:
         """Of its slowest pole [s]."""
         return 1.0 / (2.0 * np.pi * self.cutoff * np.sin(0.5 * np.pi / self.order))
-
-    @property
-    def memory(self) -> float:
-        """A third of the period of the cut-off."""
-        return 1.0 / (PASSED * self.cutoff)
 
 
 @dataclass(frozen=True)

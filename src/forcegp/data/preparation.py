@@ -28,6 +28,7 @@ from forcegp.summary import plain
 
 LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 FEW = 2_000  # rows of a whole log
+FAR_ABOVE = 100.0  # a cut-off: where the memory of a filter does not depend on the rate
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 
 
@@ -124,7 +125,7 @@ class Preparation:
 def memory(metadata: Mapping[str, Any]) -> float:
     """Time in s within which rows of a filtered log repeat their neighbours; 0 where the metadata name no filter."""
     cutoff = preparation_report(metadata).get("cutoff")
-    return 0.0 if cutoff is None else LowPass(float(cutoff)).memory
+    return 0.0 if cutoff is None else LowPass(float(cutoff)).memory(FAR_ABOVE * float(cutoff))
 
 
 def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
