@@ -117,7 +117,7 @@ class Dataset(Summary):
     @property
     def units(self) -> FrozenDict:
         """SI units of "q", "v", "u", "a" and "time": one text, or one per joint where joints differ."""
-        return units_of(~self.turns)
+        return units_of((~self.turns).tolist())
 
     @property
     def turns(self) -> Bool[np.ndarray, " nv"]:
