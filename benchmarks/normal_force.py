@@ -24,8 +24,7 @@ from forcegp.data import farthest_rows
 from forcegp.forces import parse_forces
 from forcegp.posterior.predictor import Predictor
 from forcegp.simulation.bullet import ArmState, BulletArm
-from forcegp.simulation.contact_forces import IdealContact
-from forcegp.simulation.kuka_surface import kuka_urdf, tool_friction_of
+from forcegp.simulation.kuka_surface import IdealContact, kuka_urdf, tool_friction_of
 from forcegp.simulation.trajectory import table_of
 
 SEEDS = (1, 2, 3, 4, 5)

@@ -1,14 +1,6 @@
 """Files and folders that appear whole or not at all: written in a hidden folder beside them, then renamed.
 
-That folder, `.NAME.*.tmp`, lies beside the target, because only a rename within one file system is atomic. Whatever is
-written gets the permissions that the umask allows, and whatever fails, Ctrl-C included, leaves the old file or folder
-as it was and nothing beside it. A process that is killed leaves the hidden folder; whoever writes to the same name next
-deletes it. Its writer holds a lock in it, which ends with the process, so what is being written is never deleted.
-
-A symbolic link stays, and what it points to is replaced. What is neither a file nor a folder is never replaced.
-
-`SHA256SUMS` holds a digest of every file of a stored folder, because a bit that flipped on a disk changes predictions.
-Its format is that of `sha256sum`. It protects itself: its text must be exactly the one that the files give.
+What fails leaves the old one; a killed process leaves `.NAME.*.tmp`, unlocked, which the next writer deletes.
 """
 
 import contextlib
@@ -180,11 +172,7 @@ def _remove_if_left(entry: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Wait until the contents are on the disk.
-
-    File systems may put a rename on the disk before the contents, so that a power cut would leave an empty file under
-    the final name and the old contents nowhere.
-    """
+    """Wait until the contents are on the disk: a rename may be there first, and a power cut would leave nothing."""
     folder = path.is_dir()
     if folder and os.name == "nt":  # Windows opens no folders, and orders these writes itself
         return

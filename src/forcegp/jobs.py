@@ -1,7 +1,6 @@
 """Pieces of work whose results are kept: `Job`, `JobStore`, a folder of finished jobs, and `run_jobs`.
 
-What decides a result is digested: the settings of a job, its inputs, all code of forcegp, and the files in the package
-of the task's own module where that is another. Other libraries are not; their versions stand in `machine`.
+What decides a result is digested: settings, inputs, all code of forcegp, and the package of the task's own module.
 """
 
 import hashlib
@@ -136,13 +135,13 @@ class JobStore:
         folder of something else or of another configuration, naming what differs.
         """
         store, wanted = cls(folder, kind), json.loads(json.dumps(dict(configuration)))  # as JSON stores it
-        stored: dict[str, Any] = {"kind": kind, "configuration": wanted}
-        there = (folder / DESCRIPTION).exists()
-        if there:
-            stored = read_json(folder / DESCRIPTION, f"choose another `folder`, or delete {folder}")
-        ours = stored.get("kind") == kind and (
-            there or not folder.exists() or (folder.is_dir() and all(map(_is_own_start, folder.iterdir())))
-        )
+        description = folder / DESCRIPTION
+        if description.exists():
+            stored = read_json(description, f"choose another `folder`, or delete {folder}")
+            ours = stored.get("kind") == kind
+        else:
+            stored = {"configuration": wanted}
+            ours = not folder.exists() or (folder.is_dir() and all(map(_is_own_start, folder.iterdir())))
         if not ours:
             raise InvalidInput(f"{folder} exists and was not written by `{kind}`; choose another `folder`.")
         before = stored.get("configuration") or {}
@@ -152,12 +151,12 @@ class JobStore:
             named = ", ".join(text if len(text) < 80 else name for name, text in given)
             more = "" if overwrite is None else ", or add `overwrite=True` to compute everything anew"
             raise InvalidInput(f"{folder} holds results with another {named}; choose another `folder`{more}.")
-        if overwrite or not there:
+        if overwrite or not description.exists():
             folder.mkdir(parents=True, exist_ok=True)
             with store.locked():
                 shutil.rmtree(folder / JOBS, ignore_errors=True)
                 (folder / JOBS).mkdir()
-                write_json(folder / DESCRIPTION, {"kind": kind, "configuration": wanted})
+                write_json(description, {"kind": kind, "configuration": wanted})
         return store
 
     @contextmanager
@@ -211,7 +210,6 @@ def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: 
     with store.locked():
         remove_leftovers(store.folder)
         waiting = {job.name: job for job in jobs if not store.has(job.name, wanted[job.name])}
-        count = len(waiting)
         require_writable(store.place("trial"))
         old = [name for name in waiting if store.place(name).exists()]
         if old:
@@ -221,18 +219,25 @@ def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: 
                 OutdatedWarning,
                 stacklevel=2,
             )
-        _compute_all(store, waiting, wanted, at_once, progress)
-    return count
+        try:
+            return _compute_all(store, waiting, wanted, at_once, progress)
+        finally:
+            remove_leftovers(store.folder)
 
 
 def _compute_all(
     store: JobStore, waiting: dict[str, Job], wanted: Mapping[str, str], at_once: Jobs, progress: Progress | None
-) -> None:
-    """Empty `waiting`: each job after its inputs, and of those that can begin the longest first."""
+) -> int:
+    """Each job after its inputs, and of those that can begin the longest first; how many were waiting."""
     executor, at_work = executor_for(at_once), dict[Future[Any], Job]()
-    count, total = len(waiting), sum(job.cost for job in waiting.values())
+    count, total, cost, full = len(waiting), sum(job.cost for job in waiting.values()), 0.0, False
     most = at_once if isinstance(at_once, int) else count
-    finished, failed, done, cost, full = wanted.keys() - waiting.keys(), dict[str, str](), 0, 0.0, False
+    finished, failed = set(wanted.keys() - waiting.keys()), dict[str, str]()
+
+    def kept() -> str:
+        done = count - len(waiting) - len(at_work) - len(failed)
+        return f"{done} of {count} jobs are kept, so the same command goes on from here"
+
     try:
         while True:
             ready = [job for job in waiting.values() if not full and finished.issuperset(job.inputs)]
@@ -244,11 +249,9 @@ def _compute_all(
             if not at_work:
                 break  # what still waits depends on jobs that failed
             for future in wait(at_work, return_when=FIRST_COMPLETED).done:
-                job = at_work.pop(future)
-                cost += job.cost
+                job = at_work[future]
                 try:
                     outcome_of(future)
-                    done += 1
                     finished.add(job.name)
                 except BackendError:
                     raise
@@ -256,23 +259,21 @@ def _compute_all(
                     own = isinstance(error, ForceGPError | OSError)
                     failed[job.name] = str(error) if own else f"{type(error).__name__}: {error}"
                     full |= isinstance(error, OSError)  # a full disk, say: what others compute could not be kept either
+                del at_work[future]
+                cost += job.cost
                 if progress is not None:
-                    note = f"{done + len(failed)} of {count} jobs, last {job.name}"
+                    note = f"{count - len(waiting) - len(at_work)} of {count} jobs, last {job.name}"
                     progress(int(cost * 10), max(1, int(total * 10)), note)
     except BackendError as error:
-        raise BackendError(f"{error}. {_kept(done, count)}") from None
+        raise BackendError(f"{error}. {kept()}") from None
     finally:
         stop(executor, at_work)
-        remove_leftovers(store.folder)
     if failed:
         name, cause = next(iter(failed.items()))
         others = f" and {len(failed) - 1} more failed" if len(failed) > 1 else " failed"
         skipped = f", {len(waiting)} that need them were left out" if waiting else ""
-        raise FitError(f"{name}{others}{skipped} ({cause}); {_kept(done, count)}")
-
-
-def _kept(done: int, count: int) -> str:
-    return f"{done} of {count} jobs are kept, so the same command goes on from here"
+        raise FitError(f"{name}{others}{skipped} ({cause}); {kept()}")
+    return count
 
 
 def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: Any) -> None:
@@ -284,14 +285,7 @@ def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: A
         folder.mkdir()
         warnings.simplefilter("always")
         result = task(store, job.spec, folder, *arguments)
-        stored = {
-            **digests,
-            "task": job.task,
-            "spec": dict(job.spec),
-            "machine": machine(),
-            "result": result,
-            "cpu_seconds": time.process_time() - start,
-            "wall_seconds": time.monotonic() - wall,
-            "warnings": sorted({str(warning.message) for warning in caught}),
-        }
+        spent = {"cpu_seconds": time.process_time() - start, "wall_seconds": time.monotonic() - wall}
+        told = {"warnings": sorted({str(warning.message) for warning in caught}), "machine": machine()}
+        stored = {**digests, "task": job.task, "spec": dict(job.spec), "result": result, **spent, **told}
         write_json(folder / RESULT_FILE, stored)

@@ -1,7 +1,6 @@
-"""Work at once: in this process, in processes that are kept between calls, or in any `concurrent.futures.Executor`.
+"""Work at once: `jobs` is 1 for this process, a number of own processes, or any `concurrent.futures.Executor`.
 
-Where a function takes `jobs`, 1 is this process, a number is so many processes of this machine, and an executor is
-used as it is: `ProcessPoolExecutor`, Dask's `client.get_executor()`, the pool of Ray or MPI. Outcomes are the same.
+Executors are used as they are: `ProcessPoolExecutor`, Dask's `client.get_executor()`, the pool of Ray or MPI.
 """
 
 import contextlib

@@ -30,8 +30,3 @@ def test_the_commands_are_commands(page):
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     parsed = [parse_arguments(shlex.split(line)[1:]) for line in commands.splitlines()]
     assert [type(command) for command in parsed] == [Import, Check, Import]
-
-
-def test_its_links_lead_somewhere(page, repository):
-    for target in re.findall(r"\]\(([^)#]+)\)", page):
-        assert (repository / "docs" / "how-to" / target).exists(), target

@@ -13,7 +13,8 @@ from tests.posterior.arm import URDF, arm_data, arm_model
 
 from forcegp import scores
 from forcegp.cli.main import main
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
+from forcegp.data.dataset_fields import sliding_joints
 from forcegp.model import Model
 from forcegp.posterior import load_posterior
 from forcegp.robots import Robot
@@ -125,7 +126,7 @@ def test_another_robot_keeps_gravity_armature_and_locked_joints_of_the_recording
         **two,
         model=Model(recorded),
         joint_names=recorded.joint_names,
-        units=units_for(recorded),
+        sliding=sliding_joints(recorded),
         noise_std=np.full(2, 0.5),
         truth={},
     ).save("locked.h5")

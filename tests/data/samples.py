@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from forcegp.data import REVOLUTE_UNITS, Dataset
+from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -38,7 +38,6 @@ def dataset(rows: int = 40, seed: int = 0, **changes: object) -> Dataset:
         "time": 0.01 * np.arange(rows),
         "episode": (np.arange(rows) >= rows // 2).astype(int),
         "joint_names": NAMES,
-        "units": REVOLUTE_UNITS,
         **changes,
     }
     return Dataset(**fields)

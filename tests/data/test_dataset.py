@@ -1,4 +1,3 @@
-import copy
 import dataclasses
 import json
 
@@ -31,15 +30,6 @@ def test_arrays_are_private_float64_contiguous_and_read_only():
         np.testing.assert_array_equal(values, before[name])
 
 
-def test_the_callers_arrays_stay_writable_and_unchanged():
-    given = columns()
-    kept = copy.deepcopy(given)
-    dataset(**given)
-    for name, values in given.items():
-        assert values.flags.writeable
-        np.testing.assert_array_equal(values, kept[name])
-
-
 def test_fields_cannot_be_replaced_nor_mappings_changed():
     data = complete()
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -69,32 +59,22 @@ def test_fields_cannot_be_replaced_nor_mappings_changed():
         ({"q": np.zeros((40, 3))}, r"q has shape \(40, 3\); expected \(rows, 2\)"),
         ({"v": np.zeros((39, 2))}, "v has 39 rows; expected 40"),
         ({"time": np.zeros((40, 1))}, r"time has shape \(40, 1\)"),
-        ({"time": np.zeros(3)}, "time has 3 rows"),
         ({"u": np.zeros((40, 2), dtype=complex)}, "u must be an array of real numbers"),
-        ({"u": np.full((40, 2), "a")}, "u must be an array of real numbers"),
         ({"u": [[1.0, 2.0], [1.0]]}, "u is not an array of real numbers"),
         ({"episode": np.zeros(40)}, "episode must be an array of integers"),
-        ({"episode": np.zeros(4, int)}, r"episode has shape \(4,\)"),
         ({"joint_names": ("a", "a")}, "repeats"),
         ({"joint_names": "ab"}, "sequence of non-empty texts"),
-        ({"joint_names": ("a", "")}, "sequence of non-empty texts"),
         ({"joint_names": ()}, "at least one joint"),
         ({"noise_std": np.array([0.1, 0.0])}, "'elbow' is 0.0; it must be > 0"),
         ({"noise_std": np.array([0.1])}, "noise_std has 1 joints; expected 2"),
-        ({"noise_std": np.full((40, 3), 0.1)}, r"noise_std has shape \(40, 3\); expected \(rows, 2\)"),
-        ({"noise_std": np.full((39, 2), 0.1)}, "noise_std has 39 rows; expected 40"),
         ({"noise_std": np.full((40, 2, 1), 0.1)}, r"noise_std has shape \(40, 2, 1\)"),
         (
             {"noise_std": np.diag([1.0, 0.0]).repeat(20, 0)},
             "noise_std of joint 'elbow' is 0.0 at row 0; it must be > 0",
         ),
-        ({"noise_std": np.full((40, 2), np.nan)}, r"noise_std is nan at row 0, column 0 \(shoulder\)"),
-        ({"noise_std": [[0.1, 0.1], [0.1]]}, "noise_std is not an array of real numbers"),
         ({"truth": {"force": np.zeros((40, 2))}}, "truth has no"),
         ({"truth": {"a": np.zeros((40, 3))}}, r"truth\['a'\] has shape"),
-        ({"truth": {"lambda": np.zeros((39, 1))}}, r"truth\['lambda'\] has 39 rows"),
         ({"metadata": {"x": float("nan")}}, "metadata cannot be written as JSON"),
-        ({"metadata": {"x": np.zeros(2)}}, "metadata cannot be written as JSON"),
         ({"metadata": {"x": {1: 2}}}, "a key is not text"),
     ],
 )
@@ -132,41 +112,21 @@ def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
 # ---------------------------------------------------------------- units and model
 
 
-@pytest.mark.parametrize(
-    ("units", "message"),
-    [
-        ({}, "must name exactly"),
-        ({**REVOLUTE_UNITS, "force": "N"}, "must name exactly"),
-        ({**REVOLUTE_UNITS, "q": "deg"}, "deg.*Convert"),
-        ({**REVOLUTE_UNITS, "q": "m"}, "joint 'shoulder' has units"),
-        ({**REVOLUTE_UNITS, "time": "ms"}, "only 's'"),
-        ({**REVOLUTE_UNITS, "q": ("rad",)}, "one text or 2 of them"),
-    ],
-)
-def test_units_that_do_not_fit_are_refused(units, message):
-    with pytest.raises(DatasetError, match=message):
-        dataset(units=units)
-
-
 def test_units_may_differ_between_joints():
-    units = {
-        "q": ("rad", "m"),
-        "v": ("rad/s", "m/s"),
-        "u": ("Nm", "N"),
-        "a": ("rad/s^2", "m/s^2"),
-        "time": "s",
-    }
-    assert dataset(units=units).units == units
-    assert units_for(model("prismatic").robot) == units
-    assert units_for(model().robot) == REVOLUTE_UNITS
+    units = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "u": ("Nm", "N"), "a": ("rad/s^2", "m/s^2"), "time": "s"}
+    assert dataset(sliding=("elbow",)).units == units_for(model("prismatic").robot) == units
+    assert dataset().units == units_for(model().robot) == REVOLUTE_UNITS
+    assert dataset(model=model("prismatic")).sliding == ("elbow",)
+    with pytest.raises(DatasetError, match=r"sliding joints are \['wrist'\]; joints are"):
+        dataset(sliding=("wrist",))
 
 
 def test_a_system_must_have_the_same_joints_and_units():
     assert dataset(model=model()).model is not None
     with pytest.raises(DatasetError, match="in the robot's order"):
         dataset(model=model(), joint_names=("elbow", "shoulder"))
-    with pytest.raises(DatasetError, match="joint types of 'slider'"):
-        dataset(model=model("prismatic"))
+    with pytest.raises(DatasetError, match=r"sliding joints are \[\]; those of the robot are \['elbow'\]"):
+        dataset(model=model("prismatic"), sliding=())
     with pytest.raises(DatasetError, match="3 columns; the model has 0 contacts"):
         dataset(model=model(), truth={"lambda": np.zeros((40, 3))})
 

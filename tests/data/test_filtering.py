@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from tests.data.samples import arrays, dataset
 
 from forcegp.data import (
-    REVOLUTE_UNITS,
     Dataset,
     Lag,
     Later,
@@ -36,7 +35,6 @@ def motion(time: np.ndarray = TIME, **changes: object) -> Dataset:
         "u": np.stack([np.cos(time), np.sin(time)], 1),
         "time": time,
         "joint_names": ("one", "two"),
-        "units": REVOLUTE_UNITS,
         **changes,
     }
     return Dataset(**fields)
@@ -68,8 +66,20 @@ def test_a_sine_comes_out_with_the_gain_that_the_filter_states(smooth, accuracy,
     np.testing.assert_allclose(gain, smooth.gain(np.array([frequency]), RATE)[0], atol=accuracy)
 
 
-def test_the_memory_of_noise_is_that_of_the_slowest_filter():
-    assert (LowPass(20.0) >> Lag(0.01) >> LowPass(50.0)).memory == LowPass(20.0).memory == pytest.approx(1 / 60)
+@pytest.mark.parametrize(
+    ("smooth", "memory"),
+    [(Mean(9), 4.5 / RATE), (Lag(0.1), 0.1 * np.log(2.0)), (Later(0.3), 0.5 / RATE), (LowPass(20.0), 1 / 62)],
+)
+def test_the_memory_of_noise_is_where_its_autocorrelation_is_one_half(smooth, memory):
+    """In closed form: 1 - k / n, exp(-t / T), none; and of noise behind the filter."""
+    assert smooth.memory(RATE) == pytest.approx(memory, rel=0.01)
+    both = smooth >> LowPass(30.0)
+    noise = np.random.default_rng(0).normal(size=(200_000, 1))
+    behind = both(noise, np.arange(len(noise)) / RATE)[2000:-2000, 0]
+    at = both.memory(RATE) * RATE
+    correlations = [behind[k:] @ behind[: len(behind) - k] for k in (0, int(at), int(at) + 1)]
+    share = correlations[1] + (at % 1) * (correlations[2] - correlations[1])
+    assert share / correlations[0] == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_straight_line_passes():
@@ -207,12 +217,3 @@ def test_resampling_of_uneven_rows():
     np.testing.assert_allclose(even.q, exact.q, atol=1e-6)
     np.testing.assert_allclose(even.v, exact.v, atol=1e-5)
     low_pass(even, 50.0)  # what the error message promises
-
-
-def test_resampling_keeps_the_rows_where_the_step_fits():
-    data = dataset(40, time=np.tile(0.01 * np.arange(20), 2), noise_std=np.ones(2), truth={"a": np.zeros((40, 2))})
-    again = resample(data, 0.01)
-    np.testing.assert_allclose(again.q, data.q, atol=1e-12)
-    np.testing.assert_array_equal(again.episode, data.episode)
-    assert again.truth == {}
-    assert again.noise_std is None

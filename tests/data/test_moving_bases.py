@@ -102,9 +102,7 @@ def test_neither_signs_nor_the_frame_of_the_world_matter(how):
         replace(x, q=x.model.robot.integrate(torch.tensor(x.q), bump).numpy(), v=x.v + bump.numpy())
         for x in (one, other)
     )
-    a, b = (
-        Preparation(cutoff=10.0, every=2, trim=0.2, delay=(0.004, 0.0, -0.002), **how).apply(x) for x in (one, other)
-    )
+    a, b = (Preparation(cutoff=10.0, every=2, trim=0.2, delay=0.004, **how).apply(x) for x in (one, other))
     np.testing.assert_allclose(a.v, b.v, atol=1e-9)
     np.testing.assert_allclose(a.a, b.a, atol=1e-8)
     np.testing.assert_allclose(a.u, b.u)
@@ -129,7 +127,6 @@ def test_the_automatic_cutoff_passes_the_motion_and_its_price_is_reported_per_jo
     noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
     prepared = Preparation(cutoff="auto", trim=0.5).apply(noisy)
     assert 1.0 < prepared.metadata["preparation"]["cutoff"] < 20.0
-    assert len(prepared.metadata["preparation"]["delay"]) == 3
 
 
 def test_what_no_filter_can_follow_is_refused():
@@ -142,8 +139,6 @@ def test_what_no_filter_can_follow_is_refused():
     fast = replace(log, q=log.model.robot.integrate(torch.tensor(log.q[:1]), spin).numpy())
     with pytest.raises(DatasetError, match="episode 0: 'base' turns faster than the filter passes"):
         low_pass(fast, 3.0)
-    with pytest.raises(InvalidInput, match="delay has 4 numbers; the dataset has 3 actuators"):
-        Preparation(delay=(0.0,) * 4).apply(log)
     loose = replace(log, model=Model(log.model.robot), u=log.u[:, :3])
     with pytest.raises(InvalidInput, match=r"a base that moves.* give the delay in s"):
         Preparation(delay="auto").apply(loose)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
-from forcegp.data import AirLaw, find_wind
+from forcegp.data import find_wind
 from forcegp.data.wind import steady_forces
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_point
@@ -81,11 +81,6 @@ def test_another_wind_is_observed_from_the_rows_before():
     after = law.wind_before(replace(other, a=changed))
     np.testing.assert_array_equal(after[:301], observed[:301])
     assert np.abs(after[301] - observed[301]).max() > 1e-3
-
-
-def test_a_law_comes_back_from_plain_numbers():
-    law, _ = find_wind(flight([(1.0, 2.0, 0.0)]))
-    assert AirLaw.from_dict(law.to_dict()) == law
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from forcegp.data import Dataset, Preparation, resample, units_for
+from forcegp.data import Dataset, Preparation, resample
 from forcegp.errors import DataWarning
 from forcegp.forces import Actuation, CoupledRotors, Law, RigidBodies
 from forcegp.model import Model
@@ -22,7 +22,7 @@ def dataset(model: Model, time, q, u, episode) -> Dataset:
     """A raw log: q and u as recorded; v and a are for `Preparation` to compute."""
     names, nothing = model.robot.joint_names, np.zeros_like(q)
     return Dataset(
-        q=q, v=nothing, u=u, a=nothing, time=time, joint_names=names, units=units_for(model.robot),
+        q=q, v=nothing, u=u, a=nothing, time=time, joint_names=names,
         model=model, episode=episode,
     )  # fmt: skip
 

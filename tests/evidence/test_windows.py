@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tests.data.test_moving_bases import jumbled, tumbling
 
-from forcegp.data import REVOLUTE_UNITS, Dataset, Preparation
+from forcegp.data import Dataset, Preparation
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.evidence import Windows
 from forcegp.evidence.evidence import white_noise
@@ -25,8 +25,8 @@ HOWS = {
 def log(q, v, a, time, episode=None) -> Dataset:
     columns = [np.stack([x, 2.0 * x], axis=1) for x in (q, v, np.sin(q), a)]
     q, v, u, a = columns
-    names, units = ("first", "second"), dict(REVOLUTE_UNITS)
-    return Dataset(q=q, v=v, u=u, a=a, time=time, joint_names=names, units=units, episode=episode)
+    names = ("first", "second")
+    return Dataset(q=q, v=v, u=u, a=a, time=time, joint_names=names, episode=episode)
 
 
 def sine(time, episode=None, frequency=9.0) -> Dataset:

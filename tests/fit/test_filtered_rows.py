@@ -11,13 +11,14 @@ from tests.posterior.arm import arm_model
 from torch import tensor
 
 from forcegp import Dataset, JointForces, fit
+from forcegp.data import LowPass
 from forcegp.errors import DataWarning
 from forcegp.fit.refinement import independent_rows
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 
 QUICK = OptimizerOptions(iterations=2)
-CUTOFF = 4.0  # Hz, so that rows within 1/12 s are alike
+CUTOFF = 4.0  # Hz, so that rows within .081 s are alike
 
 
 def filtered(rows: int = 480, seed: int = 0, cutoff: float | None = CUTOFF) -> Dataset:
@@ -47,7 +48,7 @@ def test_kept_rows_lie_apart_and_every_other_row_is_near_an_earlier_one(seed, ep
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         kept = independent_rows(log)
-    apart = 1.0 / (3.0 * CUTOFF) - 1e-9
+    apart = LowPass(CUTOFF).memory(100.0 * CUTOFF) - 1e-9
     rows = [int(np.flatnonzero(log.time == time)[0]) for time in kept.time]
     near = (np.abs(log.time[:, None] - log.time) < apart) & (log.episode[:, None] == log.episode)
     assert near[np.ix_(rows, rows)].sum() == len(rows)
@@ -77,7 +78,7 @@ def test_rows_that_are_left_out_are_warned_of():
     )
     with pytest.warns(
         DataWarning,
-        match=r"within 0\.083 s of .* of 200 rows lie further .*these alone teach the noise",
+        match=r"within 0\.081 s of .* of 200 rows lie further .*these alone teach the noise",
     ):
         fit(model, filtered(), points=200, **quick)
     with pytest.warns(DataWarning, match="too few, so all are taken, and learned noise may be none"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import functools
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from hypothesis import strategies as st
 from tests.fuzz.made import INPUTS, QUICK
 from tests.fuzz.oracle import DefectError, Target, allowed
+from tests.fuzz.values import words
 from tests.posterior.arm import URDF, arm_model
 from tests.robots.mjcf_models import FOUR_BAR
 
@@ -27,32 +29,15 @@ import forcegp.mechanics
 import forcegp.recordings
 import forcegp.scores
 import forcegp.simulation
-from forcegp import forces, mechanics
+from forcegp import KukaSurfaceConfig, forces, mechanics
 from forcegp.evidence import parse_evidence
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 
-STATE = (np.full(3, 0.3), np.full(3, 0.1), np.full(3, 0.5))
-POSE = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8])
-TEXTS = (
-    "",
-    "x",
-    "abc",
-    "10",
-    "nan",
-    "joint",
-    "\ud800",
-    "a\nb",
-    "auto",
-    "joint +",
-    "none",
-    "base",
-    "hand",
-    "pan",
-    "body",
-    "floating",
-    "planar",
-)
+STATE = tuple(torch.full((3,), number, dtype=torch.float64) for number in (0.3, 0.1, 0.5))
+POSE = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8]).double()
+STILL = torch.zeros(6).double()
+TEXTS = ("", "\ud800", "a\nb", "joint +", *words("x abc 10 nan joint auto none base hand pan body floating planar"))
 TENSORS = (
     lambda: torch.ones(3, dtype=torch.float64, requires_grad=True),
     lambda: torch.ones(3, dtype=torch.complex128),
@@ -62,23 +47,11 @@ TENSORS = (
     lambda: torch.tensor(float("nan")),
     lambda: torch.ones(2, 3).to_sparse(),
 )
+VALUES = (None, True, False, Ellipsis, NotImplemented, 0, -1, 1, 2, 3, 7, 2**63, 10**30, -0.0, 0.5, 1.5, 1e308, -1e308)
+VALUES += (1e-320, float("nan"), float("inf"), float("-inf"), 1j, b"x", *TEXTS, (), (1,), (1, 2, 3), (0.0, 0.0, 0.0))
+VALUES += (("pan",), (None,), (float("nan"),) * 3)
 MADE: dict[str, Callable[[], Any]] = {
-    **{
-        repr(value): functools.partial(lambda value: value, value)
-        for value in (None, True, False, Ellipsis, NotImplemented)
-    },
-    **{
-        repr(v): functools.partial(lambda v: v, v)
-        for v in (0, -1, 1, 2, 3, 7, 2**63, 10**30, -0.0, 0.5, 1.5, 1e308, -1e308, 1e-320)
-    },
-    **{
-        repr(v): functools.partial(lambda v: v, v)
-        for v in (float("nan"), float("inf"), float("-inf"), 1j, b"x", *TEXTS)
-    },
-    **{
-        repr(v): functools.partial(lambda v: v, v)
-        for v in ((), (1,), (1, 2, 3), (0.0, 0.0, 0.0), ("pan",), (None,), (float("nan"),) * 3)
-    },
+    **{repr(value): functools.partial(lambda value: value, value) for value in VALUES},
     "[]": list,
     "{}": dict,
     "[[1, 2], [3]]": lambda: [[1, 2], [3]],
@@ -134,7 +107,7 @@ MADE: dict[str, Callable[[], Any]] = {
 
 def _dataset() -> dict[str, Any]:
     data = INPUTS.data
-    names = ("q", "v", "u", "a", "time", "joint_names", "units", "episode", "model", "noise_std", "truth", "metadata")
+    names = ("q", "v", "u", "a", "time", "joint_names", "sliding", "episode", "model", "noise_std", "truth", "metadata")
     return {name: getattr(data, name) for name in names}
 
 
@@ -148,7 +121,7 @@ def _robot() -> Any:
 
 def _prior(kind: Any, **arguments: Any) -> Any:
     """A prior shows what is wrong with it where it meets a robot."""
-    dynamics = INPUTS.data.model.dynamics(*(torch.tensor(x)[None] for x in STATE))
+    dynamics = INPUTS.data.model.dynamics(*(x[None] for x in STATE))
     made = kind(**arguments)
     made.direction(dynamics), made.features(dynamics)
     made.latent_names(_robot())
@@ -160,28 +133,28 @@ def _forces(kind: Any, **arguments: Any) -> None:
     made = kind(**arguments)
     model = INPUTS.data.model.with_contacts(())
     known = (*model.forces, made)
-    forcegp.Model(model.robot, (), known).dynamics(*(torch.tensor(x) for x in STATE)).acceleration_map()
+    forcegp.Model(model.robot, (), known).dynamics(*STATE).acceleration_map()
 
 
 def _with(force: Any) -> Any:
-    return INPUTS.data.model.with_forces(force).dynamics(*(torch.tensor(x) for x in STATE)).A
+    return INPUTS.data.model.with_forces(force).dynamics(*STATE).A
 
 
 def _surface(kind: Any, **arguments: Any) -> Any:
     model = arm_model(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),))
-    return model.dynamics(*(torch.tensor(x) for x in STATE)).A
+    return model.dynamics(*STATE).A
 
 
 def _contact(**arguments: Any) -> Any:
-    return arm_model(0).with_contacts((forcegp.Contact(**arguments),)).dynamics(*(torch.tensor(x) for x in STATE)).A
+    return arm_model(0).with_contacts((forcegp.Contact(**arguments),)).dynamics(*STATE).A
 
 
 def _baumgarte(**arguments: Any) -> Any:
-    return arm_model(baumgarte=forcegp.mechanics.Baumgarte(**arguments)).dynamics(*(torch.tensor(x) for x in STATE)).b
+    return arm_model(baumgarte=forcegp.mechanics.Baumgarte(**arguments)).dynamics(*STATE).b
 
 
-def _robot_from(**arguments: Any) -> Any:
-    return forcegp.Robot.from_urdf_text(**arguments).forward_dynamics(*(torch.tensor(x) for x in STATE))
+def _robot_from(of: Any, **arguments: Any) -> Any:
+    return of(**arguments).forward_dynamics(*STATE)
 
 
 def _drone() -> Any:
@@ -193,384 +166,289 @@ def _link_force(kind: Any, **arguments: Any) -> Any:
     known = (made,) if kind is forcegp.forces.Actuation else (forcegp.forces.Actuation(), made)
     model = forcegp.Model(_drone(), (), (*known, forcegp.RigidBodies()))
     forcegp.Model.from_json(model.to_json())
-    return model.dynamics(POSE, np.zeros(6), np.ones(len(model.inputs))).M
-
-
-def _held(contacts: Any) -> Any:
-    model = INPUTS.moving.model.with_contacts(contacts)
-    return model.dynamics(POSE, np.zeros(6), np.ones(len(model.inputs))).A
-
-
-def _flying(made: Any) -> None:
-    dynamics = INPUTS.moving.model.dynamics(POSE[None], np.zeros((1, 6)), np.ones((1, 4)))
-    made.direction(dynamics), made.features(dynamics)
-    made.latent_names(_drone())
+    return model.dynamics(POSE, STILL, torch.ones(len(model.inputs)).double()).M
 
 
 def _fitted(noise: Any) -> Any:
     return fit(INPUTS.data.model.with_forces(JointForces(), noise=noise), INPUTS.data, restarts=1, options=QUICK)
 
 
-def _options(**arguments: Any) -> Any:
-    from forcegp.inference import OptimizerOptions
-
-    made = OptimizerOptions(**arguments)
+def _options(kind: Any, **arguments: Any) -> Any:
+    made = kind(**arguments)
     if isinstance(made.iterations, int) and made.iterations > 50:
         return None
     return fit(INPUTS.data.model.with_forces(JointForces()), INPUTS.data, points=6, restarts=1, options=made)
 
 
 def _engine(kind: Any, **arguments: Any) -> Any:
-    return fit(
-        INPUTS.data.model.with_forces(JointForces()),
-        INPUTS.data,
-        points=8,
-        restarts=1,
-        options=QUICK,
-        engine=kind(**arguments),
-    )
-
-
-def _control(kind: Any, of: Callable[[], Any], *more: Any, **arguments: Any) -> Any:
-    return kind(of(), *more, **arguments)(*STATE[:2], *(() if more else (STATE[0], STATE[1], STATE[2])))
+    how = {"points": 8, "restarts": 1, "options": QUICK, "engine": kind(**arguments)}
+    return fit(INPUTS.data.model.with_forces(JointForces()), INPUTS.data, **how)
 
 
 def _cost(q: torch.Tensor, v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
     return q.square().sum((-1, -2))
 
 
-TRACKING = {"stiffness": 10.0, "damping": None, "integral": 0.0, "dt": 0.01, "torque_limits": 50.0}
+TRACKING = {
+    "stiffness": 10.0,
+    "damping": None,
+    "integral": 0.0,
+    "dt": 0.01,
+    "torque_limits": 50.0,
+    "on_failure": "hold",
+}
 FIT = {"points": 6, "restarts": 1, "seed": 0, "options": QUICK}
 SURFACES = {"normal": (0.0, 0.0, 1.0), "offset": 0.1}
+
+
+def _call(
+    of: Callable[..., Any], use: Callable[..., Any] | None = None, names: str = "", given: Callable[..., Any] = dict
+) -> tuple[Callable[..., Any], Callable[[], dict[str, Any]]]:
+    """What is called, directly or by `use`; and its arguments: those `given`, and the defaults of these names."""
+
+    def arguments() -> dict[str, Any]:
+        parameters = inspect.signature(of).parameters
+        return {**given(), **{name: parameters[name].default for name in names.split()}}
+
+    return (of if use is None else functools.partial(use, of)), arguments
+
+
+def _of_posterior(name: str, then: Callable[[Any], Any] = lambda made: made, **more: Any) -> Callable[..., Any]:
+    return lambda _, **k: then(getattr(INPUTS.posterior, name)(**{**k, **more}))
+
+
+def _of_robot(name: str) -> Callable[..., Any]:
+    return lambda _, **k: getattr(_robot(), name)(**k)
+
+
+def _of_drone(name: str) -> Callable[..., Any]:
+    return lambda _, **k: getattr(_drone(), name)(**k)
+
+
+def _shown(kind: Any, **arguments: Any) -> str:
+    return str(kind(**arguments))
+
+
+def _held(kind: Any, **arguments: Any) -> Any:
+    model = INPUTS.moving.model.with_contacts(kind(**arguments))
+    return model.dynamics(POSE, STILL, torch.ones(len(model.inputs)).double()).A
+
+
+def _flying(kind: Any, **arguments: Any) -> None:
+    made, dynamics = kind(**arguments), INPUTS.moving.model.dynamics(POSE[None], STILL[None], torch.ones(1, 4).double())
+    made.direction(dynamics), made.features(dynamics)
+    made.latent_names(_drone())
+
+
+def _fit_of(model: Callable[[], Any]) -> Callable[..., Any]:
+    return lambda _, **k: fit(model(), **k)
+
+
+def _number(kind: Any, **arguments: Any) -> Any:
+    return _forces(forcegp.Viscous, damping=kind(**arguments))
+
+
+Posterior, Robot = forcegp.Posterior, forcegp.Robot
+POINT = (0.0, 0.0, 0.1)
 CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
-    "Dataset": (forcegp.Dataset, _dataset),
+    "Dataset": _call(forcegp.Dataset, given=_dataset),
     "Dataset.rows": (lambda index: INPUTS.data.rows(index), lambda: {"index": [0, 1]}),
     "Dataset[]": (lambda index: INPUTS.data[index], lambda: {"index": "q"}),
-    "predict": (lambda **k: INPUTS.posterior.predict(**k), lambda: {**_states(), "covariance": True}),
-    "components": (lambda **k: INPUTS.posterior.components(**k), lambda: {**_states(), "covariance": True}),
-    "rollout": (
-        lambda **k: str(INPUTS.posterior.rollout(**k)),  # NaN from where a motion diverges
-        lambda: {
-            "q0": STATE[0],
-            "v0": STATE[1],
-            "u": np.zeros((2, 3)),
-            "dt": 0.001,
-            "integrator": "rk4",
-            "samples": 0,
-            "seed": 0,
-            "baumgarte": None,
-        },
+    "Dataset.load": _call(forcegp.Dataset.load, given=lambda: {"path": INPUTS.folder / "train.h5"}),
+    "predict": _call(Posterior.predict, _of_posterior("predict"), "covariance", _states),
+    "components": _call(Posterior.components, _of_posterior("components"), "covariance", _states),
+    "rollout": _call(
+        Posterior.rollout,
+        _of_posterior("rollout", str),  # NaN from where a motion diverges
+        "integrator samples seed baumgarte",
+        lambda: {"q0": STATE[0], "v0": STATE[1], "u": torch.zeros(2, 3).double(), "dt": 0.001},
     ),
-    "update": (lambda **k: INPUTS.posterior.update(**k), lambda: {"rows": INPUTS.data.rows([9]), "budget": 8}),
-    "update (horizon)": (
-        lambda **k: INPUTS.posterior.update(**k).predict(*STATE),
-        lambda: {"rows": INPUTS.data.rows([9]), "horizon": 60.0},
+    "update": _call(
+        Posterior.update,
+        _of_posterior("update", lambda made: made.predict(*STATE)),
+        "budget horizon",
+        lambda: {"rows": INPUTS.data.rows([9])},
     ),
     "predictor().refreshed": (lambda **k: INPUTS.predictor.refreshed(**k), lambda: {"posterior": INPUTS.posterior}),
-    "curve": (lambda **k: INPUTS.posterior.curve(**k), lambda: {"latent": "pan", "features": None, "points": 5}),
-    "with_contacts": (lambda **k: INPUTS.posterior.with_contacts(**k), lambda: {"contacts": ()}),
-    "with_robot": (lambda **k: INPUTS.posterior.with_robot(**k), lambda: {"robot": _robot()}),
-    "with_model": (lambda **k: INPUTS.posterior.with_model(**k), lambda: {"model": INPUTS.data.model}),
-    "predictor": (
-        lambda **k: INPUTS.posterior.predictor(**{**k, "compile": False})(*STATE),
-        lambda: {"covariance": "auto", "tolerance": 0.01, "largest_rank": 64},
+    "curve": _call(Posterior.curve, _of_posterior("curve"), "features", lambda: {"latent": "pan", "points": 5}),
+    "with_contacts": _call(Posterior.with_contacts, _of_posterior("with_contacts"), given=lambda: {"contacts": ()}),
+    "with_robot": _call(Posterior.with_robot, _of_posterior("with_robot"), given=lambda: {"robot": _robot()}),
+    "with_model": _call(Posterior.with_model, _of_posterior("with_model"), given=lambda: {"model": INPUTS.data.model}),
+    "predictor": _call(
+        Posterior.predictor,
+        _of_posterior("predictor", lambda made: made(*STATE), compile=False),
+        "covariance tolerance largest_rank",
     ),
     "predictor()": (lambda **k: INPUTS.predictor(**k), _states),
     "predictor().mean": (lambda **k: INPUTS.predictor.mean(**k), _states),
-    "Noise": (lambda **k: _fitted(forcegp.Noise(**k)), lambda: {"acceleration": 0.1, "force": 0.1, "learn": False}),
+    "Noise": _call(
+        forcegp.Noise, lambda _, **k: _fitted(forcegp.Noise(**k)), "acceleration learn", lambda: {"force": 0.1}
+    ),
     "noise": (_fitted, lambda: {"noise": 0.1}),
-    "fit": (
-        lambda **k: fit(INPUTS.data.model.with_forces(JointForces()), **k),
-        lambda: {
-            "dataset": INPUTS.data,
-            "evidence": None,
-            **FIT,
-            "start": None,
-            "engine": "exact",
-            "learning_points": None,
+    "fit": _call(
+        fit,
+        _fit_of(lambda: INPUTS.data.model.with_forces(JointForces())),
+        "evidence start engine learning_points",
+        lambda: {"dataset": INPUTS.data, **FIT},
+    ),
+    "fit (laws)": _call(
+        fit,
+        _fit_of(lambda: INPUTS.free.model.with_forces(forcegp.Viscous())),
+        "baseline",
+        lambda: {"dataset": INPUTS.free, "evidence": forcegp.Torques(), "rows": 50},
+    ),
+    "IndependentAccelerations": _call(
+        forces.IndependentAccelerations,
+        lambda kind, **k: fit(INPUTS.data.model.without_mean().with_forces(kind(**k)), INPUTS.data, **FIT),
+        "inputs",
+    ),
+    "OptimizerOptions": _call(
+        forcegp.inference.OptimizerOptions, _options, "tolerance gradient_tolerance memory", lambda: {"iterations": 2}
+    ),
+    "Inducing": _call(forcegp.inference.Inducing, _engine, "tolerance refine", lambda: {"points": 5}),
+    "Robot.from_urdf_text": _call(
+        Robot.from_urdf_text, _robot_from, "gravity armature locked inertias base root", lambda: {"text": URDF}
+    ),
+    "Robot.from_mjcf_text": _call(
+        Robot.from_mjcf_text,
+        _shown,
+        given=lambda: {
+            "text": FOUR_BAR,
+            **dict.fromkeys(("gravity", "armature", "locked", "base")),
+            "inertias": "strict",
         },
     ),
-    "IndependentAccelerations": (
-        lambda **k: fit(
-            INPUTS.data.model.without_mean().with_forces(forcegp.forces.IndependentAccelerations(**k)),
-            INPUTS.data,
-            **FIT,
-        ),
-        lambda: {"inputs": ("q",)},
+    "Robot.from_urdf": _call(Robot.from_urdf, given=lambda: {"path": INPUTS.folder / "arm.urdf"}),
+    "Model.from_file": _call(
+        forcegp.Model.from_file, _shown, given=lambda: {"path": INPUTS.folder / "drone.xml", "base": None}
     ),
-    "OptimizerOptions": (
-        _options,
-        lambda: {
-            "iterations": 2,
-            "tolerance": 1e-8,
-            "gradient_tolerance": 1e-4,
-            "memory": 5,
-        },
+    "floating": (lambda **k: Robot.from_urdf_text(URDF, **k).neutral(), lambda: {"base": None, "locked": None}),
+    "integrate": _call(Robot.integrate, _of_drone("integrate"), given=lambda: {"q": POSE, "step": STILL + 0.1}),
+    "difference": _call(Robot.difference, _of_drone("difference"), given=lambda: {"q0": POSE, "q1": POSE}),
+    "normalized": _call(Robot.normalized, _of_drone("normalized"), given=lambda: {"q": POSE}),
+    "inverse_dynamics": _call(
+        Robot.inverse_dynamics, _of_robot("inverse_dynamics"), given=lambda: dict(zip("qva", STATE, strict=True))
     ),
-    "Robot.from_urdf_text": (
-        _robot_from,
-        lambda: {
-            **{"text": URDF, "gravity": (0.0, 0.0, -9.81), "armature": None, "locked": None},
-            **{"inertias": "strict", "base": None, "root": None},
-        },
-    ),
-    "Robot.from_mjcf_text": (
-        lambda **k: repr(forcegp.Robot.from_mjcf_text(**k)),
-        lambda: {
-            **{"text": FOUR_BAR, "gravity": None, "armature": None, "locked": None, "inertias": "strict"},
-            "base": None,
-        },
-    ),
-    "Model.from_file": (
-        lambda **k: repr(forcegp.Model.from_file(**k)),
-        lambda: {"path": INPUTS.folder / "drone.xml", "base": None, "locked": None},
-    ),
-    "floating": (
-        lambda **k: forcegp.Robot.from_urdf_text(URDF, **k).neutral(),
-        lambda: {"base": "floating", "locked": None, "armature": None},
-    ),
-    "integrate": (lambda **k: _drone().integrate(**k), lambda: {"q": POSE, "step": np.full(6, 0.1)}),
-    "difference": (lambda **k: _drone().difference(**k), lambda: {"q0": POSE, "q1": POSE}),
-    "normalized": (lambda **k: _drone().normalized(**k), lambda: {"q": POSE}),
+    "mass_matrix": _call(Robot.mass_matrix, _of_robot("mass_matrix"), given=lambda: {"q": STATE[0]}),
+    "frame_pose": (lambda frame, q: _robot().frame_pose(q, frame), lambda: {"frame": "hand", "q": STATE[0]}),
+    "with_armature": (lambda armature: _robot().with_armature(armature), lambda: {"armature": (0.1, 0.1, 0.1)}),
     "dynamics (drone)": (
         lambda **k: INPUTS.moving.model.dynamics(**k).M,
-        lambda: {"q": POSE, "v": np.full(6, 0.1), "u": np.full(4, 500.0)},
+        lambda: {"q": POSE, "v": STILL + 0.1, "u": torch.full((4,), 500.0).double()},
     ),
-    "Thrusters": (
-        functools.partial(_link_force, forces.Thrusters),
-        lambda: {
-            **{"frame": "body", "places": [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], "thrust": 1.0, "torque": 0.1},
-            **{"axes": (0.0, 0.0, 1.0), "power": 2, "names": ("one", "two")},
-        },
+    "Thrusters": _call(
+        forces.Thrusters,
+        _link_force,
+        "torque axes power names",
+        lambda: {"frame": "body", "places": [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], "thrust": 1.0},
     ),
-    "ObservedWrench": (
-        functools.partial(_link_force, forces.ObservedWrench),
-        lambda: {"frame": "body", "names": ("x", "y", "z")},
+    "ObservedWrench": _call(forces.ObservedWrench, _link_force, "names", lambda: {"frame": "body"}),
+    "Actuation": _call(
+        forces.Actuation, _link_force, given=lambda: {"matrix": np.ones((6, 2)), "names": ("one", "two")}
     ),
-    "Actuation": (
-        functools.partial(_link_force, forcegp.forces.Actuation),
-        lambda: {"matrix": np.ones((6, 2)), "names": ("one", "two")},
+    "fixed_point": _call(mechanics.fixed_point, _held, given=lambda: {"frame": "body", "point": POINT, "switch": "x"}),
+    "fixed_frame": _call(mechanics.fixed_frame, _held, given=lambda: {"frame": "body", "switch": "stands"}),
+    "loop_point": _call(
+        mechanics.loop_point,
+        _held,
+        given=lambda: {"frame_a": "body", "point_a": POINT, "frame_b": "body", "point_b": POINT, "switch": "stands"},
     ),
-    "fixed_point": (
-        lambda **k: _held(mechanics.fixed_point(**k)),
-        lambda: {"frame": "body", "point": (0.0, 0.0, 0.1), "switch": "stands"},
-    ),
-    "fixed_frame": (
-        lambda **k: _held(mechanics.fixed_frame(**k)),
-        lambda: {"frame": "body", "switch": "stands"},
-    ),
-    "loop_point": (
-        lambda **k: _held(mechanics.loop_point(**k)),
-        lambda: {
-            **{"frame_a": "body", "point_a": (0.0, 0.0, 0.1), "frame_b": "body", "point_b": (0.0, 0.0, 0.1)},
-            "switch": "stands",
-        },
-    ),
-    "AerodynamicForce": (
-        lambda **k: _flying(forcegp.AerodynamicForce(**k)),
-        lambda: {"frame": "body", "inputs": ("velocity", "thrust"), "kernel": "linear", "observe": 0.5},
-    ),
-    "BaseWrench": (
-        lambda **k: _flying(forcegp.forces.BaseWrench(**k)),
-        lambda: {"frame": "body", "inputs": ("velocity",), "kernel": "linear"},
-    ),
-    "QuadrotorConfig": (
-        forcegp.simulation.QuadrotorConfig,
-        lambda: {"seconds": 1.0, "seed": 0, "noise": 0.1, "episodes": 1, "wind": 4.0, "lag": 0.06},
-    ),
-    "Robot.from_urdf": (forcegp.Robot.from_urdf, lambda: {"path": INPUTS.folder / "arm.urdf"}),
-    "inverse_dynamics": (
-        lambda **k: _robot().inverse_dynamics(**k),
-        lambda: {"q": STATE[0], "v": STATE[1], "a": STATE[2]},
-    ),
-    "forward_dynamics": (
-        lambda **k: _robot().forward_dynamics(**k),
-        lambda: {"q": STATE[0], "v": STATE[1], "tau": STATE[2]},
-    ),
-    "mass_matrix": (lambda **k: _robot().mass_matrix(**k), lambda: {"q": STATE[0]}),
-    "frame_pose": (lambda frame, q: _robot().frame_pose(frame, q), lambda: {"frame": "hand", "q": STATE[0]}),
-    "with_armature": (lambda armature: _robot().with_armature(armature), lambda: {"armature": (0.1, 0.1, 0.1)}),
-    "Model": (
-        forcegp.Model,
-        lambda: {
-            "robot": _robot(),
-            "contacts": (),
-            "forces": (forcegp.forces.Actuation(),),
-            "noise": None,
-            "baumgarte": None,
-        },
-    ),
+    "AerodynamicForce": _call(forcegp.AerodynamicForce, _flying, "frame inputs kernel observe"),
+    "BaseWrench": _call(forces.BaseWrench, _flying, "frame inputs kernel"),
+    "QuadrotorConfig": _call(forcegp.simulation.QuadrotorConfig, names="seconds seed noise episodes wind lag"),
+    "KukaSurfaceConfig": _call(KukaSurfaceConfig, names="seconds seed noise surface friction tool_mass"),
+    "Model": _call(forcegp.Model, names="contacts forces noise baumgarte", given=lambda: {"robot": _robot()}),
     "dynamics": (lambda **k: INPUTS.data.model.dynamics(**k).A, _states),
-    "Contact": (_contact, lambda: {"frame": "hand", "point": (0.0, 0.0, 0.2), "surface": forcegp.Plane(**SURFACES)}),
-    "Plane": (functools.partial(_surface, forcegp.Plane), lambda: dict(SURFACES)),
-    "Sphere": (functools.partial(_surface, forcegp.Sphere), lambda: {"center": (0.0, 0.0, 0.1), "radius": 0.5}),
-    "Cylinder": (
-        functools.partial(_surface, forcegp.Cylinder),
-        lambda: {"point": (0.0, 0.0, 0.1), "axis": (1.0, 0.0, 0.0), "radius": 0.5},
+    "Contact": (_contact, lambda: {"frame": "hand", "point": POINT, "surface": forcegp.Plane(**SURFACES)}),
+    "Plane": _call(forcegp.Plane, _surface, given=lambda: dict(SURFACES)),
+    "Sphere": _call(forcegp.Sphere, _surface, given=lambda: {"center": POINT, "radius": 0.5}),
+    "Cylinder": _call(
+        forcegp.Cylinder, _surface, given=lambda: {"point": POINT, "axis": (1.0, 0.0, 0.0), "radius": 0.5}
     ),
     "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
-    "viscous": (functools.partial(_forces, forcegp.Viscous), lambda: {"damping": 0.1}),
-    "coulomb": (
-        functools.partial(_forces, forcegp.Coulomb),
-        lambda: {"level": 0.1, "velocity_scale": 0.01},
+    "viscous": _call(forcegp.Viscous, _forces, given=lambda: {"damping": 0.1}),
+    "coulomb": _call(forcegp.Coulomb, _forces, given=lambda: {"level": 0.1, "velocity_scale": 0.01}),
+    "stribeck": _call(
+        forcegp.Stribeck, _forces, given=lambda: {"level": 0.1, "breakaway": 0.1, "stribeck_velocity": 0.1}
     ),
-    "stribeck": (
-        functools.partial(_forces, forcegp.Stribeck),
-        lambda: {"level": 0.1, "breakaway": 0.1, "stribeck_velocity": 0.1},
+    "constant": _call(forcegp.Offset, _forces, given=lambda: {"value": 0.1}),
+    "direction": _call(forces.DirectionalFriction, _forces, given=lambda: {"difference": 0.1}),
+    "armature": _call(forcegp.Rotor, _forces, given=lambda: {"inertia": 0.1}),
+    "rotor": _call(forces.CoupledRotors, _forces, "transmission", lambda: {"inertia": 0.1}),
+    "load": _call(forcegp.LoadFriction, _forces, given=lambda: {"level": 0.1, "factor": 0.1}),
+    "spring": _call(forcegp.Spring, _forces, "rest", lambda: {"stiffness": 0.1}),
+    "Payload": _call(
+        forcegp.Payload, _forces, "inertia", lambda: {"link": "hand", "mass": 1.0, "center_of_mass": POINT}
     ),
-    "constant": (functools.partial(_forces, forcegp.Offset), lambda: {"value": 0.1}),
-    "direction": (functools.partial(_forces, forcegp.forces.DirectionalFriction), lambda: {"difference": 0.1}),
-    "armature": (functools.partial(_forces, forcegp.Rotor), lambda: {"inertia": 0.1}),
-    "rotor": (functools.partial(_forces, forcegp.forces.CoupledRotors), lambda: {"inertia": 0.1, "transmission": None}),
-    "load": (functools.partial(_forces, forcegp.LoadFriction), lambda: {"level": 0.1, "factor": 0.1}),
-    "spring": (functools.partial(_forces, forcegp.Spring), lambda: {"stiffness": 0.1, "rest": None}),
-    "Normal": (
-        lambda **k: _forces(forcegp.Viscous, damping=forcegp.Normal(**k)),
-        lambda: {"mean": 0.1, "std": 0.1},
-    ),
-    "LogNormal": (
-        lambda **k: _forces(forcegp.Coulomb, level=0.1, velocity_scale=forcegp.LogNormal(**k)),
-        lambda: {"median": 0.1, "spread": 1.0},
-    ),
-    "RigidBodies": (lambda **k: _with(forcegp.RigidBodies(**k)), lambda: {"learn": ("hand",)}),
+    "Normal": _call(forcegp.Normal, _number, given=lambda: {"mean": 0.1, "std": 0.1}),
+    "LogNormal": _call(forcegp.LogNormal, _number, given=lambda: {"median": 0.1, "spread": 1.0}),
+    "RigidBodies": _call(forcegp.RigidBodies, lambda kind, **k: _with(kind(**k)), given=lambda: {"learn": ("hand",)}),
     "with_forces": (
         lambda **k: INPUTS.data.model.with_forces(k["forces"], noise=k["noise"]),
         lambda: {"forces": forcegp.Viscous(), "noise": 0.1},
     ),
-    "parse_forces": (forces.parse_forces, lambda: {"expression": "gp:joint"}),
-    "parse_evidence": (parse_evidence, lambda: {"words": "torques:mean=.4"}),
-    "JointForces": (
-        functools.partial(_prior, forcegp.JointForces),
-        lambda: {"inputs": ("q",), "kernel": "linear", "angles": "plain"},
+    "parse_forces": _call(forces.parse_forces, given=lambda: {"expression": "gp:joint"}),
+    "parse_evidence": _call(parse_evidence, given=lambda: {"words": "torques:mean=.4"}),
+    "JointForces": _call(JointForces, _prior, "inputs kernel angles"),
+    "JointFriction": _call(forcegp.JointFriction, _prior, "joints kernel"),
+    "PeriodicJointForces": _call(forces.PeriodicJointForces, _prior, "period joints"),
+    "ToolForces": _call(
+        forcegp.ToolForces, _prior, "point axes inputs torque contact kernel", lambda: {"frame": "hand"}
     ),
-    "JointFriction": (functools.partial(_prior, forcegp.JointFriction), lambda: {"joints": None, "kernel": "friction"}),
-    "PeriodicJointForces": (
-        functools.partial(_prior, forcegp.forces.PeriodicJointForces),
-        lambda: {"period": 6.28, "joints": None},
+    "ContactFriction": _call(forcegp.ContactFriction, _prior, "contact axes load viscous inputs kernel"),
+    "Preparation": _call(
+        forcegp.data.Preparation,
+        lambda kind, **k: kind(**k).apply(INPUTS.free),
+        "delay lag every trim differentiate",
+        lambda: {"cutoff": 20.0},
     ),
-    "ToolForces": (
-        functools.partial(_prior, forcegp.ToolForces),
-        lambda: {
-            "frame": "hand",
-            "point": (0.0, 0.0, 0.0),
-            "axes": "world",
-            "inputs": ("velocity",),
-            "torque": False,
-            "contact": 0,
-            "kernel": "linear",
-        },
+    "ComputedTorque": _call(
+        forcegp.ComputedTorque,
+        lambda kind, **k: kind(arm_model(0), **k)(*STATE[:2], *STATE),
+        "forces_at",
+        lambda: dict(TRACKING),
     ),
-    "ContactFriction": (
-        functools.partial(_prior, forcegp.ContactFriction),
-        lambda: {
-            "contact": 0,
-            "axes": "isotropic",
-            "load": False,
-            "viscous": False,
-            "inputs": ("velocity",),
-            "kernel": None,
-        },
+    "PDGravity": _call(
+        forcegp.control.PDGravity,
+        lambda kind, **k: kind(_robot(), **k)(*STATE[:2], *STATE),
+        "",
+        lambda: dict(TRACKING),
     ),
-    "Payload": (
-        functools.partial(_forces, forcegp.Payload),
-        lambda: {"link": "hand", "mass": 1.0, "center_of_mass": (0.0, 0.0, 0.1), "inertia": None},
+    "ContactMonitor": _call(
+        forcegp.ContactMonitor,
+        lambda kind, **k: kind(arm_model(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
+        "bandwidth covariance",
+        lambda: {"dt": 0.01},
     ),
-    "Inducing": (
-        functools.partial(_engine, forcegp.inference.Inducing),
-        lambda: {"points": 5, "tolerance": 0.02, "refine": 0},
+    "MPPI": _call(
+        forcegp.MPPI,
+        lambda kind, **k: kind(INPUTS.predictor, _cost, **k)(*STATE[:2]),
+        "noise correlation temperature functions seed on_failure",
+        lambda: {"dt": 0.01, "steps": 2, "torque_limits": 5.0, "samples": 3, "integrator": "rk4"},
     ),
-    "Preparation": (
-        lambda **k: forcegp.data.Preparation(**k).apply(INPUTS.free),
-        lambda: {"cutoff": 20.0, "delay": 0.0, "every": 1, "trim": 0.0, "differentiate": "q"},
-    ),
-    "ComputedTorque": (
-        functools.partial(_control, forcegp.ComputedTorque, lambda: arm_model(0)),
-        lambda: {**TRACKING, "forces_at": "desired", "on_failure": "raise"},
-    ),
-    "PDGravity": (
-        functools.partial(_control, forcegp.control.PDGravity, _robot),
-        lambda: {**TRACKING, "on_failure": "hold"},
-    ),
-    "ContactMonitor": (
-        lambda **k: forcegp.ContactMonitor(arm_model(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
-        lambda: {"dt": 0.01, "bandwidth": 5.0, "covariance": "noise"},
-    ),
-    "MPPI": (
-        functools.partial(_control, forcegp.MPPI, lambda: INPUTS.predictor, _cost),
-        lambda: {
-            "dt": 0.01,
-            "steps": 2,
-            "torque_limits": 5.0,
-            "samples": 3,
-            "noise": None,
-            "correlation": 0.5,
-            "temperature": None,
-            "functions": 0,
-            "integrator": "rk4",
-            "seed": 0,
-            "on_failure": "raise",
-        },
-    ),
-    "excitation": (
+    "excitation": _call(
         forcegp.excitation,
+        None,
+        "margin start surfaces clearance task seed",
         lambda: {
-            "model": INPUTS.posterior.with_contacts(()),
-            "seconds": 1.0,
-            "limits": {"velocity": 1.0},
-            "margin": 0.9,
-            "start": None,
-            "surfaces": None,
-            "clearance": 0.05,
-            "task": None,
-            "rows": 5,
+            **{"model": INPUTS.posterior.with_contacts(()), "seconds": 1.0, "limits": {"velocity": 1.0}, "rows": 5},
             "motions": 2,
-            "seed": 0,
         },
     ),
-    "score": (
-        lambda **k: str(forcegp.score(**k)),
-        lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1},
+    "score": _call(
+        forcegp.score,
+        _shown,
+        given=lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1},
     ),
-    "check": (forcegp.check, lambda: {"dataset": INPUTS.free, "model": None, "preparation": None}),
-    "fit (laws)": (
-        lambda **k: fit(INPUTS.free.model.with_forces(forcegp.Viscous()), **k),
-        lambda: {"dataset": INPUTS.free, "evidence": forcegp.Torques(), "rows": 50, "baseline": None},
-    ),
-    "Torques": (forcegp.Torques, lambda: {"noisy": "u", "robust": False, "mean": None}),
-    "Motions": (forcegp.Motions, lambda: {"seconds": 1.0, "bodies": True}),
+    "check": _call(forcegp.check, None, "model preparation", lambda: {"dataset": INPUTS.free}),
+    "Torques": _call(forcegp.Torques, names="noisy robust mean"),
+    "Motions": _call(forcegp.Motions, names="seconds bodies"),
     "split_named": (forcegp.scores.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
-    "ColumnMapping": (
-        forcegp.recordings.ColumnMapping,
-        lambda: {
-            "time": "t",
-            "q": ("q",),
-            "u": ("u",),
-            "joints": ("a",),
-            "unit": {},
-            "sign": {},
-            "step": None,
-            "headerless": (),
-        },
-    ),
-    "ImportOptions": (
-        forcegp.recordings.ImportOptions,
-        lambda: {"gap": None, "rate": "auto", "start": None, "end": None},
-    ),
-    "KukaSurfaceConfig": (
-        forcegp.KukaSurfaceConfig,
-        lambda: {
-            "seconds": 1.0,
-            "seed": 0,
-            "noise": 0.1,
-            "surface": "plane",
-            "friction": None,
-            "patch_factor": 1.0,
-        },
-    ),
-    "Windows": (forcegp.Windows, lambda: {"seconds": 0.1, "nodes": 6, "signal": "q", "order": 2}),
-    "Body": (forcegp.forces.Body, lambda: {"strength": 1.0, "parts": ("mass",)}),
-    "load_posterior": (forcegp.load_posterior, lambda: {"path": INPUTS.folder / "carried", "contacts": None}),
-    "Dataset.load": (forcegp.Dataset.load, lambda: {"path": INPUTS.folder / "train.h5"}),
+    "ColumnMapping": _call(forcegp.recordings.ColumnMapping, names="time q u joints unit sign step headerless"),
+    "ImportOptions": _call(forcegp.recordings.ImportOptions, names="gap rate start end"),
+    "Windows": _call(forcegp.Windows, names="seconds nodes signal order"),
+    "Body": _call(forces.Body, names="strength parts"),
+    "load_posterior": _call(forcegp.load_posterior, given=lambda: {"path": INPUTS.folder / "carried"}),
 }
 
 

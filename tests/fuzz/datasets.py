@@ -14,24 +14,11 @@ import numpy as np
 from hypothesis import strategies as st
 from tests.fuzz.made import INPUTS
 from tests.fuzz.oracle import Target, allowed, require_ended_well, require_no_code
-from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, SCALARS, WORDS, Damage, damaged, edited_json
+from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, SCALARS, WORDS, Damage, damaged, edited_json, words
 
 from forcegp import Dataset
 
-NAMES = (
-    "q",
-    "v",
-    "u",
-    "a",
-    "time",
-    "episode",
-    "noise_std",
-    "truth/a",
-    "truth/lambda",
-    "joint_names",
-    "metadata",
-    "model",
-)
+NAMES = words("q v u a time episode noise_std truth/a truth/lambda joint_names metadata model")
 ATTRIBUTES = ("format", "format_version", "written_by", "time_ordered", "units")
 ARRAYS = {
     "no quaternions": lambda x: x * 1.5,
@@ -179,14 +166,13 @@ def check_commands(case: DataFile, folder: Path) -> None:
     """The same files under the commands that read datasets."""
     write(case, folder / "data.h5")
     number = sum(map(ord, repr(case)))
-    lag = "import data.h5 --cutoff 20 --lag auto --out o.h5"
-    words = (
+    lines = (
         "check data.h5",
-        lag,
+        "import data.h5 --cutoff 20 --lag auto --out o.h5",
         "import data.h5 --cutoff 20 --out o.h5",
         f"score {INPUTS.folder / 'carried'} data.h5",
     )
-    require_ended_well(words[number % 4].split(), folder)
+    require_ended_well(lines[number % 4].split(), folder)
 
 
 TARGET = Target(CASES, check, fast=25, nightly=3000)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from tests.fuzz.mappings import CASES as MAPPINGS
 from tests.fuzz.mappings import Mapping
 from tests.fuzz.mappings import write as write_mapping
 from tests.fuzz.oracle import Target, require_ended_well
-from tests.fuzz.values import DAMAGE, WORDS, Damage, Hostile, damaged
+from tests.fuzz.values import DAMAGE, WORDS, Damage, Hostile, damaged, words
 
 TABLE = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --joints shoulder,elbow"
 ARRAYS = "--time time --q q --v v --u u --joints shoulder,elbow"
@@ -96,31 +95,12 @@ class Log:
     more: tuple[str, ...]
 
 
-MORE = st.lists(
-    st.tuples(
-        st.sampled_from(
-            (
-                "--rate",
-                "--gap",
-                "--start",
-                "--end",
-                "--cutoff",
-                "--delimiter",
-                "--headerless",
-                "--unit",
-                "--sign",
-                "--step",
-                "--episode",
-                "--episodes",
-                "--a",
-                "--orientation",
-                "--axes",
-            )
-        ),
-        WORDS,
-    ),
-    max_size=2,
-).map(lambda pairs: tuple(word for pair in pairs for word in pair) if len(pairs) == 2 else ())
+OPTIONS = words(
+    "--rate --gap --start --end --cutoff --delimiter --headerless --unit --sign --step --episode --episodes"
+)
+MORE = st.lists(st.tuples(st.sampled_from((*OPTIONS, "--a", "--orientation", "--axes")), WORDS), max_size=2).map(
+    lambda pairs: tuple(word for pair in pairs for word in pair) if len(pairs) == 2 else ()
+)
 CASES = st.one_of(
     st.builds(Log, st.just("log.csv"), TABLES, MORE),
     st.builds(Log, st.just("log.csv"), DAMAGE, MORE),
@@ -151,13 +131,6 @@ def check(case: Log, folder: Path) -> None:
         lines = [change.delimiter.join(cells) for cells in (change.header, *change.rows)]
         path.write_bytes(change.end.join([*lines, ""]).encode(change.encoding, "replace"))
     require_ended_well(["import", case.base, *flags, *case.more, "--out", "out.h5"], folder)
-
-
-def npy(values: np.ndarray) -> bytes:
-    """The bytes of one array."""
-    buffer = io.BytesIO()
-    np.save(buffer, values)
-    return buffer.getvalue()
 
 
 TARGET = Target(CASES, check, fast=9, nightly=2000)

@@ -9,31 +9,14 @@ from typing import Any
 import yaml
 from hypothesis import strategies as st
 from tests.fuzz.oracle import CANARY, Target, allowed, require_no_code
-from tests.fuzz.values import DAMAGE, NUMBERS, SCALARS, WORDS, Damage, damaged
+from tests.fuzz.values import DAMAGE, SCALARS, WORDS, Damage, damaged, words
 
 from forcegp.recordings.mapping import mapping_text, read_mapping
 
 KEYS = ("time", "step", "q", "v", "u", "a", "joints", "unit", "sign", "episode", "episodes")
 KEYS += ("orientation", "axes", "ned", "headerless", "delimiter", "side_by_side", "x", "q")
-COLUMNS = (
-    "q_{joints}",
-    "q{1..7}",
-    "q{1..999999999}",
-    "q{7..1}",
-    "q{1..}",
-    "{joints}{joints}",
-    "a*b",
-    "2*a-b/3",
-    "a/0",
-    "((((a",
-)
-COLUMNS += (
-    "/joint_states:position",
-    "a+1e400*b",
-    "q{1..3}{1..3}{1..3}{1..3}{1..3}{1..3}{1..3}{1..3}",
-    "a" + "+a" * 3000,
-    "(" * 5000,
-)
+COLUMNS = words("q_{joints} q{1..7} q{1..999999999} q{7..1} q{1..} {joints}{joints} a*b 2*a-b/3 a/0 ((((a a+1e400*b")
+COLUMNS += ("/joint_states:position", "q" + 8 * "{1..3}", "a" + "+a" * 3000, "(" * 5000)
 PLAIN = SCALARS.filter(lambda value: value != "\ud800") | WORDS | st.sampled_from(COLUMNS)
 VALUES = st.recursive(
     PLAIN,
@@ -86,7 +69,6 @@ CASES = st.builds(
     | st.sampled_from(RAW).map(lambda text: ("raw", text)),
     st.none() | st.none() | st.none() | DAMAGE,
 )
-NUMBERS_OF = NUMBERS
 
 
 def write(case: Mapping, path: Path) -> None:

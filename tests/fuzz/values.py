@@ -12,56 +12,15 @@ from typing import Any
 from hypothesis import strategies as st
 from tests.fuzz.oracle import CANARY
 
-NUMBERS = ("0", "-0", "1", "-1", "2", "0.5", "1e400", "-1e400", "1e308", "1e-320", "nan", "NaN", "inf", "-inf")
-NUMBERS += (
-    "10000000000000000000000000",
-    "-9223372036854775809",
-    "1.5",
-    "1_000",
-    "0x10",
-    "1,5",
-    "٣",
-    "1e5000",
-    "+",
-    ".",
-)
-TEXTS = (
-    "",
-    " ",
-    "x",
-    "q",
-    "a,b",
-    ",",
-    "=",
-    ":",
-    "é",
-    "\u202e",
-    "🤖",
-    "a" * 5000,
-    "../..",
-    "%s",
-    "{}",
-    "{x}",
-)
-TEXTS += (
-    "[",
-    "-",
-    "--",
-    "none",
-    "auto",
-    "null",
-    "true",
-    "\t",
-    "a\nb",
-    "'",
-    '"',
-    "\\",
-    "*",
-    "**",
-    "$HOME",
-    "~",
-    "q_{joints}",
-)
+
+def words(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
+
+
+NUMBERS = words("0 -0 1 -1 2 0.5 1e400 -1e400 1e308 1e-320 nan NaN inf -inf 1.5 1_000 0x10 1,5 ٣ 1e5000 + .")
+NUMBERS += ("10000000000000000000000000", "-9223372036854775809")
+TEXTS = ("", " ", "\t", "a\nb", "a" * 5000, "\u202e")
+TEXTS += words("x q a,b , = : é 🤖 ../.. %s {} {x} [ - -- none auto null true ' \" \\ * ** $HOME ~ q_{joints}")
 WORDS = st.sampled_from(NUMBERS + TEXTS)
 
 PLAIN = (None, True, False, 0, -0.0, 1, -1, 2, 10**30, 2**63, 1.5, 1e308, -1e308, 1e-320, float("nan"), float("inf"))
@@ -210,93 +169,27 @@ MJCF_EDITS = st.builds(
     st.integers(0, 500),
     st.sampled_from(("drop", "twice", "lose", "tag", "into", "swap", "extra", *["attribute"] * 8)),
     st.sampled_from(
-        [
-            "name",
-            "joint",
-            "joint1",
-            "body1",
-            "site",
-            "range",
-            "axis",
-            "pos",
-            "type",
-            "ref",
-            "mass",
-            "armature",
-            "polycoef",
-            "gear",
-            "anchor",
-            "fullinertia",
-            "mimic",
-            "freejoint",
-            "replicate",
-            "count",
-            "include",
-            "file",
-            "equality",
-            "connect",
-            "weld",
-            "actuator",
-            "motor",
-            "option",
-            "compiler",
-            "default",
-            "class",
-            "multiplier",
-            "offset",
-            "euler",
-            "quat",
-            "damping",
-            "limited",
-            "size",
-            "geom",
-            "body",
-            "springref",
-            "stiffness",
-        ]
+        words(
+            "name joint joint1 body1 site range axis pos type ref mass armature polycoef gear anchor fullinertia mimic "
+            "freejoint replicate count include file equality connect weld actuator motor option compiler default class "
+            "multiplier offset euler quat damping limited size geom body springref stiffness"
+        )
     ),
     st.sampled_from(
         (
-            *NUMBERS,
-            "0 0 0",
-            "0 0 0 0",
-            "1 2",
-            "nan 0 0",
-            "1e200 0 0",
-            "free",
-            "ball",
-            "slide",
-            "hinge",
-            "floating",
-            "planar",
-            "left",
-            "right",
-            "crank",
-            "coupler",
-            "world",
-            "true",
-            "radian",
-            "a" * 5000,
-            "",
-            "../secret.txt",
-            "secret.txt",
-            "x/y",
+            *(*NUMBERS, "0 0 0", "0 0 0 0", "1 2", "nan 0 0", "1e200 0 0", "a" * 5000, ""),
+            *words("../secret.txt secret.txt x/y free ball slide hinge floating planar left right crank coupler world"),
+            *words("true radian"),
         )
     ),
 )
 """Also for mimic joints and moving bases of URDF."""
 PROLOGUES = {
     "none": b"",
-    "punycode": b'<?xml version="1.0" encoding="punycode"?>',
-    "utf-7": b'<?xml version="1.0" encoding="utf-7"?>',
-    "idna": b'<?xml version="1.0" encoding="idna"?>',
-    "zlib": b'<?xml version="1.0" encoding="zlib"?>',
-    "rot13": b'<?xml version="1.0" encoding="rot13"?>',
-    "undefined": b'<?xml version="1.0" encoding="undefined"?>',
-    "unicode_escape": b'<?xml version="1.0" encoding="unicode_escape"?>',
-    "utf-16": b'<?xml version="1.0" encoding="utf-16"?>',
-    "nothing": b'<?xml version="1.0" encoding=""?>',
-    "NUL": b'<?xml version="1.0" encoding="\x00"?>',
+    **{
+        name: b'<?xml version="1.0" encoding="%s"?>' % name.encode()
+        for name in ("", "\x00", *words("punycode utf-7 idna zlib rot13 undefined unicode_escape utf-16"))
+    },
     "version": b'<?xml version="1e400"?>',
     "mark": b"\xff\xfe",
     "bomb": b'<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">'

@@ -72,15 +72,6 @@ def test_only_one_at_a_time(results):
         pass  # free again
 
 
-def test_leftovers_of_killed_runs_go(results):
-    store(results, "fits/a", "1", {})
-    leftover = results.folder / "jobs" / "fits" / ".b.0123456789ab.tmp"
-    leftover.mkdir()
-    remove_leftovers(results.folder)
-    assert not leftover.exists()
-    assert results.has("fits/a", "1")
-
-
 def test_a_run_killed_before_its_description_does_not_block_the_folder(tmp_path):
     folder = tmp_path / "out"
     left = folder / ".jobs.json.0123456789ab.tmp"

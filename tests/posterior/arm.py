@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.forces import Actuation, RigidBodies, Unknown, kernel_of
 from forcegp.mechanics import Baumgarte, Contact, Plane
 from forcegp.model import Model
@@ -104,7 +104,6 @@ def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
         a=a + generator.normal(0.0, NOISE, a.shape),
         time=np.arange(rows) * 0.01,
         joint_names=model.robot.joint_names,
-        units=units_for(model.robot),
         model=model,
         noise_std=np.full(3, NOISE),
         truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},

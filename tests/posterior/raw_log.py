@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from tests.posterior.arm import arm_model, unknown_force
 
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 
 STEP = 0.002
 SENSOR = 2e-5
@@ -33,7 +33,6 @@ def motion(seconds: float = 3.0, seed: int = 0, noise: float = SENSOR) -> Datase
         a=np.full_like(measured, 1e3),  # nobody may look at it
         time=time,
         joint_names=model.robot.joint_names,
-        units=units_for(model.robot),
         model=model,
         truth={"a": a},
     )

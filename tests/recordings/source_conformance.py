@@ -67,11 +67,6 @@ class SourceConformance(ABC):
         for name in names:
             np.testing.assert_array_equal(read[name], self.expected()[name])
 
-    def test_a_log_can_be_read_again(self, source):
-        name = next(iter(self.expected()))
-        first, second = (self.read(source, [name])[name] for _ in range(2))
-        np.testing.assert_array_equal(first, second)
-
     def test_vectors_stand_for_columns(self, source):
         columns = set(source.columns())
         assert all(elements and set(elements) <= columns for elements in source.vectors.values())

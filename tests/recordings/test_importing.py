@@ -97,14 +97,6 @@ def test_even_times_and_differences_are_those_of_another_spline(tmp_path, logged
         np.testing.assert_allclose(getattr(found, name), values, rtol=0, atol=rounding * np.abs(values).max())
 
 
-def test_every_stamp_is_kept_if_told_so(tmp_path):
-    data = uneven()
-    found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES, rate="log")
-    np.testing.assert_array_equal(found.time, data["time"] - data["time"][0])
-    np.testing.assert_array_equal(found.q, data["q"])
-    np.testing.assert_array_equal(found.a, differentiate(data["v"], found.time))
-
-
 def test_a_rate_that_is_asked_for_is_the_rate(tmp_path):
     path = write_text(tmp_path / "log.csv", table(motion()))
     found = imported(path, NAMES, rate=1000.0)

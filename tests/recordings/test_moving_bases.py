@@ -247,20 +247,6 @@ def test_motors_of_an_mjcf_file_are_the_inputs(tmp_path, flight):
     np.testing.assert_array_equal(found.u, flight.u)
 
 
-@pytest.mark.parametrize(
-    "mapping",
-    [
-        replace(PLAIN, q=("q0",), joints=("a",), orientation="wxyz"),
-        replace(PLAIN, q=("q0",), joints=("a",), ned=True),
-        replace(PLAIN, q=("q0",), joints=("a",), axes={"v": ("world",)}),
-    ],
-)
-def test_without_a_base_that_moves_nothing_of_it_can_be_stated(tmp_path, flight, mapping):
-    path = write_text(tmp_path / "log.csv", columns(flight))
-    with pytest.raises(InvalidInput, match="about a base that moves"):
-        import_recordings([path], mapping)
-
-
 def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
     """A body that tumbles in free fall: the dynamics of the robot give the accelerations that were imported."""
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")

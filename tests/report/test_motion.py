@@ -93,7 +93,7 @@ def test_a_dataset_without_robot_is_refused(swinging):
         a=swinging.a,
         time=swinging.time,
         joint_names=swinging.joint_names,
-        units=swinging.units,
+        sliding=swinging.sliding,
     )
     with pytest.raises(InvalidInput, match="holds no robot"):
         recorded_scene(bare)

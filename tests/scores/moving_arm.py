@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tests.posterior.arm import URDF
 
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.forces import Actuation, Coulomb, RigidBodies, Stribeck, Viscous
 from forcegp.integration import integrator_named
 from forcegp.model import Model
@@ -70,7 +70,6 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
         time=np.tile(time, episodes),
         episode=np.repeat(np.arange(episodes), rows),
         joint_names=given.robot.joint_names,
-        units=units_for(given.robot),
         model=given,
         noise_std=np.full(3, NOISE),
     )

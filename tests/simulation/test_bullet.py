@@ -110,16 +110,6 @@ def test_torques_that_are_not_finite_are_refused(arm):
         arm.step(np.full(7, np.nan))
 
 
-def test_leaving_disconnects():
-    import pybullet
-
-    with BulletArm(urdf(), gravity=9.8, time_step=STEP, tool_point=POINT) as arm:
-        client = arm.client
-        assert pybullet.isConnected(client)
-    assert not pybullet.isConnected(client)
-    arm.close()
-
-
 def test_loading_prints_nothing_that_would_spoil_json(capfd):
     BulletArm(urdf(), gravity=9.8, time_step=STEP, tool_point=POINT).close()
     assert capfd.readouterr().out == ""

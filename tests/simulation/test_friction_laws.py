@@ -15,8 +15,8 @@ from forcegp.forces.force import JointLaw
 from forcegp.forces.parameters import Coefficient
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.contact_forces import DryFriction, RoughPatch, ViscousFriction, multiplier_with_friction
 from forcegp.simulation.joint_friction import LawsOfJoints
+from forcegp.simulation.kuka_surface import DryFriction, ViscousFriction, multiplier_with_friction
 
 STRIBECK = DryFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
 ROBOT = Robot.from_urdf_text(
@@ -42,15 +42,13 @@ def test_dry_friction_at_speeds_known_by_hand():
     np.testing.assert_allclose(coulomb.force(np.array([0.03, 0.0, 7.0]), UP), [-0.18, 0.0, 0.0], atol=1e-15)
 
 
-def test_joint_friction_and_the_patch_at_values_known_by_hand():
+def test_joint_friction_at_values_known_by_hand():
     law = joint_law("stribeck", joint_smoothing=1e-6)
     np.testing.assert_allclose(law.curve(v := np.full(7, 0.2)), C + (S - C) / np.e + D * v, atol=1e-12)
     np.testing.assert_allclose(law.curve(np.full((1, 7), -10.0)), [-C - 10.0 * D], atol=1e-12)
     np.testing.assert_array_equal(law.step(v, U, INERTIA, 3.0), -law.curve(v))
     law = joint_law("exponential", joint_smoothing=1e-6, joint_breakaway_velocity=0.5)
     np.testing.assert_allclose(law.curve(np.full(7, -1.0)), -(C + (S - C) * np.exp(-2.0) + D), atol=1e-12)
-    patch = RoughPatch(0.0, 0.25, factor=4.0)
-    np.testing.assert_allclose([patch.scale(x) for x in (-0.1, 0.0, 0.1, 0.25, 0.4)], [1, 2.5, 4, 2.5, 1], atol=1e-12)
 
 
 @given(velocity=vectors, normal=vectors, smoothing=st.floats(1e-3, 1.0))
@@ -107,19 +105,6 @@ def test_a_hard_sign_differs_by_direction_and_stops_a_joint_without_turning_it_r
     slow = np.full(7, 1e-6)
     stopped = slow + DT * (law.step(slow, U, INERTIA, 0.0) + D * slow) / INERTIA.diagonal()
     np.testing.assert_allclose(stopped, 0.0, atol=1e-15)
-
-
-def test_friction_under_load_is_larger_where_the_torque_drives():
-    law, v = joint_law("load", joint_smoothing=1e-6), np.full(7, 0.5)
-    expected = C + np.where(U > 0.0, 0.04, 0.015) * np.abs(U) + D * v
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 0.0), -expected, atol=1e-12)
-
-
-def test_friction_falls_as_gears_warm_up():
-    law, v = joint_law("drift", joint_smoothing=1e-6), np.full(7, -0.5)
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 0.0), C - D * v, atol=1e-12)
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 1e4), 0.7 * C - D * v, atol=1e-12)
-    np.testing.assert_allclose(law.step(v, U, INERTIA, 60.0), C * (1.0 - 0.3 * (1.0 - 1.0 / np.e)) - D * v, atol=1e-12)
 
 
 def test_bristles_are_a_spring_before_they_slide_and_follow_the_curve_afterwards():

@@ -3,23 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from tests.data.samples import assert_equal
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, SimulationError
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.simulation.contact_forces import DryFriction, RoughPatch
+from forcegp.simulation.kuka_surface import DryFriction
 
 pytest.importorskip("pybullet")
 
 SCENES = {
     "stribeck": {"friction": "stribeck", "joint_friction": "stribeck"},
-    "patch": {"patch_factor": 4.0},
     "tilted": {"surface": "tilted", "friction": "stribeck"},
     "sphere": {"surface": "sphere", "friction": "coulomb"},
     "none": {"surface": "none", "joint_friction": "stribeck"},
-    "bullet": {"contact": "bullet", "seconds": 6.0},
-    "bullet-sphere": {"contact": "bullet", "surface": "sphere"},
 }
 
 
@@ -56,7 +52,7 @@ def test_the_equations_of_motion_hold_in_every_row(scenes, name):
         (multiplier,) = tensors(data, "lambda")
         force = force + (dynamics.A.mT @ multiplier[..., None])[..., 0]
     np.testing.assert_allclose(data.model.robot.inverse_dynamics(q, v, a), force, rtol=0, atol=1e-10)
-    if not name.startswith(("bullet", "none")):
+    if name != "none":
         np.testing.assert_allclose((dynamics.A @ a[..., None])[..., 0], dynamics.b, rtol=0, atol=1e-10)
 
 
@@ -67,7 +63,6 @@ def test_parts_of_the_unknown_force_exist_where_the_force_does_and_add_up(scenes
     expected = set() if made.surface == "none" else {"Q_U.tool-friction"}
     expected |= {"Q_U.joint-friction"} if made.joint_friction != "none" else set()
     assert parts == expected
-    assert ("in_contact" in data.truth) == (made.contact == "bullet")
     assert ("lambda" in data.truth) == ("force.tool-friction" in data.truth) == (made.surface != "none")
     assert len(data.model.contacts) == (made.surface != "none")
     np.testing.assert_allclose(sum(data.truth[part] for part in parts), data.truth["Q_U"], atol=1e-13)
@@ -98,15 +93,6 @@ def test_joint_friction_is_its_law(scenes):
     )
 
 
-def test_the_patch_multiplies_viscous_friction_where_it_lies(scenes):
-    data = scenes["patch"]
-    _, velocity, _, place = tool_motion(data)
-    scale = np.array([RoughPatch(0.0, 0.25, 4.0).scale(x) for x in place[:, 0]])
-    np.testing.assert_allclose(data.truth["force.tool-friction"], -scale[:, None] * velocity, atol=1e-10)
-    assert (scale > 3.9).any()
-    assert (scale < 1.1).any()
-
-
 def test_free_motion_stays_above_the_table(scenes):
     data = scenes["none"]
     pose = data.model.robot.frame_pose(torch.tensor(data.q), "lbr_iiwa_link_7").numpy()
@@ -115,45 +101,11 @@ def test_free_motion_stays_above_the_table(scenes):
     assert data.model.contacts == ()
 
 
-@pytest.mark.parametrize("name", ["bullet", "bullet-sphere"])
-def test_bullets_contact_only_pushes_within_its_friction_cone(scenes, name):
-    data = scenes[name]
-    on, load = data.truth["in_contact"][:, 0].astype(bool), data.truth["lambda"][:, 0]
-    force = data.truth["force.tool-friction"]
-    assert (load[on] > 0.0).all()
-    assert not load[~on].any()
-    assert not force[~on].any()
-    np.testing.assert_array_equal(data.truth["Q_U"][~on], 0.0)
-    ratio = np.linalg.norm(force, axis=1)[on] / load[on]
-    assert ratio.max() < 0.3 * 1.01
-    jacobian, velocity, _, _ = tool_motion(data)
-    fast = on & (np.linalg.norm(velocity, axis=1) > 0.1)
-    assert np.median(np.linalg.norm(force, axis=1)[fast] / load[fast]) == pytest.approx(0.3, rel=0.02)
-    assert ((force * velocity).sum(1)[fast] < 0.0).mean() > 0.99
-    # A lever arm of 1 mm is all that lies between PyBullet's force at the sphere and one at the tool point.
-    torques = (jacobian.transpose(0, 2, 1) @ force[..., None])[..., 0]
-    arm = np.abs(data.truth["Q_U.tool-friction"] - torques).max(axis=1)
-    assert (arm <= 1.5e-3 * np.linalg.norm(force, axis=1) + 1e-3).mean() > 0.99
-
-
-def test_the_tool_leaves_bullets_surface_now_and_then(scenes):
-    share = 1.0 - scenes["bullet"].truth["in_contact"].mean()
-    assert 0.02 < share < 0.6
-
-
-def test_equal_seeds_give_equal_data(scenes):
-    assert_equal(simulate_kuka_surface(config("stribeck")), scenes["stribeck"])
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"friction": "wet"}, "no friction .wet. in the tool"),
         ({"surface": "cone"}, "no surface 'cone'"),
-        ({"contact": "bullet", "surface": "none"}, "needs a surface"),
-        ({"contact": "bullet", "friction": "viscous"}, "has Coulomb friction"),
-        ({"contact": "bullet", "patch_factor": 2.0}, "ideal contact"),
-        ({"surface": "none", "patch_factor": 2.0}, "needs a surface"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(changes, message):

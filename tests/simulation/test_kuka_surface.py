@@ -8,7 +8,7 @@ import torch
 from tests.data.samples import assert_equal
 
 from forcegp.data import REVOLUTE_UNITS, Dataset, require_disjoint
-from forcegp.errors import DatasetError, InvalidInput, SimulationError
+from forcegp.errors import InvalidInput, SimulationError
 from forcegp.mechanics import Plane
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig, simulate, simulate_kuka_surface
@@ -35,21 +35,6 @@ def tensors(data: Dataset, *names: str) -> list[torch.Tensor]:
 
 
 # ---------------------------------------------------------------- the physics, by forcegp's own robot
-
-
-def test_rigid_body_dynamics_holds_in_every_row(data):
-    q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
-    dynamics = data.model.dynamics(q, v, u)
-    force = u + unknown + (dynamics.A.mT @ multiplier[..., None])[..., 0]
-    found = data.model.robot.inverse_dynamics(q, v, a)
-    np.testing.assert_allclose(found, force, rtol=0, atol=1e-10)
-
-
-def test_the_constraint_with_baumgarte_holds_in_every_row(data):
-    q, v, u, a = tensors(data, "q", "v", "u", "a")
-    dynamics = data.model.dynamics(q, v, u)
-    residual = (dynamics.A @ a[..., None])[..., 0] - dynamics.b
-    assert float(residual.abs().max()) < 1e-10
 
 
 def test_gauss_principle_gives_acceleration_and_multiplier_from_the_true_force(data):
@@ -149,11 +134,6 @@ def test_other_seeds_and_episodes_are_other_trajectories(short):
         assert np.abs(one.q - another.q).max() > 0.1
         assert abs(np.corrcoef((one.a - one.truth["a"]).ravel(), (another.a - another.truth["a"]).ravel())[0, 1]) < 0.1
         require_disjoint(one, another)
-
-
-def test_two_samples_of_one_simulation_are_recognised(short):
-    with pytest.raises(DatasetError, match="same trajectory"):
-        require_disjoint(short.rows(slice(0, None, 2)), short.rows(slice(1, None, 2)))
 
 
 def test_a_longer_recording_begins_like_a_shorter_one(short):

@@ -14,8 +14,6 @@ from forcegp.fit import calibrated
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
 from forcegp.posterior.observed_wrench import _lasting
-from forcegp.report.motion import recorded_scene
-from forcegp.scores.predicted_rows import predict_rows
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 
@@ -58,11 +56,6 @@ def test_without_wind_at_rest_only_thrust_and_lag_are_unknown():
     known = calm.model.dynamics(*(torch.tensor(x) for x in (calm.q, calm.v, calm.u)))
     a = known.acceleration(torch.tensor(calm.truth["Q_U"]))
     np.testing.assert_allclose(a, calm.truth["a"], atol=1e-9)
-
-
-def test_equal_seeds_give_equal_flights(test):
-    again = simulate_quadrotor(QuadrotorConfig(seconds=0.5, seed=2, wind=8.0))
-    np.testing.assert_array_equal(again.truth["a"], test.truth["a"][: len(again)])
 
 
 def test_the_lag_of_the_rotors_is_found(train):
@@ -113,13 +106,6 @@ def test_a_load_on_an_arm_beneath_is_no_lag():
     rows = {"q": torch.stack(q).numpy(), "v": v.T, "a": a.T, "u": u, "time": time}
     found, _ = estimate_thruster_lag(Dataset(**rows, model=model))
     assert found == pytest.approx(0.06, abs=0.01)
-
-
-def test_a_lag_needs_thrusters(train):
-    joints = Actuation(torch.zeros(6, 4, dtype=torch.float64), ("a", "b", "c", "d"))
-    model = replace(train.model, forces=(joints, RigidBodies()))
-    with pytest.raises(InvalidInput, match="Thrusters"):
-        estimate_thruster_lag(replace(train, model=model, truth={}))
 
 
 def test_new_wind_is_observed_from_the_past(posterior, test):
@@ -230,14 +216,6 @@ def test_a_fit_reports_that_no_wind_was_found(posterior):
     assert fit_summary(posterior, 1.0)["wind"] == posterior.settings["air"]["wind"]
 
 
-def test_known_physics_alone_has_no_observer(posterior, test):
-    rows = acting(test).rows(np.arange(200))
-    seeing, seen = observing(posterior, rows)
-    known = predict_rows(seeing, seen).known_physics
-    there = rows.rows(np.arange(len(rows) - len(seen), len(rows)))
-    np.testing.assert_allclose(known, predict_rows(posterior, there).known_physics, rtol=1e-10, atol=1e-10)
-
-
 def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
     rows = acting(test).rows(np.arange(3))
     predictor = posterior.predictor(compile=False)
@@ -286,11 +264,3 @@ def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
         warnings.simplefilter("ignore")
         again = fit(posterior.model, rows, points=40, restarts=1)  # too few rows to show their wind
     assert again.model.inputs == train.model.inputs
-
-
-def test_a_report_shows_the_air_forces_at_the_body(posterior, test):
-    seeing, seen = observing(posterior, acting(test))
-    scene = recorded_scene(seen, seeing, seconds=1.0)
-    (arrows,) = [each for each in scene.arrows if each.title.startswith("aerodynamic")]
-    start = torch.tensor(arrows.start[:, 0])
-    np.testing.assert_allclose(start[0], seen.q[0, :3], atol=1e-12)

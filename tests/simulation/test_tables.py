@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.trajectory import PathOverTable, table_of
+from forcegp.simulation.trajectory import over_table, random_path, table_of
 
 KINDS = ("plane", "tilted", "sphere")
 MIDDLE = np.array([0.0, 0.5, 0.055])
@@ -40,12 +40,15 @@ def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
 def test_velocity_and_acceleration_of_the_bent_path_are_derivatives(kind):
     config = KukaSurfaceConfig(surface=kind)
     start = np.array([0.1, 0.5, 0.3])
-    generators = np.random.default_rng(3), np.random.default_rng(4)
-    path = PathOverTable.random(config, table_of(config), start, 4.0, *generators)
-    np.testing.assert_allclose(path.sample(np.array([0.0]))[0][0], start, atol=1e-14)
+    table, flat = table_of(config), random_path(config, start, 4.0, np.random.default_rng(3))
+
+    def path(time: np.ndarray):
+        return over_table(table, flat.sample(time))
+
+    np.testing.assert_allclose(path(np.zeros(1))[0][0, :2], start[:2], atol=1e-14)
     time, step = np.linspace(0, 4, 1001)[1:-1], 1e-6
-    before, after = path.sample(time - step), path.sample(time + step)
-    _, velocity, acceleration = path.sample(time)
+    before, after = path(time - step), path(time + step)
+    _, velocity, acceleration = path(time)
     np.testing.assert_allclose((after[0] - before[0]) / (2 * step), velocity, atol=1e-4)
     smooth = np.abs(after[2] - before[2]).max(axis=1) < 1e-3  # away from the jumps of acceleration
     assert smooth.mean() > 0.98

@@ -1,56 +1,31 @@
 import numpy as np
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
+import pinocchio as pin
 
 from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import TaskSpaceController, rotation_vector
+from forcegp.simulation.trajectory import joint_acceleration
 
 
-def matrix(quaternion: np.ndarray) -> np.ndarray:
-    return Rotation.from_quat(quaternion).as_matrix()
-
-
-@given(st.integers(0, 10_000))
-def test_the_rotation_vector_turns_one_orientation_into_the_other_by_the_shorter_way(seed):
-    rng = np.random.default_rng(seed)
-    aim, present = (values / np.linalg.norm(values) for values in rng.normal(size=(2, 4)))
-    vector = rotation_vector(aim, present)
-    assert np.linalg.norm(vector) <= np.pi + 1e-12
-    x, y, z = vector
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    np.testing.assert_allclose(expm(skew) @ matrix(present), matrix(aim), atol=1e-12)
-    np.testing.assert_allclose(rotation_vector(-aim, present), vector, atol=1e-12)
-    np.testing.assert_allclose(rotation_vector(aim, -present), vector, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-14, 1e-9, 1e-3, 3.0])
-def test_small_and_large_angles_keep_their_digits(angle):
-    present = np.array([0.0, -1.0, 0.0, 0.0])  # the scenario's orientation, half a turn: real part 0
-    turn = np.array([np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2)])
-    aim = (Rotation.from_quat(turn) * Rotation.from_quat(present)).as_quat()
-    np.testing.assert_allclose(rotation_vector(aim, present), [angle, 0, 0], rtol=1e-7, atol=1e-15)
+def turned(quaternion: np.ndarray) -> np.ndarray:
+    return pin.Quaternion(quaternion).toRotationMatrix()
 
 
 def test_the_law_is_the_published_one_with_the_pseudo_inverse():
     rng = np.random.default_rng(0)
     orientation = np.array([0.0, -1.0, 0.0, 0.0])
     posture, selected = np.deg2rad((85, 50, -10, -100, -170, -25, -100)), np.array([0, 1, 1, 0, 1, 0, 0.0])
-    controller = TaskSpaceController(KukaSurfaceConfig())
     for _ in range(20):
         q, v, J, bias = rng.normal(size=7), rng.normal(size=7), rng.normal(size=(6, 7)), rng.normal(size=6)
         position, aim = rng.normal(size=3), tuple(rng.normal(size=(3, 3)))
         present = (values := rng.normal(size=4)) / np.linalg.norm(values)
-        found = controller.joint_acceleration(ArmState(q, v, np.eye(7), np.zeros(7), position, present, J, bias), aim)
+        state = ArmState(q, v, np.eye(7), np.zeros(7), position, present, J, bias)
+        found = joint_acceleration(KukaSurfaceConfig(), state, aim)
 
         velocity = J @ v
         task = np.concatenate(
             [
                 aim[2] + 2 * 100 * (aim[1] - velocity[:3]) + 1e4 * (aim[0] - position),
-                -2 * 100 * velocity[3:] + 1e4 * rotation_vector(orientation, present),
+                -2 * 100 * velocity[3:] + 1e4 * pin.log3(turned(orientation) @ turned(present).T),
             ]
         )
         inverse = np.linalg.pinv(J)

@@ -24,12 +24,6 @@ def test_acceleration_cruise_and_braking_by_hand():
     assert np.ptp(position[:, [0, 2]], axis=0).max() == 0
 
 
-def test_the_least_acceleration_meets_in_the_middle():
-    _, velocity, acceleration = one_segment(3.0, 2.0, 3.0).sample(np.array([0.999, 1.0, 1.001]))
-    np.testing.assert_allclose(velocity[:, 1], [2.997, 3.0, 2.997], atol=1e-12)
-    np.testing.assert_allclose(acceleration[[0, 2], 1], [3.0, -3.0])
-
-
 def test_it_rests_before_after_and_on_a_segment_without_length():
     path = one_segment(0.0, 1.0, 0.5)
     for values, expected in zip(path.sample(np.array([-1.0, 0.0, 0.5, 2.0])), (path.points[0], 0.0, 0.0), strict=True):
@@ -67,12 +61,6 @@ def test_way_points_are_reached_at_rest_below_the_surface_within_their_ranges():
         assert lower <= corners[:, column].min() < lower + 0.1 * (upper - lower)
         assert upper >= corners[:, column].max() > upper - 0.1 * (upper - lower)
     np.testing.assert_allclose(corners[:, 2], 0.055 - 1e-4)
-
-
-def test_a_longer_path_begins_like_a_shorter_one():
-    short = random_path(KukaSurfaceConfig(), START, 5.0, np.random.default_rng(7))
-    long = random_path(KukaSurfaceConfig(), START, 50.0, np.random.default_rng(7))
-    np.testing.assert_array_equal(long.points[: len(short.points)], short.points)
 
 
 def test_accelerations_are_the_published_rule():

@@ -1,7 +1,7 @@
 """The log as every check sees it: mended, at even times, filtered, and as it is compared with the robot."""
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,19 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces import JointLaw
 from forcegp.model import Model
 from forcegp.robots import Robot
-
-
-def numbers_of(values: Sequence[float | None]) -> np.ndarray:
-    """Numbers from a report, NaN where it has none."""
-    return np.array([np.nan if value is None else value for value in values], dtype=float)
-
 
 GAP = 5.0  # median steps without a row at which a motion is taken for two
 COMPARED = 0.5  # of the cut-off: where torques are compared
@@ -84,7 +77,7 @@ class CheckInput:
     @property
     def rotates(self) -> Bool[np.ndarray, " nv"]:
         """Whether a joint turns; others slide."""
-        return _angular(self.log)
+        return self.log.turns
 
     def named(self, joints: Iterable[int] | np.ndarray) -> tuple[str, ...]:
         """The names of the joints with these numbers."""
@@ -99,8 +92,9 @@ class CheckInput:
 
     @property
     def price(self) -> Mapping[str, Any]:
-        """What the filter of the check did, or that of an earlier preparation where this one filters nothing."""
-        assert self.prepared is not None
+        """What the filter of the check did, or an earlier one where this one filters nothing; empty without rows."""
+        if self.prepared is None:
+            return {}
         return preparation_report(self.prepared.metadata) if self.cutoff is not None else _earlier(self.log)
 
     @property
@@ -118,20 +112,20 @@ class CheckInput:
         found["even"] = even = _even(_unwrapped(mended, found["wraps"]), jumps)
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
-            chosen = replace(preparation, every=1, delay=0.0).resolved(even)
-            trim = 0.0 if chosen.cutoff is None else min(1.0 / float(chosen.cutoff), LONGEST_TRIM * shortest)
-            found["prepared"] = prepared = replace(chosen, trim=float(trim)).apply(even)
-            found["compared"] = prepared
-            applied = chosen.cutoff or _earlier(dataset).get("cutoff")
-            first = even.time[even.episode == even.episode[0]]
-            if applied is not None and COMPARED * float(applied) < HIGHEST * 0.5 / uniform_step(first):
-                lower = COMPARED * float(applied)
-                lowest = replace(chosen, cutoff=lower, trim=min(1.0 / lower, LONGEST_TRIM * shortest))
+            chosen = replace(preparation, every=1, delay=0.0, trim=0.0).resolved(even)
+
+            def trimmed(cutoff: float) -> Preparation:
+                return replace(chosen, cutoff=cutoff, trim=float(min(1.0 / cutoff, LONGEST_TRIM * shortest)))
+
+            chosen = chosen if chosen.cutoff is None else trimmed(float(chosen.cutoff))
+            found["prepared"] = found["compared"] = prepared = chosen.apply(even)
+            lower = COMPARED * float(chosen.cutoff or _earlier(dataset).get("cutoff") or np.inf)
+            if lower < HIGHEST * 0.5 / uniform_step(even.time[even.episode == even.episode[0]]):
                 with contextlib.suppress(DatasetError):  # too short for that
-                    found["compared"] = lowest.rows(even)
+                    found["compared"] = trimmed(lower).rows(even)
             # white noise as logged, or what the filter left
             left = preparation_report(prepared.metadata).get("acceleration_noise", {}).get("after")
-            seen = white_noise(mended) if left is None else numbers_of(left) * HALF_CUTOFF
+            seen = white_noise(mended) if left is None else np.array(left, float) * HALF_CUTOFF
             found["compared_noise"] = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
         return cls.as_recorded(dataset, model, **found)
 
@@ -166,9 +160,8 @@ def _mended(dataset: Dataset) -> dict[str, Any]:
     mended = replace(dataset, **changed, truth={}) if changed else dataset
     change = np.abs(np.diff(mended.q, axis=0, append=mended.q[-1:]))
     change[~consecutive(mended)] = 0.0
-    angular = _angular(mended)
-    wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & angular
-    jumps = (change > np.pi) & angular & ~wraps
+    wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & mended.turns
+    jumps = (change > np.pi) & mended.turns & ~wraps
     return {"mended": mended, "dropped": dropped, "wraps": wraps, "jumps": jumps}
 
 
@@ -190,10 +183,6 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
-
-
-def _angular(dataset: Dataset) -> np.ndarray:
-    return np.array(unit_of_each("q", dataset.units["q"], dataset.nv)) == "rad"
 
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:
@@ -254,12 +243,10 @@ def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:
     rows = np.concatenate(pieces)
     numbers = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     even = replace(dataset.rows(rows), episode=numbers, noise_std=None, truth={}, time_ordered=True)
-    try:
+    with contextlib.suppress(DatasetError):
         steps = [uniform_step(even.time[even.episode == number]) for number in even.episodes]
         if max(steps) - min(steps) <= 1e-3 * max(steps):
             return even
-    except DatasetError:
-        pass
     if jumps.any():
         return even  # a spline through a jump would be of no use, and nothing is differentiated then
     return resample(even, float(np.median(np.concatenate([np.diff(dataset.time[piece]) for piece in pieces]))))

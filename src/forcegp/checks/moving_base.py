@@ -1,9 +1,6 @@
 """Robots whose base moves: do positions, velocities and accelerations belong together, in which axes, in which order.
 
-State estimators differ: quaternions begin or end with w, velocities are those of the body's or of the world's axes.
-Each reading predicts how positions change; that which the log obeys shows. They are compared over a tenth of a second,
-not from row to row: noise of 1 mm and 0.2 degrees at 400 Hz is 0.6 m/s and 2 rad/s there. Thrusters have to carry a
-base that floats, which shows the unit of their speeds, and the order of a quaternion that velocities were derived from.
+Each reading predicts how positions change over a tenth of a second, in which noise of poses is small.
 """
 
 import contextlib
@@ -87,38 +84,38 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         windows = _Windows.of(dataset, own[[k for k, free in enumerate(group.motion.free) if free > 2]])
         q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
         at, v, a = q[:, group.places], v[:, group.rows], a[:, group.rows]
-        yield from _of_velocity(windows, group, at, v, _stated_axes(dataset), _stated_order(dataset))
+        yield from _of_velocity(windows, group, at, v, *_stated(dataset))
         each = v.unflatten(0, windows.rows.shape)
         change = (each[:, -1] - each[:, 0]) / windows.step
         error, size = _rms(change - windows.mean(a)), _rms(change)
         measured = in_base(group, at, a, ("imu", "body"), v, model.robot.gravity)
         specific = _rms(change - windows.mean(measured))
-        if error > 2.0 * size and specific < CLEARLY * error:
-            yield wrong(
-                about="base acceleration",
-                what=f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its "
-                f"velocity it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}.",
-                do="Differentiate v.",
-                correction=IMU,
-                numbers={"error": error, "specific": specific, "size": size},
+        if error <= 2.0 * size:  # noise of the velocities alone makes both large
+            continue
+        numbers = {"error": error, "specific": specific, "size": size}
+        if specific < CLEARLY * error:
+            seen = (
+                f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its velocity "
+                f"it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}."
             )
-        elif error > 2.0 * size:  # noise of the velocities alone makes both large
-            yield look(
-                about="base acceleration",
-                what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, "
-                f"which itself is {size:.2g}.",
-                do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of "
-                "an accelerometer; differentiate v, or add gravity to what an IMU measures.",
-                numbers={"error": error, "size": size},
-            )
+            told = {"about": "base acceleration", "what": seen, "do": "Differentiate v.", "numbers": numbers}
+            yield wrong(**told, correction=IMU)
+            continue
+        yield look(
+            about="base acceleration",
+            what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, which "
+            f"itself is {size:.2g}.",
+            do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of an "
+            "accelerometer; differentiate v, or add gravity to what an IMU measures.",
+            numbers=numbers,
+        )
 
 
 def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
-    """A base that no foot, wheel, thruster or known force of the model moves, although it does not fall or drives."""
+    """A base that no foot, thruster or known force of the model carries, although it does not fall."""
     robot, groups = model.robot, model.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
-    planar = bool(groups) and groups[0].kind == "planar"
-    if not planar and (not groups or groups[0].kind != "floating" or not weight):
+    if not groups or groups[0].kind != "floating" or not weight:
         return
     complete, feet = dataset.u.shape[1] == len(model.inputs), {contact.switch for contact in model.touching}
     if None in feet or (feet and not complete):
@@ -127,35 +124,23 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     if flags.any(1).mean() > 0.5:  # the median window shows less of flight
         return
     group = groups[0]
-    linear = 2 if planar else 3
-    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][linear:], MOST_FORCES)
+    windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][3:], MOST_FORCES)
     inputs = dataset.u if complete else np.zeros((len(dataset), len(model.inputs)))
     q, v, u, a = (windows.of_signal(x).to(robot.device) for x in (dataset.q, dataset.v, inputs, dataset.a))
 
     def missing(inputs: Tensor) -> Tensor:
         """The linear part of M a less what the model knows of, in the axes of the base, in N."""
         dynamics = model.dynamics(q, v, inputs)
-        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :linear].cpu()
+        return ((dynamics.M @ a[..., None])[..., 0] - dynamics.Q_K)[:, group.rows][:, :3].cpu()
 
     def size(force: Tensor) -> float:
         return float(torch.linalg.vector_norm(windows.mean(force), dim=-1).median())
 
     found, thrusters = size(missing(u)), sorted(thruster_columns(model)) if complete else []
-    if planar:
-        needed = size(robot.mass * a[:, group.rows][:, :linear].cpu())
-        if found > CARRIED * needed:
-            yield look(
-                about="base force",
-                what=f"{group.name!r} moves under {found:.3g} N that no wheel and no actuator of the model explains "
-                f"(its acceleration takes {needed:.3g} N); masses found from this log would be wrong.",
-                do="Name wheels that roll, which are joints of the file: forcegp import --wheels FRAME=RADIUS. "
-                "For the arm alone, record it while the base stands, and leave out --base and the columns of the base.",
-                numbers={"force": found, "needed": needed},
-            )
-        return
     if found <= CARRIED * weight:
         return
     numbers, weighs = {"force": found, "weight": weight}, f"(the robot weighs {weight:.3g} N)"
+    kind, correction = wrong, dict[str, dict[str, tuple[str, ...]]]()
     if not thrusters:
         remedy = (
             "Describe them in Python (docs/how-to/moving-bases.md), write model.to_json() into a file, and take it in "
@@ -168,46 +153,39 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
             remedy = f"Let forcegp import --feet name what stands, and compare {named} with heights."
         seen = (
             f"{group.name!r} does not fall: it moves under {found:.3g} N that nothing in the model explains, no foot "
-            f"that stands and no thruster {weighs}."
+            f"that stands and no thruster {weighs}"
         )
-        yield wrong(about="base force", what=seen, do=remedy, numbers=numbers)
-        return
-    seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
-    still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
-    still[:, thrusters], slower[:, thrusters] = 0.0, RPM * u[:, thrusters]
-    needed, upright = missing(still), torch.eye(3, dtype=at.dtype)
-    turned = pose(group.kind, _reordered(group, at))[0].mT @ pose(group.kind, at)[0]
-    order, unit = {"orientation": {"q": ("wxyz",)}}, {"unit": {"u": ("rpm",)}}
-    readings = {
-        "rotor speeds in rpm": (upright, slower, unit),
-        "a quaternion w, x, y, z": (turned, u, order),
-        "a quaternion w, x, y, z and rotor speeds in rpm": (turned, slower, order | unit),
-    }
-    kind, correction = look, dict[str, dict[str, tuple[str, ...]]]()
-    remedy = "Check the unit of u, the mass, coefficients of thrust and the axes of a; leave out rows on the ground."
-    for what, (rotation, speeds, stated) in readings.items():
-        left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
-        if left < CLEARLY * min(found, weight):
-            kind, correction, remedy = wrong, stated, ""
-            numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
-            break
+    else:
+        seen = f"{group.name!r} moves under {found:.3g} N that its thrusters do not explain {weighs}"
+        still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
+        still[:, thrusters], slower[:, thrusters] = 0.0, RPM * u[:, thrusters]
+        needed, upright = missing(still), torch.eye(3, dtype=at.dtype)
+        turned = pose(group.kind, _reordered(group, at))[0].mT @ pose(group.kind, at)[0]
+        order, unit = {"orientation": {"q": ("wxyz",)}}, {"unit": {"u": ("rpm",)}}
+        kind, remedy = look, "Check the unit of u, the mass, coefficients of thrust and the axes of a."
+        for what, rotation, speeds, stated in (
+            ("rotor speeds in rpm", upright, slower, unit),
+            ("a quaternion w, x, y, z", turned, u, order),
+            ("a quaternion w, x, y, z and rotor speeds in rpm", turned, slower, order | unit),
+        ):
+            left = size((rotation @ needed[..., None])[..., 0] + missing(speeds) - needed)
+            if left < CLEARLY * min(found, weight):
+                kind, correction, remedy = wrong, stated, ""
+                numbers[what], seen = left, f"{seen}; with {what} {left:.3g} N"
+                break
     yield kind(about="base force", what=f"{seen}.", do=remedy, correction=correction, numbers=numbers)
 
 
-def _stated_axes(dataset: Dataset) -> tuple[str, str]:
-    """Of linear and angular velocities in the log file, as its import was given them."""
-    with contextlib.suppress(AttributeError, TypeError, KeyError, ValueError):  # somebody else's metadata
-        given = dataset.metadata["import"]["mapping"]["axes"]["v"]  # one word, or one for each part
-        *_, linear, angular = 2 * ((given,) if isinstance(given, str) else tuple(given))
-        return str(linear), str(angular)
-    return "body", "body"
-
-
-def _stated_order(dataset: Dataset) -> str:
-    """Of quaternions in the log file, as its import was given it."""
+def _stated(dataset: Dataset) -> tuple[tuple[str, str], str]:
+    """Axes of linear and angular velocities, and the order of quaternions, in the log file, as its import was told."""
+    axes, order = ("body", "body"), "xyzw"
     with contextlib.suppress(AttributeError, TypeError, KeyError):  # somebody else's metadata
-        return str(dataset.metadata["import"]["mapping"]["orientation"])
-    return "xyzw"
+        mapping = dataset.metadata["import"]["mapping"]
+        order = str(mapping.get("orientation", order))
+        given = mapping["axes"]["v"]  # one word, or one for each part
+        *_, linear, angular = 2 * ((given,) if isinstance(given, str) else tuple(given))
+        axes = str(linear), str(angular)
+    return axes, order
 
 
 def _of_velocity(
@@ -291,11 +269,7 @@ def _reordered(group: Group, q: Tensor, order: str = "xyzw") -> Tensor:
 
 
 def _explained(error: Tensor, difference: Tensor) -> bool:
-    """Whether `difference` (rows, k), what another reading changes, is what the `error` consists of.
-
-    Its coefficient in a regression of the error is 1 for the other reading, 0 for this one, and 1/2 where both are
-    noise: noise e of v changes the difference by R^T e - e, of which the error has the part -e.
-    """
+    """Whether `difference` (rows, k), of another reading, is what the `error` consists of; noise has half of it."""
     variance = torch.minimum(error.square().mean(0), (error - difference).square().mean(0)).clamp_min(TINY)
     weight = float((difference.square() / variance).sum())
     share = float((error * difference / variance).sum()) / weight if weight > 0.0 else 0.0

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput, numbers_of
-from forcegp.checks.excitation import excitation_doubts, noise_doubts, stated_noise_doubts, torque_noise
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.moving_base import (
     base_doubts,
     carried_doubts,
@@ -16,13 +15,15 @@ from forcegp.checks.moving_base import (
     unmeasured_base_doubts,
 )
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
-from forcegp.checks.torque_doubts import Hypothesis, best_hypothesis, not_compared, torque_doubts
-from forcegp.checks.torques import parameter_doubts
+from forcegp.checks.torque_doubts import corrected, not_compared, torque_doubts
+from forcegp.checks.torques import Comparison, parameter_doubts, torque_noise
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.doubts import LEVELS, Doubt, Doubts
+from forcegp.data.views import white_noise
+from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look, ok
 from forcegp.errors import InvalidInput, require_type
+from forcegp.evidence.identifiability import base_parameters, excitation
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
@@ -44,7 +45,7 @@ class CheckReport(Summary):
 
     doubts: Doubts
     inputs: CheckInput
-    comparison: Hypothesis | None
+    comparison: Comparison | None
 
     def facts(self) -> dict[str, object]:
         """The subjects of the doubts, by level."""
@@ -58,18 +59,18 @@ class CheckReport(Summary):
         the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
         """
         nothing: list[Any] = [None] * self.inputs.log.nv
-        columns = {"joint": list(self.inputs.names), "unexplained": nothing, "residual": nothing, "factor": nothing}
+        names = ("unexplained", "residual", "factor", "noise_before", "noise_after", "noise_torque")
+        columns = {"joint": list(self.inputs.names), **dict.fromkeys(names, nothing)}
         if self.comparison is not None:
-            fit = self.comparison.fit
+            fit, spread = self.comparison.fit, np.std(self.comparison.rows.u, axis=0)
             columns["unexplained"] = plain(fit.unexplained)
-            predicted = fit.at(self.comparison.robot, self.comparison.tau, self.comparison.rows)
-            columns["residual"] = plain(np.std(self.comparison.rows.u - predicted, axis=0))
+            columns["residual"] = plain(np.sqrt(fit.unexplained) * spread)
             columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
-        report = {} if self.inputs.prepared is None else self.inputs.price
-        noise = report.get("acceleration_noise", {"before": nothing, "after": nothing})
-        columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
-        torque = torque_noise(self.inputs, numbers_of(noise["after"])) if self.inputs.prepared is not None else None
-        columns["noise_torque"] = nothing if torque is None else plain(torque)
+        if (noise := self.inputs.price.get("acceleration_noise")) is not None:
+            columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
+            if (robot := self.inputs.robot) is not None:
+                after = np.array(noise["after"], float)
+                columns["noise_torque"] = plain(torque_noise(robot, self.inputs.rows(), after))
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -78,7 +79,7 @@ class CheckReport(Summary):
         return {
             "level": self.doubts.level,
             "counts": counts,
-            "cutoff": None if self.inputs.prepared is None else self.inputs.price.get("cutoff"),
+            "cutoff": self.inputs.price.get("cutoff"),
             "joints": self.per_joint(),
             "doubts": [doubt.to_dict() for doubt in self.doubts],
         }
@@ -128,7 +129,7 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
-def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Hypothesis | None]:
+def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Comparison | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
     doubts = [*signal_doubts(inputs), *stated_noise_doubts(inputs)]
     if inputs.log.time_ordered:
@@ -141,11 +142,11 @@ def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Hypot
     if inputs.robot is None or inputs.contacts:
         return [*doubts, not_compared(inputs)], None
     if inputs.log.u.any() and not contacts:
-        comparison, corrections = best_hypothesis(inputs)
-        compared = list(torque_doubts(inputs, comparison))
+        comparison, corrections = corrected(inputs)
+        compared = torque_doubts(inputs, comparison)
         noise = inputs.compared_noise
         if noise is not None and ("torque unit", "wrong") not in {(each.about, each.level) for each in compared}:
-            numbers = parameter_doubts(comparison.robot, comparison.without_laws(comparison.rows), noise)
+            numbers = parameter_doubts(comparison.robot, comparison.changed(inputs.rows()), noise)
             compared = [each for each in compared if not numbers or each.about != "torque unit"] + numbers
         doubts += [*corrections, *compared]
     return doubts, comparison
@@ -170,3 +171,163 @@ def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation |
     with contextlib.suppress(InvalidInput):  # too short
         inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
         yield from motion_doubts(inputs, robot.space.single_rows)  # gaps may be rows whose feet are not known
+
+
+MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
+
+
+STATED_OFF = 3.0  # factor either way between stated and seen noise of the acceleration that is reported
+FAR_OFF = 10.0
+
+
+def stated_noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
+    """`noise_std` against the noise that the acceleration of successive rows shows."""
+    log = inputs.log
+    stated, seen = log.noise_level, white_noise(log)
+    if stated is None or seen is None:
+        return
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = seen / stated
+    off = np.flatnonzero((ratio > STATED_OFF) | (ratio < 1.0 / STATED_OFF))
+    if not len(off):
+        return
+    joint = int(off[np.argmax(np.abs(np.log(ratio[off])))])
+    small = ratio[joint] > 1.0
+    yield Doubt(
+        level="wrong" if ratio[joint] > FAR_OFF else "look",
+        about="noise_std",
+        what=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
+        f"show noise of {seen[joint]:.3g}: {ratio[joint] if small else 1.0 / ratio[joint]:.3g} times as "
+        f"{'much' if small else 'little'}.",
+        do="Learn it (forcegp fit --noise learned), or state what was measured."
+        + ("" if small else " Noise that a filter made smooth does not show between rows: then leave it."),
+        joints=inputs.named(off),
+        numbers={"stated": plain(stated), "seen": plain(seen)},
+    )
+
+
+def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
+    """Noise of the acceleration before and after the filter, in rad/s^2 or m/s^2."""
+    if inputs.prepared is None:
+        return
+    cutoff, measured = inputs.price.get("cutoff"), inputs.price.get("acceleration_noise", {})
+    if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
+        yield ok(about="noise", what="the positions show no noise worth a filter.")
+        return
+    before, after = (np.array(measured[when], float) for when in ("before", "after"))
+    spread = np.std(inputs.prepared.a, axis=0)
+    if np.isfinite(after).any():
+        when = " when this dataset was prepared" if inputs.cutoff is None else ""
+        worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
+        unit, levels = "rad/s²" if inputs.rotates[worst] else "m/s²", f"{before[worst]:.3g} to {after[worst]:.2g}"
+        what = f"a filter at {cutoff:.3g} Hz{when} takes the noise of a of {inputs.names[worst]}, the worst"
+        yield ok(
+            about="noise",
+            what=f"{what}, from {levels} {unit}.",
+            numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
+        )
+    with np.errstate(invalid="ignore"):
+        loud, left = np.flatnonzero(before > MUCH * spread), np.flatnonzero(after > MUCH * spread)
+    # a log may hold better accelerations than differences
+    noisy = np.std(inputs.log.a, axis=0)[loud] > np.hypot(1.0, MUCH) * spread[loud]
+    if "preparation" not in inputs.log.metadata and noisy.any():
+        yield look(
+            about="noise",
+            what=f"the acceleration in this dataset is not filtered: its noise is up to "
+            f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
+            do=f"forcegp import DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
+            joints=inputs.named(loud),
+        )
+    if len(left):
+        names = inputs.named(left)
+        what = f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of {', '.join(names)}."
+        remedy = "Move faster, filter lower, or learn from torques instead of accelerations."
+        yield look(about="noise", what=what, do=remedy, joints=names)
+
+
+WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)
+BADLY = 1000.0
+HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
+FEWEST_CHANGES = 2
+HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
+STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
+
+
+def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
+    """Joints that hardly move or never turn back, and how well base parameters are determined."""
+    if inputs.prepared is None:
+        return
+    rows = inputs.prepared
+    still, one_way, motions = [], [], []
+    for joint, name in enumerate(inputs.names):
+        v = rows.v[:, joint]
+        size = float(np.sqrt(np.square(v).mean()))
+        signs = np.sign(v[np.abs(v) > HYSTERESIS * size])
+        changes = int((np.diff(signs) != 0).sum())
+        span = float(np.ptp(rows.q[:, joint]))
+        motions.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
+        if span < STILL[bool(inputs.rotates[joint])]:
+            still.append(name)
+        elif changes < FEWEST_CHANGES:
+            one_way.append(name)
+    whose = "its" if len(still) == 1 else "their"
+    idle = f"moved less than 0.02 rad (2 mm): {whose} friction and inertia do not show."
+    turned = "changed direction less than twice: friction of both directions cannot be separated from gravity."
+    for joints, what, remedy in (
+        (still, idle, "Move every joint that is to be learned, or lock it in the robot (`locked`)."),
+        (one_way, turned, "Record motion to and fro."),
+    ):
+        if joints:
+            about = {"joints": tuple(joints), "numbers": {"joints": motions}}
+            yield look(about="excitation", what=f"{listed(joints)} {what}", do=remedy, **about)
+    yield from _held(inputs, still)
+    yield from _base_parameters(inputs)
+
+
+def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
+    """Joints that stand still in whole stretches although they move in others."""
+    rows = inputs.prepared
+    if rows is None or len(rows.episodes) < 2:
+        return
+    spans = np.stack([np.ptp(rows.q[rows.episode == number], axis=0) for number in rows.episodes])
+    for joint in (joint for joint, name in enumerate(inputs.names) if name not in still):
+        own, unit = spans[:, joint], "rad" if inputs.rotates[joint] else "m"
+        held = np.flatnonzero((own < HELD * own.max()) & (spans.max(axis=1) > 5.0 * own))
+        if 0 < len(held) <= len(spans) // 2:
+            first = int(held[0])
+            begin = float(rows.time[rows.episode == rows.episodes[first]][0])
+            yield look(
+                about="held joint",
+                what=f"{inputs.names[joint]} stays within {own[first]:.2g} {unit} in {len(held)} of {len(spans)} "
+                f"stretches while other joints move (the first: number {first}, counted from 0, at {begin:.3f} s); "
+                f"elsewhere it moves {own.max():.2g}.",
+                do="It was held, or sticks: leave the stretch out, or describe it as a constraint or another robot "
+                "(`locked`).",
+                joints=(inputs.names[joint],),
+                numbers={"stretches": held.tolist(), "range": float(own[first])},
+            )
+
+
+def _base_parameters(inputs: CheckInput) -> Iterator[Doubt]:
+    if inputs.robot is None:
+        return
+    rows = inputs.rows()
+    try:
+        seen = excitation(inputs.robot, rows.q, rows.v, rows.a)
+    except InvalidInput:  # nothing moves and nothing weighs
+        return
+    every = base_parameters(inputs.robot)
+    numbers = {"condition": seen.condition, "seen": seen.rank, "base_parameters": every.rank}
+    size = f"condition number {seen.condition:.3g} of {seen.rank} base parameters"
+    quality = "well excited" if seen.condition <= WELL else "usable" if seen.condition <= BADLY else "poorly excited"
+    size_and_quality, remedy = f"{size}: {quality} (below {WELL:g} is good).", ""
+    if seen.rank < every.rank:
+        size_and_quality = f"{size}; {every.rank - seen.rank} more of this robot never show in this motion."
+        remedy = "Identify few parameters, or record a motion of all joints at once."
+    elif seen.condition > BADLY:
+        remedy = (
+            "Inertias of single links will be uncertain; record faster motion of all joints at once, and keep the "
+            "URDF's values where the data are not informative."
+        )
+    kind = look if remedy else ok
+    yield kind(about="excitation", what=size_and_quality, do=remedy, numbers=numbers)

@@ -9,9 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, GAP, CheckInput
 from forcegp.data import Dataset, differentiate, low_pass
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.data.delay import lowest
-from forcegp.data.filters import JITTER
 from forcegp.data.views import consecutive, runs
 from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
 
@@ -35,18 +33,19 @@ def signal_doubts(inputs: CheckInput) -> list[Doubt]:
 
 
 def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
-    for places, how, remedy in (
-        (inputs.wraps, "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."),
-        (inputs.jumps, "by more than pi", "Look at the raw log there; nothing could be differentiated, so motion and "
-         "torque were not checked. Are the units right (degrees for radians)?"),
-    ):  # fmt: skip
+    turn = "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."
+    far = (
+        "by more than pi",
+        "Look at the raw log there; nothing could be differentiated, so motion and torque were not checked. Are the "
+        "units right (degrees for radians)?",
+    )
+    for places, (how, remedy) in ((inputs.wraps, turn), (inputs.jumps, far)):
         if places.any():
             row, joint = (int(index) for index in np.argwhere(places)[0])
-            name = inputs.names[joint]
             yield wrong(
                 about="jumps",
-                what=f"the position of {name} jumps {how} after row {row} at {inputs.log.time[row]:.3f} s "
-                f"({int(places.sum())} times in all).",
+                what=f"the position of {inputs.names[joint]} jumps {how} after row {row} at {inputs.log.time[row]:.3f} "
+                f"s ({int(places.sum())} times in all).",
                 do=remedy,
                 joints=inputs.named(np.flatnonzero(places.any(axis=0))),
                 numbers={"row": row, "count": int(places.sum())},
@@ -58,47 +57,41 @@ def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
     lost = {name: rows for name, rows in inputs.dropped.items() if rows.any()}
     if not lost:
         return
-    rows = np.logical_or.reduce([each.any(axis=1) for each in lost.values()])
-    first = int(np.flatnonzero(rows)[0])
-    joints = np.logical_or.reduce([each.any(axis=0) for each in lost.values()])
+    every = np.any(list(lost.values()), axis=0)
+    rows = every.any(axis=1)
+    first, share = int(np.argmax(rows)), 100.0 * rows.mean()
     yield wrong(
         about="drop-outs",
-        what=f"{int(rows.sum())} rows ({100.0 * rows.mean():.2g} %) read exactly 0 between values that are far from 0, "
-        f"in {listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
+        what=f"{int(rows.sum())} rows ({share:.2g} %) read exactly 0 between values that are far from 0, in "
+        f"{listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
         f"{inputs.log.time[first]:.3f} s.",
         do="They were not measured: leave these rows out, and look at the logger.",
-        joints=inputs.named(np.flatnonzero(joints)),
+        joints=inputs.named(np.flatnonzero(every.any(axis=0))),
         numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
     )
 
 
 def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
-    rests = still(log, "v") & still(log, "q")
+    rests = _still(log, "v") & _still(log, "q")
     for name, quantity in QUANTITY.items():
-        values = getattr(log, name)
-        dead = np.flatnonzero(still(log, name)).tolist()
-        if not dead:
+        values, dead = getattr(log, name), np.flatnonzero(_still(log, name))
+        if not len(dead):
             continue
-        names = inputs.named(dead)
+        names, all_of_them = inputs.named(dead), len(dead) == log.nv
         seen = f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
         remedy = "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
         passive = name == "u" and not values[:, dead].any()
         if name == "u":
             remedy = "Right for a passive mechanism; else the torque columns are missing."
-        if passive and len(dead) == log.nv:
+        if passive and all_of_them:
             seen = "no torque was logged at all (every u is 0)."
-        yield Doubt(
-            level="look" if passive or len(dead) == log.nv or rests[dead].all() else "wrong",
-            about="constant channel",
-            what=seen,
-            do=remedy,
-            joints=names,
-            numbers={"quantity": name},
-        )
+        level: Level = "look" if passive or all_of_them or rests[dead].all() else "wrong"
+        told = {"about": "constant channel", "what": seen, "do": remedy, "joints": names}
+        yield Doubt(level=level, **told, numbers={"quantity": name})
 
 
-def still(log: Dataset, name: str) -> np.ndarray:
+def _still(log: Dataset, name: str) -> np.ndarray:
     """Which joints' signal never changes, up to rounding."""
     values = getattr(log, name)
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
@@ -107,31 +100,27 @@ def still(log: Dataset, name: str) -> np.ndarray:
 def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
-    values = getattr(log, name)[:, joint]
-    follows = consecutive(log)[:-1]
+    values, follows = getattr(log, name)[:, joint], consecutive(log)[:-1]
     held = np.diff(values) == 0
     if np.ptp(values) == 0.0 or (name == "u" and held.mean() > HELD_STEPS):
         return
-    changes = [np.diff(getattr(log, other)[:, joint]) != 0 for other in QUANTITY if other != name]
-    others = np.logical_or.reduce(changes)
-    seconds = np.diff(log.time)
-    step = float(np.median(seconds[follows]))
+    others = np.any([np.diff(getattr(log, other)[:, joint]) != 0 for other in QUANTITY if other != name], axis=0)
+    step = float(np.median(np.diff(log.time)[follows]))
     # a velocity that stands still at rest is right, also where the position is noisy; a joint that sticks while its
     # velocity is an estimate does not jump afterwards; and noise about rest goes nowhere
     speed = log.v[1:, joint] if name != "v" else np.where(follows, np.diff(log.q[:, joint]), 0.0) / step
     moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-    longest = (0, 0)
-    for start, stop in runs(held & others & follows):
-        length = int(stop - start)
-        if length > longest[1] and length >= FROZEN_ROWS and length * step >= FROZEN_SECONDS:
-            gone = np.cumsum(speed[start:stop]) * step
-            sticks = name == "q" and stop < len(held) and abs(values[stop + 1] - values[start]) < 0.5 * abs(gone[-1])
-            far = np.ptp(gone) > 0.25 * np.abs(speed[start:stop]).sum() * step
-            if moves[start:stop].mean() > 0.5 and far and not sticks:
-                longest = (int(start), length)
-    start, length = longest
+    start = length = 0
+    for begin, end in runs(held & others & follows).tolist():
+        if end - begin <= max(length, FROZEN_ROWS - 1) or (end - begin) * step < FROZEN_SECONDS:
+            continue
+        gone = np.cumsum(speed[begin:end]) * step
+        sticks = name == "q" and end < len(held) and abs(values[end + 1] - values[begin]) < 0.5 * abs(gone[-1])
+        far = np.ptp(gone) > 0.25 * np.abs(speed[begin:end]).sum() * step
+        if moves[begin:end].mean() > 0.5 and far and not sticks:
+            start, length = begin, end - begin
     if not length or values[start] in (values.min(), values.max()):
         return
     yield Doubt(
@@ -147,25 +136,24 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
 
 def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
-    log = inputs.log
+    log, every = inputs.log, inputs.log.u[:, joint]
     speed = np.abs(log.v[:, joint])
-    u = log.u[speed > MOVES * np.sqrt(np.square(speed).mean()), joint]
-    if len(u) < CLIPPED_ROWS or np.ptp(log.u[:, joint]) == 0.0:
+    u = every[speed > MOVES * np.sqrt(np.square(speed).mean())]
+    if len(u) < CLIPPED_ROWS or np.ptp(every) == 0.0:
         return
-    width = np.ptp(u) / 1000.0
+    same, width = 1e-9 * np.ptp(u), np.ptp(u) / 1000.0
     for sign, side in ((1.0, "largest"), (-1.0, "smallest")):
-        extreme = float((sign * log.u[:, joint]).max())
+        extreme = float((sign * every).max())
         below = extreme - sign * u
-        at = int((below <= 1e-9 * np.ptp(u)).sum())
-        near = int(((below > 1e-9 * np.ptp(u)) & (below <= 1e-9 * np.ptp(u) + width)).sum())
-        extremes = runs(np.abs(log.u[:, joint] - sign * extreme) <= 1e-9 * np.ptp(u))
-        start, stop = max(extremes.tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
-        length = stop - start
-        if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and length >= 3:
+        at = int((below <= same).sum())
+        near = int(((below > same) & (below <= same + width)).sum())
+        extremes = runs(np.abs(every - sign * extreme) <= same).tolist()
+        start, stop = max(extremes, key=lambda run: run[1] - run[0], default=(0, 0))
+        if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and stop - start >= 3:
             yield wrong(
                 about="saturation",
                 what=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
-                f"{at} rows of motion; the longest stretch, {length} rows, begins at row {start} at "
+                f"{at} rows of motion; the longest stretch, {stop - start} rows, begins at row {start} at "
                 f"{log.time[start]:.3f} s.",
                 do="The robot received another torque than the log states, or the sensor is at its end: leave "
                 "these stretches out, or move more gently.",
@@ -181,70 +169,48 @@ OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the
 
 
 def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Rate and duration; jitter; lost samples and gaps; repeated rows."""
+    """Rate and duration; lost samples and gaps; repeated rows."""
     log = inputs.log
-    steps = np.diff(log.time)[consecutive(log)[:-1]]
+    follows = consecutive(log)[:-1]
+    steps = np.diff(log.time)[follows]
     if not len(steps):
         return
-    median = float(np.median(steps))
-    count = len(log.episodes)
+    median, count, seconds = float(np.median(steps)), len(log.episodes), float(steps.sum())
     each = f"{count} episodes" if count > 1 else "one episode"
-    seconds = float(steps.sum())
     yield ok(
         about="sampling",
         what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
         numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
     )
-    yield from _lost(inputs, steps, median)
-    regular = steps[steps < LOST * median]
-    spread = float(np.abs(regular - median).max()) / median
-    if spread > JITTER:
-        yield look(
-            about="jitter",
-            what=f"time steps lie between {1e3 * regular.min():.3g} and {1e3 * regular.max():.3g} ms about the "
-            f"median {1e3 * median:.3g} ms.",
-            do="Use the recorded time stamps, never row numbers, and resample to even steps before filtering "
-            "(forcegp import does).",
-            numbers={"relative_deviation": spread},
-        )
-    yield from _repeated(inputs)
-
-
-def _lost(inputs: CheckInput, steps: np.ndarray, median: float) -> Iterator[Doubt]:
-    log = inputs.log
     long = steps > LOST * median
-    if not long.any():
-        return
-    first_rows = np.flatnonzero(consecutive(log))
-    worst = int(first_rows[np.argmax(steps)])
-    lost = float((steps[long] - median).sum())
-    share = lost / float(steps.sum())
-    gaps = int((steps > GAP * median).sum())
-    yield Doubt(
-        level="wrong" if share > MUCH_LOST else "look" if gaps or share > LITTLE_LOST else "ok",
-        about="lost samples",
-        what=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
-        f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
-        + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
-        do=""
-        if share <= LITTLE_LOST and not gaps
-        else "A derivative across a gap is no acceleration: split the log there (forcegp import does), and look "
-        "why the logger loses samples.",
-        numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
-    )
+    if long.any():
+        worst, gaps = int(np.flatnonzero(follows)[np.argmax(steps)]), int((steps > GAP * median).sum())
+        share = float((steps[long] - median).sum()) / seconds
+        some = bool(gaps) or share > LITTLE_LOST
+        yield Doubt(
+            level="wrong" if share > MUCH_LOST else "look" if some else "ok",
+            about="lost samples",
+            what=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
+            f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
+            + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
+            do="A derivative across a gap is no acceleration: split the log there (forcegp import does), and look why "
+            "the logger loses samples."
+            if some
+            else "",
+            numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
+        )
+    yield from _repeated(log, follows)
 
 
-def _repeated(inputs: CheckInput) -> Iterator[Doubt]:
+def _repeated(log: Dataset, follows: np.ndarray) -> Iterator[Doubt]:
     """Rows in which every position is that of the row before although velocities show that the robot moves."""
-    log = inputs.log
-    follows = consecutive(log)[:-1]
     same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
     speed = np.abs(log.v).max(axis=1)[1:]
     moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
     share = float((same & moves).sum() / max(1, (moves & follows).sum()))
     if share < OFTEN_REPEATED:
         return
-    row = int(np.flatnonzero(same & moves)[0]) + 1
+    row = int(np.argmax(same & moves)) + 1
     yield look(
         about="repeated rows",
         what=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
@@ -301,20 +267,18 @@ def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tupl
     left, right = [], []
     for rows in pieces:
         inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
-        if inner.sum() < 3:
-            continue
-        left.append(CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None]))
-        right.append(differentiate(getattr(rows, source)[:, [joint]], rows.time)[inner, 0])
+        if inner.sum() >= 3:
+            left.append(CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None]))
+            right.append(differentiate(getattr(rows, source)[:, [joint]], rows.time)[inner, 0])
     if not left:
         return None
     values, slopes = np.concatenate(left, axis=1), np.concatenate(right)
-    power = np.square(values).sum(axis=1)
+    power, steep = np.square(values).sum(axis=1), float(np.square(slopes).sum())
     sizes = [float(np.square(getattr(rows, name)).mean()) for rows in pieces]
-    least = TINY_SPEED * max(*sizes, float(np.square(slopes).mean())) * len(slopes)
-    if not np.square(slopes).sum() > least or not power.min() > least:
+    if not min(steep, float(power.min())) > TINY_SPEED * max(*sizes, steep / len(slopes)) * len(slopes):
         return None  # a joint that stands still
-    factor = values @ slopes / np.square(slopes).sum()
-    unexplained = 1.0 - np.square(values @ slopes) / (np.square(slopes).sum() * power)
+    factor = values @ slopes / steep
+    unexplained = 1.0 - np.square(values @ slopes) / (steep * power)
     best = int(np.argmin(unexplained))
     return float(factor[best]), lowest(unexplained, SHIFTS), float(max(0.0, unexplained[best]))
 
@@ -332,7 +296,7 @@ def _differences(
         known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
         if kind:
             groups.setdefault((kind, known if kind == "factor" else 0.0), []).append(joint)
-    what = "velocity" if name == "v" else "acceleration"
+    what = EVERY_QUANTITY[name]
     for (kind, known), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
         named, every = inputs.named(joints), len(joints) == count > 2
@@ -361,8 +325,7 @@ def _differences(
         if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
         elif level == "wrong" and unit is not None and len(joints) == count:
-            now = unit_of_each("v", inputs.log.units["v"], inputs.log.nv)
-            units = [unit if joint in fits else own for joint, own in enumerate(now)]
+            units = [unit if joint in fits else own for joint, own in enumerate(inputs.log.unit_of_each("v"))]
             correction = {"unit": {"v": tuple(units[:1] if len(set(units)) == 1 else units)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}

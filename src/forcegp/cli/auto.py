@@ -321,11 +321,10 @@ def answer_lines(
     # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
-    late = prepared["delay"][0]
+    late, lag = prepared["delay"], prepared["lag"]
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
     on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
-    lag = max(prepared["lag"])
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
 

@@ -151,11 +151,8 @@ def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.Dataset) -> An
     values["filter"] = filtered + (f"; {report['why']['cutoff']}" if "cutoff" in report["why"] else "")
     for name in ("delay", "lag"):
         seconds, why = report[name], report["why"].get(name)
-        if any(seconds) or why is not None:
-            milliseconds = ", ".join(
-                f"{1e3 * each:.1f}" for each in (seconds if len(set(seconds)) > 1 else seconds[:1])
-            )
-            values[f"{name} of u"] = f"{milliseconds} ms{'' if why is None else f'; {why}'}"
+        if seconds or why is not None:
+            values[f"{name} of u"] = f"{1e3 * seconds:.1f} ms{'' if why is None else f'; {why}'}"
     if "stance" in report:
         values["stance"] = stance_text(report)
     if cutoff is not None:

@@ -47,10 +47,11 @@ class FilterOptions(CutoffOptions):
     """How rows to learn from are made of a raw log."""
 
     delay: Annotated[str, arg(metavar="S|auto")] = "0"
-    """Delay of u in the log, in s: one number, or one per joint with commas. auto: estimated for all joints together
-    where u are the torques of all joints and nothing is touched, else 0."""
+    """Delay of u in the log, in s. auto: estimated for all joints together where u are the torques of all joints and
+    nothing is touched, else 0."""
     lag: Annotated[str, arg(metavar="S|auto")] = "0"
-    """Time constant in s with which actuators of first order follow u: as for --delay, for thrusters."""
+    """Time constant in s with which actuators of first order follow u, thrusters where a base has them. auto: estimated
+    for thrusters."""
     every: Annotated[int | None, unless_given("N", "1, or what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0
@@ -58,14 +59,9 @@ class FilterOptions(CutoffOptions):
 
     def preparation(self) -> forcegp.data.Preparation:
         """As above."""
-        late: dict[str, Any] = {}
-        for name in ("delay", "lag"):
-            given = getattr(self, name)
-            wrong = f"--{name} is {{!r}}; give seconds, one per joint with commas, or auto.".format
-            if given != "auto":
-                each = tuple(numbers_of(word, wrong(word), one=True)[0] for word in given.split(","))
-                given = each[0] if len(each) == 1 else each
-            late[name] = given
+        late: dict[str, Any] = {"delay": self.delay, "lag": self.lag}
+        for name in [name for name, given in late.items() if given != "auto"]:
+            [late[name]] = numbers_of(late[name], f"--{name} is {late[name]!r}; give seconds, or auto.", one=True)
         return replace(super().preparation(), every=1 if self.every is None else self.every, trim=self.trim, **late)
 
 

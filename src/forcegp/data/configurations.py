@@ -1,9 +1,7 @@
 """Positions of robots whose base moves, as signals: filtered, differentiated and written as vectors.
 
-Quaternions are filtered entry by entry, after their signs were made continuous, and then divided by their length. A
-turn of the world multiplies all of them by one orthogonal matrix, with which linear filters commute: so the result
-depends neither on the frame of the world nor on the signs. A constant turn passes exactly below the cut-off, where all
-entries have the same gain.
+Quaternions whose signs are continuous are filtered entry by entry and divided by their length: turns of the world
+commute.
 """
 
 from collections.abc import Callable

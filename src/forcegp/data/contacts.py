@@ -1,9 +1,4 @@
-"""In which rows of a log a contact acts, and whether the rows bear out where it is and that it pushes.
-
-How the point moves shows whether it stays on its surface. Where the force acts shows in what is left of the
-accelerations once friction is fitted, by linear least squares: it is compared with the same under other contacts, with
-the point moved, or without any.
-"""
+"""In which rows of a log a contact acts, and whether motion and accelerations bear out where it is."""
 
 from __future__ import annotations
 
@@ -19,7 +14,7 @@ from torch import Tensor
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.data.views import evenly, move_on, tensors, white_noise
-from forcegp.doubts import Doubts, look, wrong
+from forcegp.doubts import Doubt, Doubts, look, wrong
 from forcegp.errors import ContactError, ForceGPError
 
 FARTHEST = 5e-3  # m
@@ -35,19 +30,11 @@ DISTANCE_DEVIATIONS = 20.0
 def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
     """Whether each contact of `dataset.model` acts in each row, from q, v and a alone; `truth` is not looked at.
 
-    A row counts if its point
-
-    1. moves along the surface: the velocity along the normal is at most 2 % of that along the surface plus 2 mm/s, plus
-       `omega |distance|` where the motion has Baumgarte's terms, which pull the point back;
-    2. follows the constraint: `|A a - b|` is at most 4.5 standard deviations, by `noise_std` or, where that is larger
-       or not known, by 1.48 times the median deviation of the rows that pass 1, but not less than 0.05 m/s^2;
-    3. is where contact happens: not farther than 5 mm from the surface, and not farther from the median distance of the
-       rows that pass 1 and 2 than 1 mm or 20 robust standard deviations of them, whichever is more.
-
-    Rows of an impact break 2 and do not count. A point at rest, or gliding along just above its surface, cannot be
-    distinguished from one in contact. A closed loop acts in every row, and a contact with a switch where its flag is.
-
-    Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
+    A row counts if its point moves along the surface (across it at most 2 % of that and 2 mm/s, plus what Baumgarte's
+    terms recover), `|A a - b|` is at most 4.5 standard deviations (stated, or robust ones of these rows) or 0.05 m/s^2,
+    and it is within 5 mm of the surface and where the other rows are (1 mm, or 20 robust standard deviations). A point
+    at rest or gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact with a
+    switch where its flag is. Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
     model = dataset.model
     if model is None or not model.contacts:
@@ -150,17 +137,13 @@ def _acting(motion: PointMotion, recovery: float) -> Bool[np.ndarray, " rows"]:
     return constrained & (np.abs(distance - middle) <= max(LEAST_DISTANCE, DISTANCE_DEVIATIONS * width))
 
 
-MOST_ROWS = 240
-FEWEST_ROWS = 10
-
+MOST_ROWS, FEWEST_ROWS = 240, 10
 FAR = 0.01  # m
 HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is another one
 BROKEN, NOISE = 0.2, 3.0
 """|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
 
-MOVED = 5e-3  # m
-MOVED_DEVIATIONS = 5.0
-MOVED_GAIN = 0.7
+MOVED, MOVED_DEVIATIONS, MOVED_GAIN = 5e-3, 5.0, 0.7  # m; of its standard deviation; of the sum of logarithms
 NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
@@ -169,6 +152,7 @@ BLOCKS = 6  # stretches that are left out in turn, for standard deviations
 STEP = 1e-3  # m
 SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
 FLOOR = 1e-14
+LEAVE_OUT = "leave the contact out (`contacts=none`)."
 
 
 def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doubts:
@@ -187,159 +171,131 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
     rows = dataset.rows(evenly(dataset, MOST_ROWS))
     with torch.no_grad():
         try:
-            return _stated(rows, model.to("cpu"), noise)
+            touching, off = _on_surfaces(rows, model.to("cpu"), noise)
+            if off or touching.sum() < FEWEST_ROWS:
+                return Doubts(off)
+            return Doubts(_forces(rows.rows(touching), model.to("cpu")))
         except (ForceGPError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
             return Doubts()  # states that no contact bears: who computes with them raises what is wrong
 
 
-def _stated(rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> Doubts:
+def _on_surfaces(
+    rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]
+) -> tuple[Bool[np.ndarray, " rows"], list[Doubt]]:
+    """Rows whose points move along their surfaces, and the first contact whose point does not; none for drawn rows."""
     touching = np.ones(len(rows), dtype=bool)
     motions = point_motions(rows, model, noise_seen)
     for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
-        acts = (
-            np.ones(len(rows), bool) if contact.switch is None else rows.u[:, model.inputs.index(contact.switch)] > 0.5
-        )
+        acts = np.ones(len(rows), bool)
+        if contact.switch is not None:
+            acts = rows.u[:, model.inputs.index(contact.switch)] > 0.5
         if not acts.any():
             continue
         motion = PointMotion(*(values[acts] for values in motion))
-        distance, rate = motion.distance, np.abs(motion.rate)
+        distance, rate = np.abs(motion.distance), np.abs(motion.rate)
         residual, acceleration, noise = (
             float(np.median(np.abs(values))) for values in (motion.residual, motion.acceleration, motion.noise)
         )
-        broken = residual > max(BROKEN * acceleration, NOISE * noise)
-        recovered = recovery_of(model) * np.minimum(np.abs(distance), FARTHEST)
+        recovered = recovery_of(model) * np.minimum(distance, FARTHEST)
         slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered + 2.0 * motion.rate_noise
+        middle = np.median(motion.distance[slow]) if slow.any() else 0.0
+        along = slow & (np.abs(motion.distance - middle) <= FARTHEST)
         moves = motion.speed > 2.0 * (CREEP + motion.speed_noise)
-        along = slow & (np.abs(distance - np.median(distance[slow]) if slow.any() else distance) <= FARTHEST)
-        what = f"contact {index} (frame {contact.frame!r}): "
-        remedy = "Check its point, its surface and their units (m), or leave the contact out (`contacts=none`)."
         share = float(along[moves].mean()) if moves.any() else 1.0
-        far = float(np.median(np.abs(distance[along]))) if along.any() else float(np.median(np.abs(distance)))
-        if share < HARDLY_ANY and not broken:
-            return Doubts()  # states that no contact holds, but accelerations that obey it: drawn, not recorded
         if share < HARDLY_ANY:
-            far = float(np.median(np.abs(distance)))
+            if residual <= max(BROKEN * acceleration, NOISE * noise):  # accelerations obey it: drawn, not recorded
+                return np.zeros(len(rows), dtype=bool), []
+            far = float(np.median(distance))
             seen = (
                 f"only {100.0 * share:.0f} % of the rows move along its surface; the others move through it with "
                 f"{np.median(rate):.2g} m/s, and |A a - b| is {residual:.2g} m/s² (medians)."
             )
-        elif far > FAR:
+        elif (far := float(np.median(distance[along] if along.any() else distance))) > FAR:
             seen = f"its point moves along the surface, but {far:.3g} m away from it."
         else:
             touching[acts] &= along
             continue
         numbers = {"kind": "off", "contact": index, "share": share, "distance": far}
-        return Doubts([wrong(about="contact", what=f"{what}{seen}", do=remedy, numbers=numbers)])
-    if touching.sum() < FEWEST_ROWS:
-        return Doubts()
-    return _forces(rows.rows(touching), model)
+        remedy = f"Check its point, its surface and their units (m), or {LEAVE_OUT}"
+        what = f"contact {index} (frame {contact.frame!r}): {seen}"
+        return touching, [wrong(about="contact", what=what, do=remedy, numbers=numbers)]
+    return touching, []
 
 
-def _forces(rows: Dataset, model: forcegp.Model) -> Doubts:
+def _forces(rows: Dataset, model: forcegp.Model) -> list[Doubt]:
     """Whether forces act at the points that the contacts state, and whether there are any."""
     if len(rows) * (rows.nv - len(model.contacts)) < 2 * (3 * rows.nv + 5 * len(model.contacts)):
-        return Doubts()
-    others, tangents = moved_points(rows, model)
-    given = Residual(rows, model, more=others)
-    solution, left, weights = given.fitted(extra=True)
-    stated = given.fitted(weights=weights)[1]
-    free = Residual(rows, model.with_contacts(()), friction=given.friction).fitted(weights=weights)[1]
-    necessary = float(np.log(free / stated).sum())
-    improved = float(np.log(stated / left).sum())
-    grams = given.grams()
-    each = np.stack([given.solved(grams.sum(axis=0) - gram, weights, True)[0] for gram in grams])
-    deviations = np.std(each, axis=0) * np.sqrt(BLOCKS - 1.0)
-    doubts = []
+        return []
+    others, tangents = _moved_points(rows, model)
+    dynamics = model.dynamics(*tensors(rows)[:3])
+    friction = _friction(rows, model, dynamics)
+    given = _Residual(rows, model, friction, others)
+    solution, left, weights = given.fitted(moved=True)
+    stated = given.fitted(weights)[1]
+    free = _Residual(rows, model.with_contacts(()), friction).fitted(weights)[1]
+    improved, necessary = float(np.log(stated / left).sum()), float(np.log(free / stated).sum())
+    every = given.grams.sum(axis=0)
+    each = np.stack([given.solved(every - gram, weights, moved=True)[0] for gram in given.grams])
+    deviations, doubts = np.std(each, axis=0) * np.sqrt(BLOCKS - 1.0), list[Doubt]()
     for index, contact in enumerate(model.contacts):
-        places = slice(len(solution) - len(others) + 2 * index, len(solution) - len(others) + 2 * index + 2)
-        shift, std = solution[places], deviations[places]
-        size, uncertain = float(np.linalg.norm(shift)), float(np.linalg.norm(std))
+        places = np.arange(2) + len(solution) - len(others) + 2 * index
+        shift, uncertain = solution[places], float(np.linalg.norm(deviations[places]))
+        size = float(np.linalg.norm(shift))
         if size > max(MOVED, MOVED_DEVIATIONS * uncertain) and improved > MOVED_GAIN:
             point = np.asarray(contact.point) + shift @ tangents[index]
             text = ",".join(f"{value + 0.0:.3g}" for value in np.round(point, 4))
-            doubts.append(
-                look(
-                    about="contact",
-                    what=f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
-                    f"{100.0 * min(size, 1.0):.2g} cm ± {100.0 * uncertain:.1g} cm beside the stated point.",
-                    do=f"Check the contact's point (near {text}?), or what else presses against the robot.",
-                    numbers={
-                        "kind": "point",
-                        "contact": index,
-                        "shift": size,
-                        "std": uncertain,
-                        "point": point.tolist(),
-                    },
-                )
+            numbers = {"kind": "point", "contact": index, "shift": size, "std": uncertain, "point": point.tolist()}
+            seen = (
+                f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
+                f"{100.0 * min(size, 1.0):.2g} cm ± {100.0 * uncertain:.1g} cm beside the stated point."
             )
+            remedy = f"Check the contact's point (near {text}?), or what else presses against the robot."
+            doubts.append(look(about="contact", what=seen, do=remedy, numbers=numbers))
     if not doubts and necessary < NO_FORCE:
-        doubts.append(
-            look(
-                about="contact",
-                what="the accelerations show no force of the stated contact: they fit as well without it.",
-                do="If nothing was touched, leave the contact out (`contacts=none`).",
-                numbers={"kind": "no force", "gain": necessary},
-            )
-        )
-    return Doubts(doubts)
+        seen = "the accelerations show no force of the stated contact: they fit as well without it."
+        numbers = {"kind": "no force", "gain": necessary}
+        doubts.append(look(about="contact", what=seen, do=f"If nothing was touched, {LEAVE_OUT}", numbers=numbers))
+    return doubts
 
 
-class Residual:
-    """Accelerations that friction and some more columns leave of `a` under a model's contacts, joint by joint.
-
-    `friction` (rows, nv, k) are joint forces of the friction that may be there (default: of joints and contacts),
-    `more` the same model with something moved by STEP, whose effect is one more column each.
-    """
+class _Residual:
+    """What friction (rows, nv, k), and points `moved` by STEP, leave of `a`, as products of all columns."""
 
     def __init__(
-        self,
-        rows: Dataset,
-        model: forcegp.Model,
-        friction: Float[Tensor, "rows nv k"] | None = None,
-        more: Sequence[forcegp.Model] = (),
+        self, rows: Dataset, model: forcegp.Model, friction: Tensor, moved: Sequence[forcegp.Model] = ()
     ) -> None:
         q, v, u, a = tensors(rows)
         dynamics = model.dynamics(q, v, u)
         given = dynamics.acceleration_map().offset
-        self.friction = _friction(rows, model, dynamics) if friction is None else friction
-        moved = [(other.dynamics(q, v, u).acceleration_map().offset - given) / STEP for other in more]
-        columns = torch.cat([dynamics.H @ self.friction, *(each[..., None] for each in moved)], dim=-1)
-        self.extra = len(moved)
-        parts = torch.cat([columns, (a - given)[..., None]], dim=-1).numpy()
+        changes = [(other.dynamics(q, v, u).acceleration_map().offset - given) / STEP for other in moved]
+        parts = torch.cat([dynamics.H @ friction, *(x[..., None] for x in (*changes, a - given))], dim=-1).numpy()
         size = np.linalg.norm(parts, axis=(0, 1))
         self.used = size > 1e-9 * max(float(size.max()), 1e-300)
         self.used[-1] = True
-        self.size = np.where(self.used, np.maximum(size, 1e-300), 1.0)
-        self.blocks = np.array_split(parts / self.size * self.used, BLOCKS)
-        self.count = len(rows)
-
-    def grams(self) -> Float[np.ndarray, "blocks nv k k"]:
-        """Products of all columns, the residual last, for successive blocks of rows."""
-        return np.stack([np.einsum("rjk,rjl->jkl", block, block) for block in self.blocks])
+        self.size, self.moved = np.where(self.used, np.maximum(size, 1e-300), 1.0), len(moved)
+        blocks = np.array_split(parts / self.size * self.used, BLOCKS)
+        self.grams = np.stack([np.einsum("rjk,rjl->jkl", block, block) for block in blocks])
 
     def solved(
-        self, gram: Float[np.ndarray, "nv k k"], weights: Float[np.ndarray, " nv"], extra: bool
+        self, gram: Float[np.ndarray, "nv k k"], weights: Float[np.ndarray, " nv"], moved: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients (k,), and the power (nv,) that is left in every joint; with the columns of `more` if `extra`."""
+        """Coefficients (k,), and the power (nv,) that is left in every joint; with moved points or without."""
         count = gram.shape[-1] - 1
-        used = np.flatnonzero(self.used[:-1] & ((np.arange(count) < count - self.extra) | extra))
-        total = np.tensordot(weights, gram, 1)
-        solution = np.zeros(count + 1)
+        used = np.flatnonzero(self.used[: count if moved else count - self.moved])
+        total, solution = np.tensordot(weights, gram, 1), np.zeros(count + 1)
         if len(used):
             solution[used] = -np.linalg.lstsq(total[np.ix_(used, used)], total[used, -1], rcond=1e-12)[0]
         solution[-1] = 1.0
         left = np.maximum(np.einsum("k,jkl,l->j", solution, gram, solution), FLOOR * gram[:, -1, -1]) + 1e-300
         return -solution[:-1] / self.size[:-1] * self.size[-1], left * self.size[-1] ** 2
 
-    def fitted(
-        self, extra: bool = False, weights: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def fitted(self, weights: np.ndarray | None = None, moved: bool = False) -> tuple[np.ndarray, ...]:
         """Coefficients, power left, and weights: those given, or in proportion to 1 over the power that is left."""
-        gram = self.grams().sum(axis=0)
+        gram = self.grams.sum(axis=0)
         chosen = 1.0 / np.maximum(gram[:, -1, -1], 1e-300) if weights is None else weights
         for _ in range(3 if weights is None else 0):
-            chosen = self.size[-1] ** 2 / self.solved(gram, chosen, extra)[1]
-        return *self.solved(gram, chosen, extra), chosen
+            chosen = self.size[-1] ** 2 / self.solved(gram, chosen, moved)[1]
+        return *self.solved(gram, chosen, moved), chosen
 
 
 def _friction(
@@ -348,38 +304,32 @@ def _friction(
     """Joint forces of viscous and dry friction and constants in every joint, and of friction at every contact."""
     state, v = dynamics.state, dynamics.state.v
     slow = SLOW * v.square().mean(0).sqrt() + 1e-12
-    forces = [
-        torch.diag_embed(v),
-        torch.diag_embed(torch.tanh(v / slow)),
-        torch.eye(rows.nv).to(v).expand(len(v), -1, -1),
-    ]
+    constant = torch.eye(rows.nv).to(v).expand(len(v), -1, -1)
+    forces = [torch.diag_embed(v), torch.diag_embed(torch.tanh(v / slow)), constant]
     multipliers = dynamics.multiplier_map().offset.abs()
-    many = len(v) >= MANY_ROWS
     for index, contact in enumerate(model.contacts):
         J, turning = state.kinematics.frame_jacobian(contact.frame, contact.point).split(3, dim=1)
         velocity = (J @ v[..., None])[..., 0]
         speed = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
         direction = velocity / (speed + SLOW * speed.square().mean().sqrt() + 1e-12)
-        tangential = torch.stack([velocity, direction, direction * multipliers[:, [index]]], dim=-1)
-        forces.append(J.mT @ tangential)
-        if many:  # friction beside the stated point turns the link about the normal
+        loaded = direction * multipliers[:, [index]]
+        forces.append(J.mT @ torch.stack([velocity, direction, loaded], dim=-1))
+        if len(v) >= MANY_ROWS:  # friction beside the stated point turns the link about the normal
             along = turning.mT @ dynamics.normals[:, index, :, None]
-            forces.append(along * torch.cat([velocity, direction * multipliers[:, [index]]], dim=-1)[:, None])
+            forces.append(along * torch.cat([velocity, loaded], dim=-1)[:, None])
     return torch.cat(forces, dim=-1)
 
 
-def moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Model], list[np.ndarray]]:
+def _moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Model], list[np.ndarray]]:
     """The model with each contact point moved along the surface, in both directions of the link's frame."""
     kinematics = model.robot.kinematics(torch.tensor(rows.q))
     others, tangents = [], []
-    for index, contact in enumerate(model.contacts):
+    for contact in model.contacts:
         normal = contact.surface.gradient(contact.position(kinematics))
         local = (kinematics.frame_pose(contact.frame)[:, :3, :3].mT @ normal[..., None])[..., 0].numpy()
-        across = np.linalg.eigh(local.T @ local)[1][:, :2].T  # the directions that are least along the normal
-        for direction in across:
+        tangents.append(np.linalg.eigh(local.T @ local)[1][:, :2].T)  # the directions that are least along the normal
+        for direction in tangents[-1]:
             point = tuple(np.asarray(contact.point) + STEP * direction)
-            contacts = list(model.contacts)
-            contacts[index] = replace(contact, point=point)
+            contacts = [replace(each, point=point) if each is contact else each for each in model.contacts]
             others.append(model.with_contacts(contacts))
-        tangents.append(across)
     return others, tangents

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -10,26 +11,28 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from typing_extensions import override
 
 import forcegp.model
 from forcegp.data.dataset_fields import (
+    ROTATION,
+    TRANSLATION,
     FrozenDict,
     finite_columns,
     frozen_json,
     integer_column,
-    units_for,
-    validated_units,
+    sliding_joints,
+    units_of,
 )
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
 from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
-TRUTH_NAMES = ("a", "lambda", "Q_U", "in_contact")
-TRUTH_KINDS = ("Q_U.", "force.")
-"""Beginnings of names of which there may be several: parts of Q_U, and forces on a point of the robot."""
+ORDER = "a", "lambda", "Q_U", "in_contact"
+TRUTH = re.compile(r"a|lambda|Q_U|in_contact|(Q_U|force)\.[a-zA-Z0-9-]*[a-zA-Z0-9][a-zA-Z0-9-]*")
+"""Names of what is true; parts of Q_U and forces on points of the robot have names of their own."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -46,8 +49,8 @@ class Dataset(Summary):
     a: (rows, nv) measured acceleration, with its noise.
     time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
     joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `model.robot`.
-    units: mapping of "q", "v", "u", "a", "time" to SI units; one text, or one per joint where joints differ. By default
-        those that the joint types of `model.robot` ask for. Without a model both must be given.
+    sliding: names of the joints that slide, with units m, m/s, N and m/s^2; all others turn, with rad, rad/s, Nm and
+        rad/s^2. By default, and in any case equal to, those of `model.robot`; without a model none.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     model: the robot and what it touches, or None.
     noise_std: standard deviation of the noise on `a`, if known: (nv,), or (rows, nv) where it differs between rows.
@@ -66,7 +69,7 @@ class Dataset(Summary):
     a: Float[np.ndarray, "rows nv"]
     time: Float[np.ndarray, " rows"]
     joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
-    units: Mapping[str, Any] = None  # type: ignore[assignment]  # None becomes the robot's
+    sliding: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
     model: forcegp.model.Model | None = None
     noise_std: Float[np.ndarray, " nv"] | Float[np.ndarray, "rows nv"] | None = None
@@ -79,12 +82,10 @@ class Dataset(Summary):
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
-        for name in ("joint_names", "units"):
-            if getattr(self, name) is None:
-                if self.model is None:
-                    raise DatasetError(f"{name} are missing; give them, or a model whose robot has them.")
-                robot = self.model.robot
-                put(name, robot.joint_names if name == "joint_names" else units_for(robot))
+        if self.joint_names is None:
+            if self.model is None:
+                raise DatasetError("joint_names are missing; give them, or a model whose robot has them.")
+            put("joint_names", self.model.robot.joint_names)
         names = _joint_names(self.joint_names, self.model)
         put("joint_names", names)
         positions, actuators = self._columns_of("q"), self._columns_of("u")
@@ -99,12 +100,11 @@ class Dataset(Summary):
                 raise DatasetError(str(error)) from None
         put("time", finite_columns("time", self.time, None, rows))
         put("episode", integer_column("episode", np.zeros(rows, int) if self.episode is None else self.episode, rows))
-        put("units", validated_units(self.units, names))
-        if self.model is not None and self.units != units_for(self.model.robot):
-            raise DatasetError(
-                f"units are {self.units}; the joint types of {self.model.robot.name!r} ask for "
-                f"{units_for(self.model.robot)}."
-            )
+        own = None if self.model is None else sliding_joints(self.model.robot)
+        put("sliding", (own or ()) if self.sliding is None else tuple(self.sliding))
+        if not set(self.sliding) <= set(names) or (own is not None and set(self.sliding) != set(own)):
+            allowed = f"joints are {list(names)}" if own is None else f"those of the robot are {list(own)}"
+            raise DatasetError(f"sliding joints are {list(self.sliding)}; {allowed}.")
         put("noise_std", _noise_std(self.noise_std, names, rows))
         put("truth", _truth(self.truth, names, rows, self.model))
         put("metadata", frozen_json(self.metadata))
@@ -113,6 +113,20 @@ class Dataset(Summary):
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def units(self) -> FrozenDict:
+        """SI units of "q", "v", "u", "a" and "time": one text, or one per joint where joints differ."""
+        return units_of((~self.turns).tolist())
+
+    @property
+    def turns(self) -> Bool[np.ndarray, " nv"]:
+        """Whether a joint turns; others slide."""
+        return np.array([name not in self.sliding for name in self.joint_names])
+
+    def unit_of_each(self, name: str) -> tuple[str, ...]:
+        """The unit of a signal, one per joint."""
+        return tuple((ROTATION if turns else TRANSLATION)[name] for turns in self.turns)
 
     @override
     def facts(self) -> dict[str, object]:
@@ -183,7 +197,7 @@ class Dataset(Summary):
 
     def save(self, path: str | Path) -> None:
         """Write an HDF5 file (docs/how-to/data-format.md); an interrupted write leaves the old file, or none."""
-        write_fields(Path(path), self._fields())
+        write_fields(Path(path), self._fields(), self.units)
 
     @staticmethod
     @usable_arguments("Dataset.load")
@@ -236,28 +250,19 @@ def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.nda
 def _truth(
     given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model | None
 ) -> FrozenDict:
-    def known(name: str) -> bool:  # or `Q_U.tool`, `force.tool-friction`, with a name that a file can carry
-        ends = (name[len(kind) :] for kind in TRUTH_KINDS if name.startswith(kind))
-        return name in TRUTH_NAMES or any(end.replace("-", "").isalnum() for end in ends)
-
-    unknown = sorted(name for name in given if not known(name))
+    unknown = sorted(name for name in given if not TRUTH.fullmatch(name))
     if unknown:
-        kinds = ", ".join(f"{kind}<name>" for kind in TRUTH_KINDS)
-        raise DatasetError(f"truth has no {unknown}; allowed: {', '.join(TRUTH_NAMES)}, {kinds}.")
+        raise DatasetError(f"truth has no {unknown}; allowed: a, lambda, Q_U, in_contact, Q_U.<name>, force.<name>.")
     checked = {}
-    for name in sorted(given, key=lambda name: TRUTH_NAMES.index(name) if name in TRUTH_NAMES else len(TRUTH_NAMES)):
-        what = f"truth[{name!r}]"
-        if name in ("lambda", "in_contact"):
-            values = finite_columns(what, given[name], (), rows)
-            if model is not None and values.shape[1] != len(model.contacts):
-                raise DatasetError(
-                    f"{what} has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
-                )
-        elif name.startswith("force."):
-            values = finite_columns(what, given[name], ("x", "y", "z"), rows)
-        else:
-            values = finite_columns(what, given[name], joint_names, rows)
-        checked[name] = values
+    for name in sorted(given, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER)):
+        of_contacts, columns = name in ("lambda", "in_contact"), joint_names
+        if not name.startswith(("a", "Q_U")):
+            columns = () if of_contacts else ("x", "y", "z")
+        checked[name] = values = finite_columns(f"truth[{name!r}]", given[name], columns, rows)
+        if of_contacts and model is not None and values.shape[1] != len(model.contacts):
+            raise DatasetError(
+                f"truth[{name!r}] has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
+            )
     return FrozenDict(checked)
 
 

@@ -1,7 +1,4 @@
-"""How late forces are: torques that are logged later than they act (a delay), thrusters that act later (a lag).
-
-Of both, the number of seconds is taken at which inverse dynamics fits best.
-"""
+"""How late forces are: torques logged later than they act, thrusters that act later than their commands."""
 
 from __future__ import annotations
 
@@ -93,18 +90,11 @@ class Delay:
 def estimate_delay(dataset: Dataset, robot: forcegp.robots.Robot | None = None) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
-    For every shift up to .2 s to either side, u is fitted by least squares to what rigid bodies with friction
-    in the joints need: the torque regressor of `robot` (default: that of `dataset.model`), acceleration and velocity
-    of the joint, smooth signs of the velocity of several widths, and a constant. So the delay rests neither on the
-    robot's parameters nor on one law of friction: with one smooth sign, friction that falls with velocity looked 20 ms
-    late. The laws of the dataset's model have columns, too. The best
-    shift has the least sum of squares, by a parabola through the three smallest: among shifts up to 50 ms and, where it
-    lies at their end, up to .2 s, for each joint and for all together. Its standard deviation comes from leaving
-    out each eighth of the log in turn (block jackknife; Kuensch 1989, "The jackknife and the bootstrap for general
-    stationary observations").
-
-    Filter first: q, v, u and a must be those of one filter. Raises InvalidInput without a robot, or with contacts,
-    whose forces are not known; DatasetError for a log shorter than .4 s.
+    For every shift up to .2 s, u is fitted by least squares to the torque regressor of `robot` (default: that of the
+    model), acceleration, velocity, smooth signs of it of several widths, a constant, and the model's laws: so it rests
+    neither on the robot's parameters nor on one law of friction. The best shift is the vertex of a parabola; its
+    standard deviation comes from leaving out each eighth of the log (block jackknife; Kuensch 1989). Filter q, v, u and
+    a alike before. Raises InvalidInput without a robot, or with contacts; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
     near = _estimated(dataset, robot, USUAL_DELAY)
@@ -257,16 +247,11 @@ THRUST_SETTLED = 0.5  # s, of an episode, after which nothing depends on how it 
 def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
 
-    For every T, the force that the base's acceleration needs is fitted by least squares to what thrusters, air and
-    joints can do: each thruster, its speed times the velocity (Mahony et al. 2012), velocity, its square, rates, their
-    products, attitude, thrust times velocity, and the torque regressor of bodies that joints move beside the base.
-    With such bodies only forces count, no torques: a load on an arm changes inertias far more than the mass, which
-    looked like a lag (72 ms of none). All columns lose their slow part first, for wind is slow and controllers answer
-    it, which made lags up to a third too short. The best T has the least sum of log residuals, by a parabola; its
-    deviation comes from leaving out each eighth of the time (block jackknife, as in `estimate_delay`), and from half a
-    step of time, by which a command that holds until the next row is later than one that does not. Raises InvalidInput
-    without `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag
-    below .3 s.
+    For every T, the force that accelerates the base is fitted by least squares to thrusters (Mahony et al. 2012), air,
+    attitude and bodies beside the base, all without their slow part: wind is slow, and controllers answer it. The least
+    sum of log residuals wins; its deviation is a block jackknife, and half a step of time. Raises InvalidInput without
+    `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag below .3
+    s.
     """
     found = thruster_columns(dataset.model)
     if dataset.model is None or not found:

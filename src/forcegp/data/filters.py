@@ -14,7 +14,6 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.data.configurations import actuators, continuous, rates, space_of, through
 from forcegp.data.dataset import Dataset
-from forcegp.data.dataset_fields import unit_of_each
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
@@ -23,7 +22,8 @@ Signal = Literal["q", "v", "u", "a"]
 Values = Float[np.ndarray, "rows columns"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
-PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`Filter.memory`)
+FREQUENCIES = 2**15 + 1
 
 
 class Filter(ABC):
@@ -37,10 +37,16 @@ class Filter(ABC):
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
         """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]."""
 
-    @property
-    def memory(self) -> float:
-        """Time [s] within which noise behind the filter repeats itself: rows closer than that count as one."""
-        return 0.0
+    def memory(self, rate: float) -> float:
+        """Time [s] in which the autocorrelation of white noise at this rate [Hz] falls to one half behind the filter.
+
+        Rows that are closer count as one. By the theorem of Wiener and Khinchin, from the gain.
+        """
+        correlation = np.fft.irfft(np.abs(self.gain(np.linspace(0.0, 0.5 * rate, FREQUENCIES), rate)) ** 2)
+        correlation /= correlation[0]
+        after = int(np.argmax(correlation < 0.5))
+        above, below = correlation[[after - 1, after]]
+        return float(after - (0.5 - below) / (above - below)) / rate
 
     def __rshift__(self, other: Filter) -> Filter:
         return Chain((self, other))
@@ -61,11 +67,6 @@ class Chain(Filter):
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
         """The product."""
         return np.prod([part.gain(frequency, rate) for part in self.parts], axis=0)
-
-    @property
-    def memory(self) -> float:
-        """That of the slowest."""
-        return max(part.memory for part in self.parts)
 
 
 @dataclass(frozen=True)
@@ -110,11 +111,6 @@ class LowPass(Filter):
     def time_constant(self) -> float:
         """Of its slowest pole [s]."""
         return 1.0 / (2.0 * np.pi * self.cutoff * np.sin(0.5 * np.pi / self.order))
-
-    @property
-    def memory(self) -> float:
-        """A third of the period of the cut-off."""
-        return 1.0 / (PASSED * self.cutoff)
 
 
 @dataclass(frozen=True)
@@ -204,13 +200,16 @@ def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q
     return replace(dataset, **changed, truth=dataset.truth if set(signals) == {"a"} else {}, noise_std=noise_std)
 
 
-def shifted(dataset: Dataset, seconds: Sequence[float] | np.ndarray, lags: Sequence[float] = ()) -> Dataset:
-    """The dataset with each actuator's force taken so many seconds later, after a lag [s] where one is given."""
-    ways = [Lag(lag) >> Later(each) for each, lag in zip(seconds, lags or [0.0] * len(seconds), strict=True)]
+def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[int] | None = None) -> Dataset:
+    """The dataset with the forces of actuators taken `delay` s later, after a `lag` [s] of those columns, or of all."""
+    count = actuators(dataset)
+    columns = list(range(count)) if lagging is None else list(lagging)
 
     def acting(rows: Dataset, label: str) -> dict[str, np.ndarray]:
-        moved = [way(rows.u[:, joint], rows.time) for joint, way in enumerate(ways)]
-        return {"u": np.column_stack([*moved, rows.u[:, len(moved) :]])}
+        u = rows.u.copy()
+        u[:, columns] = Lag(lag)(u[:, columns], rows.time)
+        u[:, :count] = Later(delay)(u[:, :count], rows.time)
+        return {"u": u}
 
     return replace(dataset, **by_episode(dataset, acting), truth={})
 
@@ -341,8 +340,7 @@ def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
     space = space_of(rows)
     continuous(space, rows.q)
-    units = unit_of_each("q", rows.units["q"], rows.nv)
-    angular = [units[k] == "rad" for k in space.single_rows]
+    angular = rows.turns[space.single_rows]
     jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi
     if jumps.any():
         row, column = np.argwhere(jumps)[0]

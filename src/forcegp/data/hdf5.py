@@ -1,7 +1,4 @@
-"""The dataset file: HDF5, version 1, described in docs/how-to/data-format.md.
-
-Nothing in the file is executed: numbers, texts and JSON only, no pickles, no links to other files.
-"""
+"""The dataset file: HDF5 (docs/how-to/data-format.md): numbers, texts and JSON, of which nothing is executed."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -16,6 +13,7 @@ import numpy as np
 import forcegp.mechanics
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
+from forcegp.data.dataset_fields import ROTATION, TRANSLATION
 from forcegp.errors import FileFormatError, ForceGPError
 
 FORMAT = "forcegp-dataset"
@@ -27,7 +25,7 @@ _TEXT = h5py.string_dtype("utf-8")
 _LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that claims more holds no such data
 
 
-def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
+def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]) -> None:
     """Write the fields of a Dataset, as `atomic_file` writes and raises."""
     arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
@@ -38,7 +36,7 @@ def write_fields(path: Path, fields: Mapping[str, Any]) -> None:
         file.attrs["format_version"] = VERSION
         file.attrs["written_by"] = f"forcegp {__version__}"
         file.attrs["time_ordered"] = fields["time_ordered"]
-        for name, unit in fields["units"].items():
+        for name, unit in units.items():
             file[name].attrs.create("units", unit, dtype=_TEXT)
         file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
         file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
@@ -105,8 +103,8 @@ class _Reader:
         missing = [name for name in required if name not in file]
         self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
         values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}
-        values["units"] = {name: self.units(name) for name in ("q", "v", "u", "a", "time")}
         values["joint_names"] = tuple(self.texts("joint_names"))
+        values["sliding"] = self.sliding(values["joint_names"])
         values["metadata"] = json.loads(self.text("metadata"))
         self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
         values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
@@ -150,7 +148,19 @@ class _Reader:
         self.require(len(texts) == 1, f": {name!r} must hold one text; it holds {len(texts)}.")
         return texts[0]
 
-    def units(self, name: str) -> str | tuple[str, ...]:
+    def sliding(self, joints: tuple[str, ...]) -> tuple[str, ...]:
+        """Joints whose units are those of a length."""
+        self.require(self.units("time", 1) == ("s",), ": 'time' must be in 's'.")
+        each = {name: self.units(name, len(joints)) for name in ROTATION}
+        of_joints = [dict(zip(each, units, strict=True)) for units in zip(*each.values(), strict=True)]
+        for joint, units in zip(joints, of_joints, strict=True):
+            allowed = f"allowed are {ROTATION} or, for a prismatic joint, {TRANSLATION}"
+            self.require(units in (ROTATION, TRANSLATION), f": joint {joint!r} has units {units}; {allowed}.")
+        return tuple(joint for joint, units in zip(joints, of_joints, strict=True) if units == TRANSLATION)
+
+    def units(self, name: str, count: int) -> tuple[str, ...]:
         units: Any = self.file[name].attrs.get("units")
         self.require(units is not None, f": {name!r} has no attribute 'units'.")
-        return units if isinstance(units, str) else tuple(str(unit) for unit in np.atleast_1d(units))
+        texts = tuple(map(str, np.atleast_1d(units)))
+        self.require(len(texts) in (1, count), f": {name!r} has {len(texts)} units for {count} joints.")
+        return texts if len(texts) == count else texts * count

@@ -1,12 +1,4 @@
-"""Where motion ends and noise begins: power spectra of a log, its noise floor, and the cut-off that follows from them.
-
-Spectra are Welch's (1967, "The use of fast Fourier transform for the estimation of power spectra"), over segments of
-all episodes. Positions are differenced first and the spectrum divided by the gain of the differences, so that the
-slow, strong motion does not leak into the band of the noise (prewhitening; Percival & Walden 1993, section 6.5).
-
-Why the knee of the differentiated spectrum, the floor above it and the cut-off belong together:
-docs/how-to/checking.md.
-"""
+"""Where motion ends and noise begins: spectra (Welch 1967), noise floor and cut-off; see docs/how-to/checking.md."""
 
 from __future__ import annotations
 
@@ -196,14 +188,10 @@ def held_out_cutoff(
 ) -> tuple[float, dict[float, float]]:
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
-    A low cut-off smears dry friction and takes a part of what rotors need; a high one leaves noise in the acceleration,
-    under which every inertia looks too small (errors in variables). So a linear model of the torque is fitted behind
-    each cut-off, and all are judged alike: the model sees signals behind the highest one, in which friction is sharp,
-    and both its torque and the measured one then pass the lowest, which takes the noise (parallel filtering; Gautier,
-    "Dynamic identification of robots with power model", ICRA 1997).
-
-    Shares are geometric means over the joints, in time that was held out and below the lowest cut-off. `source` is
-    that of `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
+    A low cut-off smears dry friction, a high one leaves noise that makes inertias look too small. So a linear model is
+    learned behind each, and all are judged alike: signals behind the highest, torques behind the lowest (parallel
+    filtering; Gautier, ICRA 1997), in time that was held out, by geometric means over the joints. `source` is that of
+    `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
     """
     best, shares = _judged(dataset, robot, cutoff, source)
     if best in (min(shares), max(shares)):  # the best may lie beyond
@@ -230,7 +218,7 @@ def _judged(
         return differentiated(low_pass(log, frequency, signals=signals), source)
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), robot).common)  # the best guess, sure or not
-    log = shifted(log, np.full(log.nv, delay))
+    log = shifted(log, float(delay))
     away = SETTLED / tried[0] + abs(delay)
     times = [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])

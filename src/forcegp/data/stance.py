@@ -1,11 +1,6 @@
 """Which contacts with a switch act in which rows: from the motion of what they hold, and from the forces that it needs.
 
-A contact that acts holds `A v = 0`. The force that the rows ask of all contacts together is that of least squares,
-
-    lambda = argmin |L^-1 (M a - Q_K - A^T lambda)|,    M = L L^T,
-
-Gauss' principle turned round: where the base has no actuator, only feet explain its acceleration. Forces of feet that
-clearly move show what friction, loads and noise make of zero; feet at rest show what standing is.
+What the rows ask of all contacts is lambda = argmin |L^-1 (M a - Q_K - A^T lambda)|, M = L L^T: Gauss' principle.
 """
 
 from __future__ import annotations
@@ -101,18 +96,13 @@ class Stance:
 def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Stance:
     """Flags of all contacts with a switch from q, v, u and a; those that u holds are not looked at.
 
-    1. What clearly moves is free if it does not bear.
-    2. What rests stands if it bears, and is free if it bears nothing. Without forces, rest is stance.
-    3. Up to 0.1 s in between follow the decided rows around them where both agree. All else is open (NaN), with 30 ms
-       on either side and on those of a change, and where something clearly moves and bears.
-    4. Where nothing but these contacts holds a base against gravity: rows in which none of them stands although
-       something bears a fifth of the weight are open, and rows in which one stands although nothing does. Filters and
-       averages move feet in stance as short as their memory (a hop recorded at 50 Hz), and motion alone calls it swing.
-
-    Rest is slower than 1 cm/s, or than 2.3 times the noise of the velocity; twice that clearly moves. Nothing bears
-    up to the force that feet show which clearly move, and feet bear from twice that, or where none moves from 40 % of
-    the median at rest, of rows weighted by their force. Forces decide nothing where moving feet show more than these
-    40 %. Raises ContactError without contacts that have a switch.
+    What clearly moves is free if it does not bear; what rests stands if it bears, and is free if it bears nothing. Up
+    to 0.1 s in between follow decided rows on both sides that agree; all else is open (NaN), with 30 ms about it and
+    about a change. Where nothing else holds a base up, rows in which nothing stands although a fifth of the weight is
+    borne, or the other way round, are open: filters move short stances, and motion alone calls them swing. Rest is
+    slower than 1 cm/s or 2.3 times the noise of v. Feet that clearly move show what bears nothing; twice that bears, or
+    40 % of the median at rest; forces that do not differ decide nothing. Raises ContactError without contacts that have
+    a switch.
     """
     model = dataset.model if model is None else model
     names = () if model is None else tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))

@@ -221,12 +221,9 @@ def time_blocks(
 ) -> tuple[tuple[int, ...], ...]:
     """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
 
-    To leave whole blocks out tests the prediction of a part of the motion that was not seen (block cross-validation;
-    Burman, Chow & Nolan 1994, "A cross-validatory method for dependent data").
-
-    `time` [s] and `episode` may come in any order, such as that of `farthest_rows`. Stretches are counted from the
-    first of these rows in every episode; those without rows give no block, so that every row is in exactly one.
-    Raises InvalidInput for a length that is not positive and finite, and for columns of different lengths.
+    `time` [s] and `episode` may come in any order. Stretches are counted from the first of these rows in every episode;
+    every row is in exactly one. Raises InvalidInput for a length that is not positive and finite, and columns that
+    differ.
     """
     if not 0.0 < seconds < float("inf"):
         raise InvalidInput(f"seconds is {seconds}; it must be positive and finite.")
@@ -275,15 +272,11 @@ ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below whi
 def farthest_point_sampling(
     points: Float[np.ndarray, "rows features"], count: int, *, start: int = 0
 ) -> Int[np.ndarray, " count"]:
-    """Numbers of `count` rows of which each is the farthest from all rows chosen before it.
+    """Numbers of `count` rows of which each is the farthest from all rows chosen before it, from `start` on.
 
-    Greedy k-centre (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance") with Euclidean distances
-    on columns standardised to zero mean and unit standard deviation. The first row is `start`. The
-    result is deterministic (the lowest row number wins a tie) and nested: the first n of `count` rows are the sample of
-    size n. Repeated rows come only after all distinct ones, and no row number occurs twice.
-    Time O(rows * count * features), memory O(rows * features).
-
-    Raises InvalidInput if `points` is not a finite table, or for a `count` or `start` outside the rows.
+    Greedy k-centre (Gonzalez 1985), Euclidean on columns standardised to mean 0 and deviation 1; deterministic and
+    nested; repeated rows come last. Time O(rows * count * features). Raises InvalidInput if `points` is not a finite
+    table, or for a `count` or `start` outside the rows.
     """
     table = np.asarray(points)
     if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():

@@ -82,11 +82,10 @@ class AirLaw:
 def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | None:
     """What air does to the base, and the velocity of the air [m/s, world] at each row; None where rows do not show it.
 
-    The mean wind of every episode and the law are found together, by least squares with the law projected out
-    (Kaufman's variable projection, BIT 1975, with Levenberg-Marquardt steps): a body that moves to and fro shows the
-    slope of the drag, and the force that stays is that slope times the wind. The wind then follows the rows nearby.
-    Nothing is found for bases that do not fly freely, for rows out of order, for fewer than 400, where drag explains no
-    more than its coefficients would of noise, and for winds beyond 40 m/s or a standard deviation beyond 2 m/s.
+    Mean wind of every episode and law together, with the law projected out (Kaufman, BIT 1975, with Levenberg-Marquardt
+    steps); then the wind follows the rows nearby. Not for bases that do not fly freely, rows out of order, fewer than
+    400, drag that explains no more than its coefficients would of noise, winds beyond 40 m/s or deviations beyond 2
+    m/s.
     """
     if not _flies(dataset) or not dataset.time_ordered:
         return None
@@ -108,10 +107,8 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
 def steady_forces(dataset: Dataset) -> Float[np.ndarray, "rows 3"] | None:
     """The force [N, world] by which each episode differs from the others; None for one, and where no base flies freely.
 
-    With the law of air in still air and a constant force of the world in every episode, whose coefficients are small
-    a priori: causes that hardly change in an episode can look like its force. So they share what either would explain.
-    The mean of the forces over the rows is left out, for the law holds it. Where wind is not found, this is what
-    different winds leave.
+    By the law of air in still air and a constant force in every episode, which share what either would explain; the
+    mean over the rows is left out, for the law holds it. Where wind is not found, this is what different winds leave.
     """
     numbers, own = np.unique(dataset.episode, return_inverse=True)
     if len(numbers) < 2 or not _flies(dataset) or len(dataset) < FEWEST_ROWS // 2:

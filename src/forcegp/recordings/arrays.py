@@ -1,18 +1,19 @@
-"""Files that hold arrays by name: NumPy archives (.npz), HDF5 of any layout, and MATLAB files of all versions."""
+"""Files that hold arrays by name: NumPy archives (.npz), HDF5 of any layout, MATLAB files of all versions, Parquet."""
 
 import fnmatch
 import math
 import re
 import zipfile
-from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.lib import format as npy
+from pyarrow import parquet, types
 from typing_extensions import override
 
 from forcegp.errors import FileFormatError, InvalidInput
@@ -20,9 +21,11 @@ from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
     Source,
+    arrow_numbers,
     columns_of,
     element_names,
     reading,
+    require_distinct,
     require_plausible_size,
 )
 from forcegp.summary import listed
@@ -30,32 +33,30 @@ from forcegp.summary import listed
 SEPARATOR = "/"
 MOST_NAMES = 12  # of arrays in a message
 
+Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
+"""By full name, shape and content of every array of numbers in a file."""
+
 
 class ArrayFile(Source):
     """Arrays (rows,) and (rows, k) by name; the latter are the columns `name[0] ... name[k-1]`.
 
     With `within`, only what is under that name counts, and names begin after it: a file with one array or one group per
     episode is read as one table per episode. An array by itself is then `[0] ... [k-1]`.
-    Subclasses list the `shapes` of all arrays of numbers by full name, and give each `array`.
     """
 
-    def __init__(self, path: Path, *, within: str | None = None) -> None:
+    def __init__(self, path: Path, arrays: Callable[[Path], Arrays], *, within: str | None = None) -> None:
         super().__init__(path)
-        self.within = within
+        self._listed, self.within = arrays, within
 
     @cached_property
-    @abstractmethod
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of every array of numbers."""
-
-    @abstractmethod
-    def array(self, name: str) -> np.ndarray:
-        """The array of that full name."""
+    def arrays(self) -> Arrays:
+        """All of the file."""
+        return self._listed(self.path)
 
     def episodes(self, pattern: str) -> list[str]:
         """Names that a pattern such as `data/demo_*` matches, in the order of numbers. Raises InvalidInput for none."""
         depth = pattern.count(SEPARATOR) + 1
-        names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.shapes)
+        names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.arrays)
         found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
         if not found:
             raise InvalidInput(
@@ -67,13 +68,13 @@ class ArrayFile(Source):
     def _places(self) -> dict[str, tuple[str, int | None]]:
         """Column -> (full name of its array, column in it)."""
         places: dict[str, tuple[str, int | None]] = {}
-        for full, shape in self.shapes.items():
+        for full, (shape, _) in self.arrays.items():
             name = full
             if self.within is not None:
                 if not f"{full}/".startswith(f"{self.within}/"):
                     continue
                 name = full[len(self.within) + 1 :]
-            if not shape or shape == (1,) or shape == (1, 1) or 0 in shape:
+            if not shape or shape in ((1,), (1, 1)) or 0 in shape:
                 continue
             if len(shape) == 1 or (len(shape) == 2 and shape[1] == 1 and name):
                 places[name or "[0]"] = (full, None if len(shape) == 1 else 0)
@@ -83,7 +84,7 @@ class ArrayFile(Source):
             inside = f" under {self.within!r}" if self.within else ""
             raise FileFormatError(
                 f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}; "
-                f"it has {listed(self.shapes, MOST_NAMES)}."
+                f"it has {listed(self.arrays, MOST_NAMES)}."
             )
         return places
 
@@ -93,13 +94,14 @@ class ArrayFile(Source):
 
     @override
     def table(self, names: Sequence[str]) -> Columns:
-        arrays = {self._places[name][0]: self.shapes[self._places[name][0]][0] for name in names}
-        if len(set(arrays.values())) > 1:
-            counts = ", ".join(f"{array} {rows}" for array, rows in arrays.items())
+        chosen = {self._places[name][0]: self.arrays[self._places[name][0]] for name in names}
+        if len({shape[0] for shape, _ in chosen.values()}) > 1:
+            counts = ", ".join(f"{array} {shape[0]}" for array, (shape, _) in chosen.items())
             raise FileFormatError(
                 f"{self.path}: its arrays have different numbers of rows ({counts}); map those of one."
             )
-        return columns_of({name: self.array(name) for name in arrays}, {name: self._places[name] for name in names})
+        tables = {name: content() for name, (_, content) in chosen.items()}
+        return columns_of(tables, {name: self._places[name] for name in names})
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
@@ -107,174 +109,127 @@ def _by_numbers(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D", name)]
 
 
-NUMPY = "a NumPy archive"
-_ERRORS = (zipfile.BadZipFile, NotImplementedError)
+NUMPY = "a NumPy archive", zipfile.BadZipFile, NotImplementedError
 
 
-class NumpyArchive(ArrayFile):
-    """The arrays of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
+def numpy_arrays(path: Path) -> Arrays:
+    """Of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
-    @cached_property
-    @override
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """By the headers of its members."""
-        found = {}
-        with reading(self.path, NUMPY, *_ERRORS), zipfile.ZipFile(self.path) as archive:
-            members = archive.infolist()
-            declared = sum(member.file_size for member in members)
-            require_plausible_size(self.path, "the archive", declared, self.path.stat().st_size)
-            for member in members:
-                require_plausible_size(self.path, repr(member.filename), member.file_size, member.compress_size)
-                name = member.filename.removesuffix(".npy")
-                if name == member.filename:
-                    continue
-                with archive.open(member) as stream:
-                    read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
-                    shape, _, dtype = read(stream)
-                if dtype.hasobject:
-                    raise FileFormatError(
-                        f"{self.path}: {name!r} holds Python objects, which are never read because reading them runs "
-                        "code; save it as an array of numbers."
-                    )
-                if math.prod(shape) * dtype.itemsize > member.file_size:
-                    raise FileFormatError(
-                        f"{self.path}: {name!r} claims the shape {shape}, but the file does not hold that much."
-                    )
-                if dtype.kind in "fiu":
-                    found[name] = shape
-        return found
-
-    @override
-    def array(self, name: str) -> np.ndarray:
-        with reading(self.path, NUMPY, *_ERRORS), np.load(self.path, allow_pickle=False) as archive:
+    def content(name: str) -> np.ndarray:
+        with reading(path, *NUMPY), np.load(path, allow_pickle=False) as archive:
             return archive[name]
+
+    found = {}
+    with reading(path, *NUMPY), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        require_plausible_size(path, "the archive", sum(x.file_size for x in members), path.stat().st_size)
+        for member in members:
+            require_plausible_size(path, repr(member.filename), member.file_size, member.compress_size)
+            name = member.filename.removesuffix(".npy")
+            if name == member.filename:
+                continue
+            with archive.open(member) as stream:
+                read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
+                shape, _, dtype = read(stream)
+            if dtype.hasobject:
+                raise FileFormatError(
+                    f"{path}: {name!r} holds Python objects, which are never read because reading them runs code; save "
+                    "it as an array of numbers."
+                )
+            if math.prod(shape) * dtype.itemsize > member.file_size:
+                raise FileFormatError(
+                    f"{path}: {name!r} claims the shape {shape}, but the file does not hold that much."
+                )
+            if dtype.kind in "fiu":
+                found[name] = shape, lambda name=name: content(name)
+    return found
 
 
 HDF5 = "an HDF5 file"
 
 
-class HDF5Arrays(ArrayFile):
-    """The datasets of an HDF5 file, which must lie in the file itself: links to other files are never followed.
+def hdf5_arrays(path: Path) -> Arrays:
+    """Of all groups of an HDF5 file, in which they must lie: links to other files are never followed."""
 
-    With `transposed`, arrays are stored column by column, as MATLAB does in its files of version 7.3.
-    """
-
-    transposed: ClassVar[bool] = False
-
-    @cached_property
-    @override
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of all groups."""
-        found: dict[str, tuple[int, ...]] = {}
-        with reading(self.path, HDF5), h5py.File(self.path, "r") as file:
-            self._collect(file, "", found)
-        return found
-
-    def _collect(self, group: h5py.Group, prefix: str, found: dict[str, tuple[int, ...]]) -> None:
-        for name in map(str, group):
-            path, link = prefix + name, group.get(name, getlink=True)
-            item = group[name] if isinstance(link, h5py.HardLink) else None  # a soft link is another name
-            outside = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
-            if isinstance(link, h5py.ExternalLink) or outside:
-                raise FileFormatError(
-                    f"{self.path}: {path!r} is in another file, and links to other files are not followed; give that "
-                    "file, or copy the data into one."
-                )
-            if isinstance(item, h5py.Group) and not name.startswith("#"):  # MATLAB keeps contents of cells there
-                if prefix.count("/") > 32:
-                    raise FileFormatError(f"{self.path}: its groups are nested more than 32 deep.")
-                self._collect(item, f"{path}/", found)
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and item.shape is not None:
-                declared = item.size * item.dtype.itemsize
-                require_plausible_size(self.path, repr(path), declared, item.id.get_storage_size())
-                found[path] = tuple(item.shape[:: -1 if self.transposed else 1])
-
-    @override
-    def array(self, name: str) -> np.ndarray:
-        with reading(self.path, HDF5), h5py.File(self.path, "r") as file:
+    def content(name: str) -> np.ndarray:
+        with reading(path, HDF5), h5py.File(path, "r") as file:
             stored = file[name]
             assert isinstance(stored, h5py.Dataset)
-            return stored[()].T if self.transposed else stored[()]
+            return stored[()]
+
+    with reading(path, HDF5), h5py.File(path, "r") as file:
+        return {name: (shape, lambda name=name: content(name)) for name, shape in _stored(path, file, "")}
+
+
+def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, tuple[int, ...]]]:
+    for name in map(str, group):
+        full, link = prefix + name, group.get(name, getlink=True)
+        item = group[name] if isinstance(link, h5py.HardLink) else None  # a soft link is another name
+        outside = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
+        if isinstance(link, h5py.ExternalLink) or outside:
+            raise FileFormatError(
+                f"{path}: {full!r} is in another file, and links to other files are not followed; give that file, or "
+                "copy the data into one."
+            )
+        if isinstance(item, h5py.Group) and not name.startswith("#"):  # MATLAB keeps contents of cells there
+            if prefix.count("/") > 32:
+                raise FileFormatError(f"{path}: its groups are nested more than 32 deep.")
+            yield from _stored(path, item, f"{full}/")
+        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and item.shape is not None:
+            require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, item.id.get_storage_size())
+            yield full, tuple(item.shape)
 
 
 MATLAB = "a MATLAB file"
 NOT_NUMBERS = {"cell", "object", "opaque", "function", "unknown"}
 
 
-class MatlabHDF5(HDF5Arrays):
-    """A MATLAB file of version 7.3: HDF5 whose arrays lie column by column."""
+def matlab_arrays(path: Path) -> Arrays:
+    """Of a .mat file: its matrices, and those in structs, called `struct/field`. Vectors may lie either way.
 
-    transposed = True
-
-    @cached_property
-    @override
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Vectors stand upright."""
-        arrays = super().shapes
-        with reading(self.path, MATLAB), h5py.File(self.path, "r") as file:
+    Of version 5 to 7, scipy reads whole variables, so what these hold must fit into memory. One of 7.3 is HDF5 whose
+    arrays lie column by column. Raises FileFormatError for cells, which have no columns.
+    """
+    if path.is_file() and h5py.is_hdf5(path):
+        arrays = hdf5_arrays(path)
+        with reading(path, MATLAB), h5py.File(path, "r") as file:
             named = ((name, item) for name, item in file.items() if item is not None)  # None: a link to nothing
             cells = [name for name, item in named if item.attrs.get("MATLAB_class", b"") == b"cell"]
         if cells and not arrays:
-            raise _cell(self.path, cells[0])
-        return {name: (shape[1], 1) if _is_row(shape) else shape for name, shape in arrays.items()}
+            raise _cell(path, cells[0])
+        upright = {name: _upright(shape[::-1]) for name, (shape, _) in arrays.items()}
+        return {
+            name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
+            for name, shape in upright.items()
+        }
+    from scipy.io import loadmat, matlab
 
-    @override
-    def array(self, name: str) -> np.ndarray:
-        return super().array(name).reshape(self.shapes[name])
+    with reading(path, MATLAB, matlab.MatReadError, NotImplementedError, MemoryError, IndexError):
+        size = path.stat().st_size
+        for name, shape, kind in matlab.whosmat(str(path)):
+            require_plausible_size(path, repr(name), 8 * math.prod(shape), size)
+            if kind in NOT_NUMBERS:
+                raise _cell(path, name)
+        content = loadmat(str(path), struct_as_record=True)
+    found: dict[str, np.ndarray] = {}
 
-
-class MatlabFile(ArrayFile):
-    """A MATLAB file of version 5 to 7: its matrices, and those in structs, called `struct/field`.
-
-    Vectors may lie either way. scipy reads whole variables, so what these hold must fit into memory.
-    Raises FileFormatError for cells, which have no columns.
-    """
-
-    @cached_property
-    def _arrays(self) -> dict[str, np.ndarray]:
-        from scipy.io import loadmat, matlab
-
-        with reading(self.path, MATLAB, matlab.MatReadError, NotImplementedError, MemoryError, IndexError):
-            size = self.path.stat().st_size
-            for name, shape, kind in matlab.whosmat(str(self.path)):
-                require_plausible_size(self.path, repr(name), 8 * math.prod(shape), size)
-                if kind in NOT_NUMBERS:
-                    raise _cell(self.path, name)
-            content = loadmat(str(self.path), struct_as_record=True)
-        found: dict[str, np.ndarray] = {}
-        for name, value in content.items():
-            if not name.startswith("__"):
-                self._collect(name, value, found)
-        return found
-
-    def _collect(self, name: str, value: np.ndarray, found: dict[str, np.ndarray]) -> None:
+    def collect(name: str, value: np.ndarray) -> None:
         if value.dtype.names and value.size == 1:
             for field in value.dtype.names:
-                self._collect(f"{name}/{field}", value.ravel()[0][field], found)
+                collect(f"{name}/{field}", value.ravel()[0][field])
         elif value.dtype.hasobject:
-            raise _cell(self.path, name)
+            raise _cell(path, name)
         elif value.dtype.kind in "fiu":
-            found[name] = value.reshape(-1, 1) if _is_row(value.shape) else value
+            found[name] = value.reshape(_upright(value.shape))
 
-    @cached_property
-    @override
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of what was read."""
-        return {name: values.shape for name, values in self._arrays.items()}
-
-    @override
-    def array(self, name: str) -> np.ndarray:
-        return self._arrays[name]
+    for name, value in content.items():
+        if not name.startswith("__"):
+            collect(name, value)
+    return {name: (values.shape, lambda values=values: values) for name, values in found.items()}
 
 
-def matlab_file(path: Path, *, within: str | None = None) -> ArrayFile:
-    """The reader for the version of a .mat file."""
-    kind = MatlabHDF5 if path.is_file() and h5py.is_hdf5(path) else MatlabFile
-    return kind(path, within=within)
-
-
-def _is_row(shape: tuple[int, ...]) -> bool:
-    return len(shape) == 2 and shape[0] == 1 and shape[1] > 1
+def _upright(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (shape[1], 1) if len(shape) == 2 and shape[0] == 1 and shape[1] > 1 else shape
 
 
 def _cell(path: Path, name: str) -> FileFormatError:
@@ -282,3 +237,54 @@ def _cell(path: Path, name: str) -> FileFormatError:
         f"{path}: {name!r} is a cell, an object or an array of structs, which has no columns; "
         "save matrices of numbers (cell2mat)."
     )
+
+
+PARQUET = "a Parquet file"
+LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
+
+
+def parquet_arrays(path: Path) -> Arrays:
+    """Of a Parquet file: numeric columns, and columns of lists of equal length, that of the first row."""
+
+    def content(name: str, width: int | None) -> np.ndarray:
+        with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
+            column = file.read(columns=[name]).column(name).combine_chunks()
+            if width is None:
+                return arrow_numbers(column)
+            lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
+            for row in np.flatnonzero(lengths != width)[:1]:
+                raise FileFormatError(
+                    f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before; lists must be "
+                    "of one length."
+                )
+            return arrow_numbers(column.flatten()).reshape(len(column), width)
+
+    widths: dict[str, int | None] = {}
+    with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
+        rows = file.metadata.num_rows
+        if not rows:
+            raise FileFormatError(f"{path} has columns but no rows.")
+        for field in file.schema_arrow:
+            if types.is_floating(field.type) or types.is_integer(field.type):
+                widths[field.name] = None
+            elif any(is_list(field.type) for is_list in LISTS):
+                first = next(file.iter_batches(1, columns=[field.name])).column(0)[0]
+                kind = field.type.value_type
+                if first.is_valid and len(first) and (types.is_floating(kind) or types.is_integer(kind)):
+                    widths[field.name] = len(first)
+        elements = [name for own, width in widths.items() for name in (element_names(own, width) if width else [own])]
+        require_distinct(path, [*(name for name in file.schema_arrow.names if name not in widths), *elements])
+    return {
+        name: ((rows,) if width is None else (rows, width), lambda name=name, width=width: content(name, width))
+        for name, width in widths.items()
+    }
+
+
+ARRAYS: dict[str, Callable[[Path], Arrays]] = {
+    ".npz": numpy_arrays,
+    ".mat": matlab_arrays,
+    ".h5": hdf5_arrays,
+    ".hdf5": hdf5_arrays,
+    ".parquet": parquet_arrays,
+    ".pq": parquet_arrays,
+}

@@ -1,7 +1,7 @@
-"""Columns of a log: lists in short, names that are guessed, and linear combinations.
+"""Columns of a log: lists in short, names that are guessed, and linear combinations in Python's grammar.
 
-Combinations have the grammar of Python: numbers, pi, columns, + - * / and parentheses. Known columns are recognised
-letter by letter, the longest first, so most names need no quotes whatever they contain; backticks settle the rest.
+Known columns are recognised letter by letter, the longest first, so most names need no quotes; backticks settle the
+rest.
 """
 
 import ast

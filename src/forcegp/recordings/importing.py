@@ -13,14 +13,15 @@ from typing_extensions import override
 import forcegp.mechanics
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset, is_dataset
+from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
-from forcegp.recordings.arrays import ArrayFile, HDF5Arrays, NumpyArchive, matlab_file
+from forcegp.recordings.arrays import ARRAYS, ArrayFile
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.recording import Recording, read_recording
 from forcegp.recordings.ros_bag import RosBag
 from forcegp.recordings.signal_plan import LACKING, SignalPlan, signal_plan
 from forcegp.recordings.source import Columns, Source
-from forcegp.recordings.tables import DelimitedText, ParquetFile
+from forcegp.recordings.tables import DelimitedText
 
 ROUND_RATE = 1e-3  # a median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz
 
@@ -95,7 +96,7 @@ def import_recordings(
     plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
-        if (other.joints, other.units, other.logged) != (plan.joints, plan.units, plan.logged):
+        if (other.joints, other.sliding, other.logged) != (plan.joints, plan.sliding, plan.logged):
             raise InvalidInput(
                 f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
             )
@@ -112,16 +113,16 @@ def import_recordings(
             for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
                 for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
                     where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
-                    raise DatasetError(f"{recording.label}: {seen} at {where}; {remedy}")
+                    raise DatasetError(f"{recording.told['name']}: {seen} at {where}; {remedy}")
             piece = recording.rows(rows, step)
             count, stamp = len(piece["time"]), recording.begin + float(recording.time[rows[0]])
             pieces.append(piece | {"episode": np.full(count, len(pieces))})
-            told = {"recording": recording.label, "number": number, "row": int(rows[0]), "begin": stamp}
+            told = {"recording": recording.told["name"], "number": number, "row": int(rows[0]), "begin": stamp}
             done["episodes"].append(told | {"rows": count})
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
-    return Dataset(**columns, joint_names=plan.joints, units=plan.units, model=model, metadata={"import": done})
+    return Dataset(**columns, joint_names=plan.joints, sliding=plan.sliding, model=model, metadata={"import": done})
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:
@@ -163,7 +164,7 @@ def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float
             )
         return 1.0 / options.rate
     alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in recordings)
-    if options.rate == "log" or (alike and all(own.even for own in recordings)):
+    if options.rate == "log" or (alike and all(own.worst <= JITTER for own in recordings)):
         return None
     rate = float(f"{1 / median:.3g}")
     return 1.0 / rate if abs(rate * median - 1.0) <= ROUND_RATE else median
@@ -193,20 +194,7 @@ def _what_was_done(
             name: f"logged and {made[name]}" if name in lacking else "logged" if name in plan.logged else made[name]
             for name in SIGNALS
         },
-        "recordings": [
-            {
-                "name": recording.label,
-                "rows": len(recording.time),
-                "seconds": float(sum(np.ptp(recording.time[rows]) for _, rows in recording.stretches)),
-                "median_step": recording.step,
-                "largest_deviation_of_a_step": recording.worst,
-                "repeated_stamps_dropped": recording.repeated,
-                "gaps": list(recording.gaps),
-                "rows_in_stretches_too_short": recording.dropped,
-                "notes": list(recording.notes),
-            }
-            for recording in recordings
-        ],
+        "recordings": [recording.told for recording in recordings],
         "resampled_to_step": step,
         "unwrapped": options.unwrap,
         "start": options.start,
@@ -271,15 +259,7 @@ class SideBySide(Source):
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")
-ARRAYS: dict[str, Callable[..., ArrayFile]] = {
-    ".npz": NumpyArchive,
-    ".mat": matlab_file,
-    ".h5": HDF5Arrays,
-    ".hdf5": HDF5Arrays,
-}
 TABLES: dict[str, Callable[[Path], Source]] = {
-    ".parquet": ParquetFile,
-    ".pq": ParquetFile,
     ".bag": RosBag,
     ".mcap": RosBag,
     ".db3": RosBag,
@@ -306,9 +286,9 @@ def open_source(
     if kind in TEXT:
         return DelimitedText(path, headerless=headerless, delimiter=delimiter)
     if kind in ARRAYS:
-        if kind != ".npz" and is_dataset(path):
+        if kind in (".h5", ".hdf5", ".mat") and is_dataset(path):
             raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")
-        return ARRAYS[kind](path, within=within)
+        return ArrayFile(path, ARRAYS[kind], within=within)
     return RosBag(path) if kind == "ros2" else TABLES[kind](path)
 
 

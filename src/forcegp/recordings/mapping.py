@@ -192,15 +192,10 @@ class ColumnMapping:
         """The words of `forcegp import` that state columns, units and signs."""
         words: list[str] = []
         for name, value in self.plain().items():
-            if name in SIGNALS or name == "joints":
-                words += [f"--{name}", ",".join(value) if isinstance(value, list) else str(value)]
-            elif isinstance(value, dict):
-                texts = (f"{key}={','.join(_word(x) for x in _listed(each))}" for key, each in value.items())
-                words += [f"--{name}", ",".join(texts)]
-            elif value is True:
-                words.append(f"--{name.replace('_', '-')}")
-            else:
-                words += [f"--{name}", ",".join(map(_word, _listed(value)))]
+            each = (
+                [f"{key}={_joined(own)}" for key, own in value.items()] if isinstance(value, dict) else [_joined(value)]
+            )
+            words += [f"--{name.replace('_', '-')}", *([] if value is True else [",".join(each)])]
         return words
 
     def plain(self) -> dict[str, Any]:
@@ -216,8 +211,8 @@ class ColumnMapping:
         return found
 
 
-def _word(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
+def _joined(value: Any) -> str:
+    return ",".join(each if isinstance(each, str) else f"{each:g}" for each in _listed(value))
 
 
 def _shortened(value: Any) -> Any:

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from scipy.interpolate import make_interp_spline
 
 import forcegp.robots
-from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.moving_base import Jumps, Layout, read_poses
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
@@ -23,38 +22,22 @@ from forcegp.recordings.source import Columns, Source
 class Recording:
     """What was read of one table.
 
-    Fields
-    ------
-    label: what people call it, a file or an array in it.
-    signals: those that were logged, (rows, entries) in SI, in the order of a Dataset.
-    time: (rows,) [s] from its first row on.
-    begin: the stamp of the log at the first row, in s.
-    stretches: episode number of the log and numbers of the rows, without gaps.
-    step: the median of the steps between rows that are used [s]; `worst` the largest relative deviation from it within
-        a stretch; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` [s].
-    jumps: rows before which a turning joint moves by more than half a turn, or a base by a quarter; what was
-        seen, and what to do.
+    `label` is what people call it; `signals` those that were logged, (rows, entries) in SI, in the order of a Dataset;
+    `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too far.
+    `stretches` are episode number and rows without gaps, `step` their median step [s] and `worst` the largest relative
+    deviation from it; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` in s.
     """
 
-    label: str
+    told: dict[str, Any]
     source: Source
     signals: Mapping[str, Float[np.ndarray, "rows entries"]]
     time: Float[np.ndarray, " rows"]
     begin: float
     jumps: tuple[Jumps, ...]
     layout: Layout
-    notes: tuple[str, ...]
     stretches: tuple[tuple[int, Int[np.ndarray, " rows"]], ...]
     step: float
     worst: float
-    repeated: int
-    gaps: tuple[float, ...]
-    dropped: int
-
-    @property
-    def even(self) -> bool:
-        """Is every step within 1 % of the median?"""
-        return self.worst <= JITTER
 
     def rows(self, used: Int[np.ndarray, " rows"], step: float | None) -> dict[str, np.ndarray]:
         """Time and the signals q, v, u, a of these rows, `step` [s] apart, or for None at the times of the log."""
@@ -98,15 +81,15 @@ def read_recording(
     signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
     signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
     layout = replace(plan.layout, held=read.held or plan.layout.held)
-    stretches = _stretches(label, source, time, episodes, read, options)
-    return Recording(label, source, signals, time, begin, (*jumps, *turned), layout, (*read.notes, *told), *stretches)
+    stretches, step, worst, left_out = _stretches(label, source, time, episodes, read, options)
+    seconds = float(sum(np.ptp(time[rows]) for _, rows in stretches))
+    about = {"name": label, "rows": rows, "seconds": seconds, "median_step": step, "largest_deviation_of_a_step": worst}
+    about |= {**left_out, "notes": [*read.notes, *told]}
+    return Recording(about, source, signals, time, begin, (*jumps, *turned), layout, stretches, step, worst)
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
-    """Seconds since the first row, and its stamp in s.
-
-    Whole numbers are subtracted as such: a float64 has no epochs in ns to 1 ns.
-    """
+    """Seconds since the first row, and its stamp in s; whole numbers are subtracted as such, to the last ns."""
     if plan.time is None:
         assert plan.step is not None
         return np.arange(rows) * plan.step, 0.0
@@ -227,12 +210,11 @@ SLOWEST, FASTEST = 2.0, 2e5
 
 def _stretches(
     label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
-) -> tuple[Any, ...]:
-    """Rows between gaps, their median step, its worst deviation, repeated stamps, gaps, and rows left out.
+) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
+    """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 
-    Rows in a pause of one topic of several are left out. Of rows with the same stamp the first is kept: what comes
-    after it is a sample that was sent again, or one whose time is not known. Raises DatasetError for time that runs
-    backwards, and for rates that no robot is logged at.
+    Of rows with the same stamp the first is kept. Raises DatasetError for time that runs backwards and impossible
+    rates.
     """
     begins = episodes[:, 1]
     steps = np.diff(time)
@@ -276,8 +258,9 @@ def _stretches(
             "a longer `gap` may be right."
         )
     worst = float(np.abs(between[inside] / step - 1.0).max())
-    dropped = len(used) - sum(len(rows) for _, rows in stretches)
-    return tuple(stretches), step, worst, repeated, tuple(between[same & ~inside].tolist()), dropped
+    left_out = {"repeated_stamps_dropped": repeated, "gaps": between[same & ~inside].tolist()}
+    left_out["rows_in_stretches_too_short"] = len(used) - sum(len(rows) for _, rows in stretches)
+    return tuple(stretches), step, worst, left_out
 
 
 def _require_rate(label: str, step: float) -> None:

@@ -1,7 +1,4 @@
-"""ROS 1 bags, ROS 2 bags and bare .mcap and .db3 files, read with `rosbags` (extra "logs"), without ROS.
-
-Topics with different clocks are put on that of one of them: commands are held, everything else is interpolated.
-"""
+"""Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -287,10 +284,7 @@ def _at(
     most: Float[np.ndarray, " columns"],
     turns: Sequence[Sequence[int]],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values (rows, columns), how long nothing was heard about them, and whether there are any, at these times.
-
-    Values that differ by `most` or more are held. `turns` are places of quaternions.
-    """
+    """Values (rows, columns) then, how old they are, whether there are any; jumps of `most` or more are held."""
     before = np.searchsorted(stamps, time, side="right") - 1
     there, first = before >= 0, np.maximum(before, 0)
     since, after = time - stamps[first], first

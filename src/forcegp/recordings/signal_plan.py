@@ -9,8 +9,7 @@ import numpy as np
 
 import forcegp.mechanics
 import forcegp.robots
-from forcegp.data import FrozenDict
-from forcegp.data.dataset_fields import ROTATION, TRANSLATION, unit_of_each, units_for, validated_units
+from forcegp.data.dataset_fields import ROTATION, TRANSLATION, sliding_joints
 from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.column_names import (
     LinearExpression,
@@ -56,7 +55,7 @@ class SignalPlan:
     """Everything that is read from a table. `signals` stand signal by signal, each in the order of `joints`."""
 
     joints: tuple[str, ...]
-    units: Mapping[str, Any]
+    sliding: tuple[str, ...]
     signals: tuple[JointSignal, ...]
     layout: Layout
     orientation: str
@@ -145,9 +144,11 @@ def signal_plan(
         time = parse_expression(mapping.time, source.columns(), str(source.path)) if mapping.time is not None else None
     if time is not None and not time.weights:
         raise InvalidInput(f"time is the constant {mapping.time!r}; give a column, or `step` for the time of a row.")
-    units = _units(mapping, joints) if robot is None else units_for(robot)
+    sliding = _sliding(mapping, joints) if robot is None else sliding_joints(robot)
     if robot is None:
-        log = {name: dict(zip(joints, unit_of_each(name, units[name], len(joints)), strict=True)) for name in SIGNALS}
+        log = {
+            name: {joint: (TRANSLATION if joint in sliding else ROTATION)[name] for joint in joints} for name in SIGNALS
+        }
     turned = {f"{x.name}.{part}" for x in (bases(robot) if robot and mapping.ned else ()) for part in TURNED}
     signals = tuple(
         item
@@ -163,7 +164,7 @@ def signal_plan(
     [time_unit, *_] = mapping.unit.get("time", ("ns" if stamps else "s",))
     return SignalPlan(
         joints=tuple(order["v"]),
-        units=units,
+        sliding=sliding,
         signals=signals,
         layout=layout_of(mapping, model, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
@@ -207,14 +208,16 @@ def _expressions(
     ]
 
 
-def _units(mapping: ColumnMapping, joints: tuple[str, ...]) -> FrozenDict:
-    """Those of joints without a robot: units that are stated decide which of them slide."""
-    given = {name: [log_unit(name, unit) for unit in units] for name, units in mapping.unit.items() if name != "time"}
-    kinds = []
-    for index in range(len(joints)):  # the Dataset checks that all units agree
-        stated = [(name, _at(f"unit of {name}", units, index, joints)) for name, units in given.items()]
-        kinds.append(TRANSLATION if any(unit.si == TRANSLATION[name] for name, unit in stated) else ROTATION)
-    return validated_units({name: tuple(kind[name] for kind in kinds) for name in SIGNALS} | {"time": "s"}, joints)
+def _sliding(mapping: ColumnMapping, joints: tuple[str, ...]) -> tuple[str, ...]:
+    """Without a robot, units that are stated decide which joints slide."""
+
+    def slides(index: int) -> bool:
+        own = {
+            name: _at(f"unit of {name}", units, index, joints) for name, units in mapping.unit.items() if name != "time"
+        }
+        return any(log_unit(name, unit).si == TRANSLATION[name] for name, unit in own.items())
+
+    return tuple(joint for index, joint in enumerate(joints) if slides(index))
 
 
 def _signals(
@@ -226,31 +229,22 @@ def _signals(
     joints: Sequence[str],
     turned: Collection[str],
 ) -> Iterator[JointSignal]:
-    """One signal in the order of the Dataset. `columns`: name and SI unit, in the order of the log.
-
-    `turned` are entries of bases that change sign.
-    """
+    """One signal in the order of the Dataset; `columns` (name, SI unit) in that of the log; `turned` change sign."""
     names = list(columns)
     plain = set(names) <= set(joints)
     if len(expressions) == 1 and len(names) > 1 and not expressions[0].weights:
         expressions = expressions * len(names)
     if len(expressions) != len(names):
         what = "joints" if plain and names else {"q": "positions", "u": "inputs"}.get(signal, "velocities")
-        remedy = f"name one column per {'joint' if what == 'joints' else 'entry'}."
-        if signal == "q" and not plain:
-            remedy = f"{remedy[:-1]}; `orientation` angles has roll, pitch and yaw instead of a quaternion."
-            if len(expressions) == len(set(names) & set(joints)):
-                remedy = (
-                    "the base was not measured: record its pose by motion capture or a state estimator (position and "
-                    "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
-                )
-        elif signal == "u" and names:
-            remedy = f"{remedy[:-1]}, and 0 for a joint that nothing drives."
-        elif not names:
+        remedy = "name one column for each"
+        if signal == "q" and not plain and len(expressions) == len(set(names) & set(joints)):
             remedy = (
-                "leave u out, or give actuators: motors of an MJCF file, or a file that Model.to_json wrote "
-                "(`identified`)."
+                "the base was not measured: record its pose by motion capture or a state estimator (position and "
+                "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
             )
+        elif signal in "qu":
+            more = {"q": "angles of a base have `orientation` angles", "u": "0 for a joint that nothing drives"}
+            remedy = f"{remedy}; {more[signal]}." if names else "leave u out, or give actuators (`identified`)."
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )

@@ -16,14 +16,10 @@ from forcegp.errors import MissingExtra, SimulationError
 class BulletArm:
     """A serial arm of revolute joints whose only forces are gravity, its own inertia and the torques given to `step`.
 
-    `tool_point` [m] is fixed in the frame of the last link; `gravity` [m/s^2] acts along -z. `bullet`, `client`, `body`
-    and `joints` (link numbers) are PyBullet's module and its names for this simulation.
-
-    Everything else that PyBullet would add is off: joint motors, joint limits and joint damping of the URDF, damping of
-    links; collisions need shapes in the URDF and a second body (`BulletContact`). Without them one step is
-    `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`. Use it as a context manager; leaving it
-    disconnects. Raises MissingExtra without PyBullet, and SimulationError for a link whose inertia is not along its
-    axes.
+    One step is `v' = v + time_step * M(q)^-1 (tau - h(q, v))`, `q' = q + time_step * v'`: joint motors, limits, damping
+    and collisions are off. `tool_point` [m] is fixed in the frame of the last link; `gravity` [m/s^2] acts along -z;
+    `bullet`, `client`, `body` and `joints` are PyBullet's. A context manager. Raises MissingExtra without PyBullet, and
+    SimulationError for a link whose inertia is not along its axes.
     """
 
     def __init__(self, urdf: str, *, gravity: float, time_step: float, tool_point: Sequence[float]):

@@ -2,8 +2,10 @@
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,18 +20,8 @@ from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.urdf import numbers
 from forcegp.simulation.bullet import ArmState, BulletArm
-from forcegp.simulation.contact_forces import (
-    BulletContact,
-    DryFriction,
-    IdealContact,
-    NoContact,
-    PointFriction,
-    RoughPatch,
-    ViscousFriction,
-    with_tool_sphere,
-)
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import PathOverTable, Table, TaskSpaceController, recorded, table_of
+from forcegp.simulation.trajectory import Table, joint_acceleration, over_table, random_path, recorded, table_of
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
@@ -90,6 +82,135 @@ def _write_inertial(
     )
 
 
+@dataclass(frozen=True)
+class ViscousFriction:
+    """`F = -coefficient p'` (Stokes; coefficient in N/(m/s)), whatever the normal force is.
+
+    As in Rath, Geist, Trimpe 2021 it acts on the whole velocity, of which almost nothing is normal to the surface.
+    """
+
+    load_dependent: ClassVar[bool] = False  # whether `force` is per newton of normal force
+    coefficient: float
+
+    def force(self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Force on the sliding point [N] at its velocity [m/s]; never does positive work."""
+        return -self.coefficient * velocity
+
+
+@dataclass(frozen=True)
+class DryFriction:
+    """Dry friction that depends on the velocity, per newton of normal force, smooth at rest.
+
+    With the tangential velocity `p't` and its length s, `F = -mu(s) |N| p't / sqrt(s^2 + smoothing^2)` and
+    `mu(s) = coulomb + (static - coulomb) exp(-(s / breakaway_velocity)^2)` (Bo and Pavelescu; Olsson et al. 1998,
+    section 2.1); velocities in m/s. Below `smoothing` the point creeps.
+    """
+
+    load_dependent: ClassVar[bool] = True
+    coulomb: float
+    static: float
+    breakaway_velocity: float
+    smoothing: float
+
+    def level(self, speed: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """mu at tangential speeds [m/s]."""
+        return self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.breakaway_velocity) ** 2))
+
+    def coefficient(self, speed: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """`|F| / |N|` at tangential speeds [m/s]."""
+        return np.asarray(self.level(speed) * speed / np.sqrt(speed**2 + self.smoothing**2))
+
+    def force(self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """As of `ViscousFriction`, per newton of normal force; `normal` is a unit vector."""
+        tangential = velocity - (normal @ velocity) * normal
+        speed = np.sqrt(tangential @ tangential)
+        return -self.level(speed) / np.sqrt(speed**2 + self.smoothing**2) * tangential
+
+
+PointFriction = ViscousFriction | DryFriction
+
+
+class ContactForces(NamedTuple):
+    """What acted at the tool during a step: normal force [N], friction (3,) [N, world axes] and its joint torques."""
+
+    multiplier: float
+    tool_force: Float[np.ndarray, "3"]
+    tool_torques: Float[np.ndarray, " nv"]
+    in_contact: bool
+
+
+@dataclass
+class IdealContact:
+    """The tool point stays on the table from its first touch on: `A a = b` with Baumgarte's b, and friction there.
+
+    Without `friction` it touches nothing.
+
+    `omega` [rad/s] and `zeta` stabilise the constraint.
+    """
+
+    table: Table
+    friction: PointFriction | None
+    omega: float
+    zeta: float
+    touched: bool = False
+
+    def step(self, arm: BulletArm, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
+        """Advance the arm by one step under the torques of actuators and joint friction [Nm] and those of the table.
+
+        Raises SimulationError where friction is so strong that the normal force is not determined.
+        """
+        distance = self.table.distance(state.position)
+        self.touched = self.touched or distance <= 0.0
+        if not self.touched or self.friction is None:
+            arm.step(applied)
+            return ContactForces(0.0, np.zeros(3), np.zeros_like(applied), False)
+        normal = self.table.normal(state.position)
+        jacobian = state.jacobian[:3]
+        velocity = jacobian @ state.v
+        # A column of a matrix on purpose: BLAS adds in another order along it than along a contiguous vector, and seeds
+        # shall give the motion that they gave when this was a row of the Jacobian.
+        row = np.stack([normal @ jacobian] * 2, axis=1)[:, 0]
+        # A a = b, the second derivative of distance(p(q)) = 0 with Baumgarte's terms (Rath et al. 2021, eqs. 3 and 4)
+        bias = normal @ state.bias_acceleration[:3] + self.table.curvature(state.position, velocity)
+        b = -bias - 2.0 * self.zeta * self.omega * (row @ state.v) - self.omega**2 * distance
+
+        friction = self.friction.force(velocity, normal)
+        torques = jacobian.T @ friction
+        if self.friction.load_dependent:
+            multiplier = multiplier_with_friction(state.mass, applied - state.bias, row, torques, float(b))
+            friction, torques = abs(multiplier) * friction, abs(multiplier) * torques
+        else:
+            free, per_newton = np.linalg.solve(state.mass, np.stack([applied - state.bias + torques, row], axis=1)).T
+            multiplier = float((b - row @ free) / (row @ per_newton))
+        arm.step(applied + torques + multiplier * row)
+        return ContactForces(multiplier, friction, torques, True)
+
+
+def multiplier_with_friction(
+    mass: Float[np.ndarray, "nv nv"],
+    force: Float[np.ndarray, " nv"],
+    row: Float[np.ndarray, " nv"],
+    per_load: Float[np.ndarray, " nv"],
+    b: float,
+) -> float:
+    """The multiplier [N] of `row . a = b` where friction gives the joint torques `per_load |lambda|`.
+
+    `M a = force + per_load |lambda| + row^T lambda` makes `alpha lambda + gamma |lambda| = b - row M^-1 force` with
+    `alpha = row M^-1 row^T` and `gamma = row M^-1 per_load`: two straight lines that meet at 0. For `|gamma| < alpha`
+    both rise and there is exactly one solution; otherwise there are two or none, Painleve's paradox (Brogliato,
+    Nonsmooth Mechanics, section 5.5), and SimulationError is raised.
+    """
+    free, per_newton, per_friction = np.linalg.solve(mass, np.stack([force, row, per_load], axis=1)).T
+    alpha, gamma, needed = float(row @ per_newton), float(row @ per_friction), b - float(row @ free)
+    if not abs(gamma) < alpha:
+        raise SimulationError(
+            f"friction changes the normal acceleration by {abs(gamma):.3g} 1/kg per newton of normal force, the normal "
+            f"force itself by {alpha:.3g} 1/kg: the normal force is not determined (Painleve's paradox). Use smaller "
+            "friction coefficients or another posture (start_degrees)."
+        )
+    return needed / (alpha + gamma) if needed > 0 else needed / (alpha - gamma)
+
+
 STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
@@ -100,7 +221,7 @@ multiplier), and in_contact, gap [m] and saturated."""
 
 
 def random_stream(config: KukaSurfaceConfig, episode: int, stream: int) -> np.random.Generator:
-    """Stream 0 draws way-points, 1 noise, 2 lifts: independent of each other and of other episodes and seeds."""
+    """Stream 0 draws way-points, 1 noise: independent of each other and of other episodes and seeds."""
     return np.random.default_rng([config.seed, episode, stream])
 
 
@@ -112,26 +233,24 @@ def simulate_episode(
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
-    limits, table, controller = np.array(config.torque_limits), table_of(config), TaskSpaceController(config)
+    limits, table = np.array(config.torque_limits), table_of(config)
     joint_law = config.joint_law(robot)
     columns: dict[str, np.ndarray] = {}
-    if config.contact == "bullet":
-        urdf = with_tool_sphere(urdf, TOOL_LINK, config.tool_point)
-
     with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
         arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))
-        contact = _contact(config, table, arm)
-        streams = (random_stream(config, episode, stream) for stream in (0, 2))
-        tool = arm.tool(np.zeros(7))[0]
-        path = PathOverTable.random(config, table, tool, steps * config.time_step, *streams)
-        reference = path.sample(config.time_step * np.arange(steps))
+        law = None if config.surface == "none" else tool_friction_of(config)
+        contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
+        tool, duration = arm.tool(np.zeros(7))[0], steps * config.time_step
+        flat = tool - [0.0, 0.0, table.height(tool[None, :2])[0][0]]
+        path = random_path(config, flat, duration, random_stream(config, episode, 0))
+        reference = over_table(table, path.sample(config.time_step * np.arange(steps)))
         for step in range(steps):
             aim = reference[0][step], reference[1][step], reference[2][step]
             _require_bounded(config, arm.state()[1], episode, step)
             state = ArmState.of(arm)
             v = state.v
             try:
-                wanted = controller.joint_acceleration(state, aim)
+                wanted = joint_acceleration(config, state, aim)
             except np.linalg.LinAlgError as error:
                 raise SimulationError(
                     f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
@@ -166,15 +285,6 @@ def simulate_episode(
     return {name: values[settle:] for name, values in columns.items()}
 
 
-def _contact(config: KukaSurfaceConfig, table: Table, arm: BulletArm) -> NoContact | IdealContact | BulletContact:
-    if config.surface == "none":
-        return NoContact()
-    if config.contact == "bullet":
-        return BulletContact(arm, table, config.coulomb_coefficient)
-    patch = None if config.patch_factor == 1.0 else RoughPatch(*config.patch_x, factor=config.patch_factor)
-    return IdealContact(table, tool_friction_of(config), config.baumgarte_omega, config.baumgarte_zeta, patch)
-
-
 def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
     """The law of the ideal contact."""
     if config.friction == "viscous":
@@ -203,15 +313,11 @@ LARGEST_SATURATED_SHARE = 0.01
 def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None = None) -> Dataset:
     """Simulate the scenario and return what was measured, with the ground truth.
 
-    Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded torque minus joint damping), and
-    the acceleration `(v[k+1] - v[k]) / time_step`, which PyBullet's integrator takes as constant over the step. So in
-    every row, with the true "a", "lambda" and "Q_U", `M(q) a + bias(q, v) = u + Q_U + A^T lambda` and `A a = b`.
-    All rows are in contact: the approach (`settle_seconds`) is left out. Nothing is cut at the end (the paper drops the
-    edge of its last segment; here the recording ends in mid-motion). Every episode is one continuous motion with its
-    own way-points; equal `seed` and episode number give equal motion, whatever `noise`, `seconds` and `episodes` are.
-
-    Raises MissingExtra without PyBullet, and SimulationError if the motion diverges, loses the surface, leaves the
-    joint limits or saturates the torques, which the published constants do not do.
+    Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded minus joint damping), and the
+    acceleration of the step. So with the true "a", "lambda" and "Q_U", `M(q) a + bias(q, v) = u + Q_U + A^T lambda` and
+    `A a = b` in every row. The approach (`settle_seconds`) is left out. Equal `seed` and episode number give equal
+    motion, whatever `noise`, `seconds` and `episodes` are. Raises MissingExtra without PyBullet, and SimulationError if
+    the motion diverges, loses the surface, leaves the joint limits or saturates the torques.
     """
     urdf = kuka_urdf(config)
     robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
@@ -232,7 +338,7 @@ def _require_useful(config: KukaSurfaceConfig, robot: Robot, motion: Motion, epi
     """Refuse rows that an ideal robot on an ideal plane would not give."""
     remedy = "Use the published constants, or slower segments (segment_seconds) and way-points within reach."
     gap = float(np.abs(motion["gap"]).max())
-    if config.surface != "none" and config.contact == "ideal" and not gap < LARGEST_GAP:
+    if config.surface != "none" and not gap < LARGEST_GAP:
         raise SimulationError(f"episode {episode}: the tool leaves the surface by {gap:.3g} m. {remedy}")
     lower, upper = np.array([(joint.lower, joint.upper) for joint in robot.joints]).T
     excess = np.maximum(lower - motion["q"], motion["q"] - upper).max(axis=0)
@@ -250,9 +356,7 @@ def _model(config: KukaSurfaceConfig, robot: Robot) -> Model:
     contacts = ()
     if config.surface != "none":
         contacts = (Contact(TOOL_LINK, config.tool_point, table_of(config).surface()),)
-    # PyBullet's contact does not follow Baumgarte's law.
-    stabilised = contacts and config.contact == "ideal"
-    baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if stabilised else None
+    baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if contacts else None
     return Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
 
 
@@ -263,8 +367,6 @@ def _truth(config: KukaSurfaceConfig, column: Callable[[str], np.ndarray]) -> di
         truth["lambda"] = column("multiplier")[:, None]
         parts["Q_U.tool-friction"] = column("tool_torques")
         truth["force.tool-friction"] = column("tool_force")
-    if config.contact == "bullet":
-        truth["in_contact"] = column("in_contact")[:, None].astype(np.float64)
     if config.joint_friction != "none":
         parts["Q_U.joint-friction"] = column("joint_torques")
     return {**truth, **parts, "Q_U": sum(parts.values(), np.zeros_like(truth["a"]))}

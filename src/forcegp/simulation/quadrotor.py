@@ -1,9 +1,6 @@
-"""`quadrotor`: a drone that follows paths in wind, with air forces that no robot file mentions.
+"""`quadrotor`: a drone that follows paths in wind; rotors lag, and air acts on it as no robot file mentions.
 
-Its rotors follow their commands with a lag. Air acts on the body with the velocity against the wind: drag of the rotors
-(linear) and of the body (quadratic, in its own axes), thrust that changes with the flow through and across the rotors,
-and near the ground. Forms and sizes after Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012; Faessler,
-Franchi & Scaramuzza, IEEE RA-L 2018 (rotor drag); Cheeseman & Bennett, ARC R&M 3021, 1955 (ground).
+After Mahony, Kumar & Corke, IEEE RAM 2012; Faessler et al., RA-L 2018 (drag); Cheeseman & Bennett 1955 (ground).
 """
 
 import math

@@ -1,8 +1,6 @@
-"""`quadruped`: a robot that stands, shifts its weight and lifts its feet, with friction in every joint and a load.
+"""`quadruped`: stands, shifts its weight and lifts its feet, with friction in every joint and a load.
 
-The motion is prescribed: the base follows sines in six directions, feet that stand do not move, feet that are lifted
-follow an arc. Joint angles, velocities and accelerations follow from it exactly, and so do the torques and foot forces
-under which the robot moves so (inverse dynamics, foot forces closest to an even share of the weight).
+The motion is prescribed; joints, torques and foot forces (closest to an even share of the weight) follow exactly.
 """
 
 import math

@@ -39,20 +39,9 @@ def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
         raise InvalidInput(f"{allowed}.")
 
 
-def usual_dry_friction(config: Any) -> None:
-    """Put the law that most joints need in the place of None, and check others."""
-    if config.joint_friction is None:
-        from forcegp.forces.registry import USUAL_DRY
-
-        object.__setattr__(config, "joint_friction", USUAL_DRY)
-    require_joint_friction(config.joint_friction)
-
-
 Surface = Literal["plane", "tilted", "sphere", "none"]
-ContactKind = Literal["ideal", "bullet"]
 
 PRESS_FOR_DRY_FRICTION = 15.0  # N
-LIFT_SHARE_OF_BULLET = 0.08
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,46 +77,27 @@ class KukaSurfaceConfig(CommonConfig):
     """
 
     seconds: float = 200.0
-    time_step: float = 1.0 / 240.0
-    """Step of simulation, control and recording [s]."""
-    settle_seconds: float = 1000.0 / 240.0
-    """Approach and first contact [s], left out of the data as in the paper (its first 1000 rows)."""
-
-    tool_mass: float = 2.0
-    """Mass of link 7 with its tool [kg]."""
-
+    time_step: float = 1.0 / 240.0  # s, of simulation, control and recording
+    settle_seconds: float = 1000.0 / 240.0  # approach and first contact, left out as in the paper (its first 1000 rows)
+    tool_mass: float = 2.0  # kg, of link 7 with its tool
+    # the plane z = surface_height; it tilted about the middle of the way-points' region; the top of a big sphere that
+    # touches it there; or none: free motion above. The contact is a bilateral constraint from the first touch on
     surface: Surface = "plane"
-    """The plane z = surface_height; that plane tilted about the middle of the way-points' region; the top of a big
-    sphere that touches it there; or none: free motion above."""
-    contact: ContactKind = "ideal"
-    """ideal: a bilateral constraint from the first touch on. bullet: PyBullet's unilateral contact with Coulomb
-    friction, without restitution, which the tool leaves now and then."""
-
-    friction: str | None = None
-    """Friction of the tool on the surface, the force that no model contains: viscous; or a law of dry friction of
-    `forcegp.forces` by name, which grows with the normal force, and near rest where it has a breakaway. None is viscous
-    for an ideal contact and coulomb, its only law, for PyBullet's."""
-    viscous_coefficient: float = 1.0
-    """Viscous friction of the tool point on the surface [N/(m/s)]."""
-    coulomb_coefficient: float = 0.3
-    """Dry friction of the sliding tool per normal force."""
-    static_coefficient: float = 0.5
-    """Dry friction near rest per normal force, of laws with a breakaway."""
-    breakaway_velocity: float = 0.15
-    """Speed over which the static coefficient falls to the sliding one [m/s]."""
+    # of the tool on the surface, the force that no model contains: viscous; or a law of dry friction of
+    # `forcegp.forces` by name, which grows with the normal force, and near rest where it has a breakaway
+    friction: str = "viscous"
+    viscous_coefficient: float = 1.0  # of the tool point on the surface [N/(m/s)]
+    coulomb_coefficient: float = 0.3  # dry friction of the sliding tool per normal force
+    static_coefficient: float = 0.5  # near rest, of laws with a breakaway
+    breakaway_velocity: float = 0.15  # m/s, over which the static coefficient falls to the sliding one
+    # m/s, below which dry friction of the tool falls to zero: a smooth sign. The explicit steps oscillate where
+    # `static_coefficient * normal force / friction_smoothing` exceeds some 450 N/(m/s)
     friction_smoothing: float = 0.05
-    """Speed below which dry friction of the tool falls to zero [m/s]: a smooth sign, see `DryFriction`. The explicit
-    steps oscillate where `static_coefficient * normal force * patch_factor / friction_smoothing` exceeds some
-    450 N/(m/s), as on a patch of factor 4."""
-    patch_factor: float = 1.0
-    """How many times as large friction is on the patch; 1 for no patch."""
+    # of the joints, besides the force at the tool and not part of `u`: viscous friction and laws of `forcegp.forces`,
+    # such as "coulomb", with their own numbers (`parse_forces`) or those below
     joint_friction: str = "none"
-    """Friction of the joints that is not part of `u`, besides the force at the tool: viscous friction and laws of
-    `forcegp.forces`, such as "coulomb", with their own numbers (`forcegp.forces.parse_forces`) or those below."""
-    joint_breakaway_velocity: float = 0.2
-    """Joint velocity over which the friction near rest falls to Coulomb's [rad/s]."""
-    joint_smoothing: float = 0.1
-    """Joint velocity below which joint friction falls to zero [rad/s]: a smooth sign."""
+    joint_breakaway_velocity: float = 0.2  # rad/s, over which the friction near rest falls to Coulomb's
+    joint_smoothing: float = 0.1  # rad/s, below which it falls to zero: a smooth sign
 
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
@@ -140,7 +110,6 @@ class KukaSurfaceConfig(CommonConfig):
     tilt_degrees: ClassVar[float] = 10.0  # of the tilted plane, about a horizontal axis (x, y)
     tilt_axis: ClassVar[tuple[float, float]] = (0.0, 1.0)
     sphere_radius: ClassVar[float] = 1.2
-    patch_x: ClassVar[tuple[float, float]] = (0.0, 0.25)  # the strip of the surface where the patch is
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
@@ -158,32 +127,18 @@ class KukaSurfaceConfig(CommonConfig):
     waypoint_y: ClassVar[tuple[float, float]] = (0.4, 0.6)
     waypoint_depth: ClassVar[float] = 1e-4  # below the surface, so that the tool presses on it
     clearance: ClassVar[float] = 0.05  # above the plane where there is no surface
-    lift_height: ClassVar[float] = 0.03  # of way-points off the surface
     segment_seconds: ClassVar[tuple[float, float]] = (0.5, 1.0)  # from one way-point to the next
     least_acceleration: ClassVar[float] = 0.5  # in the parabolic blends, unless a segment needs more
 
     @usable_arguments("KukaSurfaceConfig")
     def __post_init__(self) -> None:
         self._check(**_RANGES)
-        if self.friction is None:
-            object.__setattr__(self, "friction", "coulomb" if self.contact == "bullet" else "viscous")
         require_known("surface", self.surface, "kuka-surface", get_args(Surface))
-        require_known("contact", self.contact, "kuka-surface", get_args(ContactKind))
         if self.friction != "viscous":
             from forcegp.forces.registry import dry_laws
 
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
         require_joint_friction(self.joint_friction, self.own_laws)
-        if self.contact == "bullet":
-            if self.surface == "none":
-                raise InvalidInput("surface is 'none'; contact 'bullet' needs a surface: plane, tilted or sphere.")
-            if self.friction != "coulomb":
-                raise InvalidInput(f"friction is {self.friction!r}; contact 'bullet' has Coulomb friction: 'coulomb'.")
-        if self.patch_factor != 1.0 and (self.contact == "bullet" or self.surface == "none"):
-            raise InvalidInput(
-                f"patch_factor is {self.patch_factor}; a patch needs a surface and an ideal contact (PyBullet has one "
-                "coefficient for a whole body). Use 1, or surface plane, tilted or sphere and contact ideal."
-            )
 
     def joint_laws(self, robot: Any) -> Any:
         """The laws that `joint_friction` names (`LawsOfJoints`), with the numbers above where it gives none."""
@@ -210,11 +165,6 @@ class KukaSurfaceConfig(CommonConfig):
         return self.surface_height + (self.clearance if self.surface == "none" else -self.waypoint_depth)
 
     @property
-    def share_of_lifts(self) -> float:
-        """Share of way-points above the surface, which an ideal contact cannot leave."""
-        return LIFT_SHARE_OF_BULLET if self.contact == "bullet" else 0.0
-
-    @property
     def rows_per_episode(self) -> int:
         """Recorded rows of one episode."""
         return round(self.seconds / self.time_step)
@@ -231,7 +181,7 @@ class KukaSurfaceConfig(CommonConfig):
 
 
 _POSITIVE = ("tool_mass", "breakaway_velocity", "friction_smoothing", "joint_breakaway_velocity", "joint_smoothing")
-_NOT_NEGATIVE = ("viscous_coefficient", "coulomb_coefficient", "static_coefficient", "patch_factor")
+_NOT_NEGATIVE = ("viscous_coefficient", "coulomb_coefficient", "static_coefficient")
 _RANGES: dict[str, Range] = {
     "time_step": ("from 1e-5 to 0.01 s", 1e-5, 0.01),
     "settle_seconds": ("from 0.5 to 1000 s", 0.5, 1e3),
@@ -244,18 +194,18 @@ _RANGES: dict[str, Range] = {
 class FreeArmConfig(CommonConfig):
     """PD control with gravity compensation along sines of random size and rate, two per joint, about a posture.
 
-    `joint_friction` names laws of `forcegp.forces`, or "none"; None is dry friction with more near rest. With viscous
-    friction as well. Numbers that the name does not give are in proportion to the largest torque of a joint. `noise`
-    in rad/s^2. Raises InvalidInput naming the field and its range.
+    `joint_friction` names laws of `forcegp.forces`, or "none"; viscous friction comes with them. Numbers that the name
+    does not give are in proportion to the largest torque of a joint. `noise` in rad/s^2. Raises InvalidInput naming the
+    field and its range.
     """
 
     arm: Literal["ur5-free", "double-pendulum"]
-    joint_friction: str | None = None
+    joint_friction: str = "stribeck"
 
     @usable_arguments("FreeArmConfig")
     def __post_init__(self) -> None:
         self._check()
-        usual_dry_friction(self)
+        require_joint_friction(self.joint_friction)
         require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
 
 
@@ -270,12 +220,12 @@ class QuadrupedConfig(CommonConfig):
     seconds: float = 30.0
     payload: float = 2.0
     lift: bool = True
-    joint_friction: str | None = None
+    joint_friction: str = "stribeck"
 
     @usable_arguments("QuadrupedConfig")
     def __post_init__(self) -> None:
         self._check(payload=NOT_NEGATIVE)
-        usual_dry_friction(self)
+        require_joint_friction(self.joint_friction)
 
 
 @dataclass(frozen=True, kw_only=True)

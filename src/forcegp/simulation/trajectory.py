@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.mechanics
 from forcegp import __version__
-from forcegp.data import Dataset, units_for
+from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.simulation.bullet import ArmState
 from forcegp.simulation.scenarios import KukaSurfaceConfig
@@ -153,58 +153,27 @@ class SegmentPath:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class PathOverTable:
-    """A path over a horizontal table, bent to follow the table's true height `h(x, y)`."""
-
-    path: SegmentPath
-    table: Table
-
-    @classmethod
-    def random(
-        cls,
-        config: KukaSurfaceConfig,
-        table: Table,
-        start: Float[np.ndarray, "3"],
-        seconds: float,
-        rng: np.random.Generator,
-        lifts: np.random.Generator,
-    ) -> PathOverTable:
-        """`random_path` over the table, from the true place `start` [m]."""
-        origin = np.array(start, dtype=np.float64)
-        origin[2] -= table.height(origin[None, :2])[0][0]
-        return cls(random_path(config, origin, seconds, rng, lifts), table)
-
-    def sample(self, time: Float[np.ndarray, " times"]) -> Motions:
-        """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; z and h by the chain rule."""
-        position, velocity, acceleration = self.path.sample(time)
-        height, gradient, hessian = self.table.height(position[:, :2])
-        rate = np.einsum("ti,ti->t", gradient, velocity[:, :2])
-        bend = np.einsum("ti,tij,tj->t", velocity[:, :2], hessian, velocity[:, :2])
-        position[:, 2] += height
-        velocity[:, 2] += rate
-        acceleration[:, 2] += np.einsum("ti,ti->t", gradient, acceleration[:, :2]) + bend
-        return position, velocity, acceleration
+def over_table(table: Table, motions: Motions) -> Motions:
+    """Motions over a horizontal table, bent to follow its true height `h(x, y)`: z and h by the chain rule."""
+    position, velocity, acceleration = motions
+    height, gradient, hessian = table.height(position[:, :2])
+    rate = np.einsum("ti,ti->t", gradient, velocity[:, :2])
+    bend = np.einsum("ti,tij,tj->t", velocity[:, :2], hessian, velocity[:, :2])
+    position[:, 2] += height
+    velocity[:, 2] += rate
+    acceleration[:, 2] += np.einsum("ti,ti->t", gradient, acceleration[:, :2]) + bend
+    return position, velocity, acceleration
 
 
 def random_path(
-    config: KukaSurfaceConfig,
-    start: Float[np.ndarray, "3"],
-    seconds: float,
-    rng: np.random.Generator,
-    lifts: np.random.Generator | None = None,
+    config: KukaSurfaceConfig, start: Float[np.ndarray, "3"], seconds: float, rng: np.random.Generator
 ) -> SegmentPath:
-    """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s].
-
-    `lifts` draws which of them lie `config.lift_height` higher (none without it); it is a generator of its own so that
-    equal seeds visit equal places with and without lifts.
-    """
+    """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s]."""
     points, durations = [np.asarray(start, dtype=np.float64)], []
     while sum(durations) < seconds:
         durations.append(rng.uniform(*config.segment_seconds))
-        lifted = lifts is not None and lifts.random() < config.share_of_lifts
-        height = config.waypoint_height + (config.lift_height if lifted else 0.0)
-        points.append(np.array([rng.uniform(*config.waypoint_x), rng.uniform(*config.waypoint_y), height]))
+        x, y = rng.uniform(*config.waypoint_x), rng.uniform(*config.waypoint_y)
+        points.append(np.array([x, y, config.waypoint_height]))
     corners, times = np.array(points), np.array(durations)
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     accelerations = np.maximum(config.least_acceleration, 4.0 * lengths / times**2)
@@ -214,41 +183,26 @@ def random_path(
 TOOL_ORIENTATION = np.array([0.0, -1.0, 0.0, 0.0])  # quaternion (x, y, z, w): the tool points straight down
 
 
-class TaskSpaceController:
-    """Resolved-acceleration control (Siciliano et al., Robotics, section 8.6.2) with a null-space posture.
+def joint_acceleration(config: KukaSurfaceConfig, state: ArmState, reference: Aim) -> Float[np.ndarray, " nv"]:
+    """Commanded joint acceleration [rad/s^2] under which the tool follows an aimed position, velocity and acceleration.
 
-    With `e` the error of the tool (translation; rotation vector), the commanded joint acceleration is
+    Resolved-acceleration control (Siciliano et al., Robotics, section 8.6.2) with a null-space posture: with `e` the
+    error of the tool (translation; rotation vector),
     `J^+ (x_ref'' + 2 zeta omega e' + omega^2 e - Jdot v) + (I - J^+ J) S (K (q_0 - q) - D v)`; `S` selects joints.
-    It compensates inertia, gravity and joint damping, but neither the surface nor its friction.
     """
-
-    def __init__(self, config: KukaSurfaceConfig) -> None:
-        self.omega, self.zeta = config.controller_omega, config.controller_zeta
-        self.stiffness, self.damping = config.null_space_stiffness, config.null_space_damping
-        self.posture = np.deg2rad(config.start_degrees)
-        self.selected = np.isin(np.arange(1, 8), config.null_space_joints).astype(np.float64)
-
-    def joint_acceleration(self, state: ArmState, reference: Aim) -> Float[np.ndarray, " nv"]:
-        """Commanded joint acceleration [rad/s^2]; `reference` is the aimed position, velocity and acceleration."""
-        aim, aim_velocity, aim_acceleration = reference
-        jacobian = state.jacobian
-        velocity = jacobian @ state.v
-        task = np.empty(6)
-        gain = 2.0 * self.zeta * self.omega
-        task[:3] = aim_acceleration + gain * (aim_velocity - velocity[:3]) + self.omega**2 * (aim - state.position)
-        task[3:] = -gain * velocity[3:] + self.omega**2 * rotation_vector(TOOL_ORIENTATION, state.quaternion)
-        posture = self.selected * (self.stiffness * (self.posture - state.q) - self.damping * state.v)
-        # J^+ (task - Jdot v) + (I - J^+ J) posture, with J^+ = J^T (J J^T)^-1
-        residual = task - state.bias_acceleration - jacobian @ posture
-        return posture + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, residual)
-
-
-def rotation_vector(aim: Float[np.ndarray, "4"], present: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3"]:
-    """World-frame rotation vector [rad] that turns `present` into `aim` (quaternions x, y, z, w) by the shorter way.
-
-    `q` and `-q` are the same orientation; without choosing the sign the tool would turn the long way round.
-    """
-    return (Rotation.from_quat(aim) * Rotation.from_quat(present).inv()).as_rotvec()
+    aim, aim_velocity, aim_acceleration = reference
+    omega, gain = config.controller_omega, 2.0 * config.controller_zeta * config.controller_omega
+    jacobian, task = state.jacobian, np.empty(6)
+    velocity = jacobian @ state.v
+    turn = (Rotation.from_quat(TOOL_ORIENTATION) * Rotation.from_quat(state.quaternion).inv()).as_rotvec()
+    task[:3] = aim_acceleration + gain * (aim_velocity - velocity[:3]) + omega**2 * (aim - state.position)
+    task[3:] = -gain * velocity[3:] + omega**2 * turn
+    pull = config.null_space_stiffness * (np.deg2rad(config.start_degrees) - state.q)
+    selected = np.isin(np.arange(1, 8), config.null_space_joints).astype(np.float64)
+    posture = selected * (pull - config.null_space_damping * state.v)
+    # J^+ (task - Jdot v) + (I - J^+ J) posture, with J^+ = J^T (J J^T)^-1
+    residual = task - state.bias_acceleration - jacobian @ posture
+    return posture + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, residual)
 
 
 RATE = 240
@@ -278,7 +232,6 @@ def recorded(
             "a": motion["a"] + config.noise * noise,
         },
         episode=np.repeat(np.arange(config.episodes), steps),
-        units=units_for(model.robot),
         model=model,
         noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
         truth={"a": motion["a"], **truth},

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forcegp.checks import CheckReport
-from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, motion_spectrum
 from forcegp.data.configurations import as_vectors, space_of
 from forcegp.scores.figures import style
@@ -67,9 +66,9 @@ def _draw_joint(axes: Axes, report: CheckReport, shown: Dataset, joint: int) -> 
         label = label if space.is_vector_space else "position; of a base its way from the first row"
         style.draw_line(axes, shown.time, values[:, joint], style.TRUTH, 1.0, label)
         return style.joint_units(shown, "q")[joint]
-    rows = log.applied(shown)
-    tau = needed_torques(log.robot, rows, log.laws)
-    measured, fitted = rows.u[:, joint], log.fit.at(log.robot, tau, rows)[:, joint]
+    there, every = log.at(shown)
+    rows, tau, fitted = there.rows, there.tau, every[:, joint]
+    measured = rows.u[:, joint]
     if not np.array_equal(measured, shown.u[:, joint]):
         style.draw_line(axes, rows.time, shown.u[:, joint], style.KNOWN_PHYSICS, 0.9, "before the correction")
     style.draw_line(axes, rows.time, measured, style.MEASUREMENT, 2.2, "measured, filtered")
