@@ -15,7 +15,6 @@ from typing import Any
 from benchmarks.plants import PlantConfig
 from forcegp import Dataset, KukaSurfaceConfig, fit, score
 from forcegp.atomic_files import write_text
-from forcegp.data import rows_in_contact
 from forcegp.forces import parse_forces
 from forcegp.jobs import machine
 from forcegp.scores import Scores
@@ -56,7 +55,6 @@ CASES = {
     "stribeck": Case("Stribeck friction at the tool", AT_TOOL, config={"friction": "stribeck"}),
     "joints": Case("Viscous at the tool, Stribeck in the joints", WITH_JOINTS, config=STRIBECK),
     "both": Case("Stribeck at the tool and in the joints", WITH_JOINTS, config=STRIBECK | {"friction": "stribeck"}),
-    "unilateral": Case("A contact that opens and closes (PyBullet's)", AT_TOOL, config={"contact": "bullet"}),
     **{
         law: Case(f"{words}, in free motion", IN_JOINTS, config={"joint_friction": law, "surface": "none"})
         for law, words in {
@@ -78,16 +76,13 @@ unmeasured friction, nothing can be identified, so it is missing there. The nois
 .1 rad/s², so a perfect model has an MAE of .0798. “Noise-free” is the error against the true acceleration, and errors
 of the normal force are relative to its root mean square. Medians over seeds come with the least and the largest value.
 A seed is a choice of training points; functions of one or two inputs learn from all rows.
-
-Of a contact that opens, only rows in contact count, as they are found in the log.
 """  # noqa: E501  # one line of the page each
 
 
 def recording(case: Case, seconds: float) -> Dataset:
     """The rows of a case: two episodes to learn from, and the test."""
     rows = simulate_kuka_surface(PlantConfig(seconds=seconds, seed=301, episodes=3, **case.config))
-    rows = rows.rows(slice(None, None, EVERY))
-    return rows_in_contact(rows) if "in_contact" in rows.truth else rows
+    return rows.rows(slice(None, None, EVERY))
 
 
 def measured(case: Case, points: int, folder: Path, *, seconds: float = 60.0, **how: Any) -> Scores:
