@@ -20,7 +20,7 @@ from forcegp.mechanics import Baumgarte
 from forcegp.scores.motions import apart_from, inside_interval
 
 HELD = Baumgarte(10.0, 1.0)
-RUNS = (("symplectic-euler", HELD, 0), ("symplectic-euler", None, 0), ("rk4", HELD, 0), ("projected", None, 0))
+RUNS = (("symplectic-euler", HELD, 0), ("symplectic-euler", None, 0), ("rk4", HELD, 0))
 RUNS_WITH_SAMPLES = (("symplectic-euler", HELD, 20),)
 
 

@@ -4,7 +4,7 @@ import torch
 from tests.posterior.arm import arm_model, unknown_force
 
 from forcegp.forces import Actuation, RigidBodies, Stribeck
-from forcegp.integration import ConstraintManifold
+from forcegp.integration import onto_contacts
 from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -28,7 +28,7 @@ def start(model: Model, speed: float = 0.6) -> tuple[torch.Tensor, torch.Tensor]
     """Two states that meet the constraint."""
     q = torch.tensor([[0.3, 0.7, 0.8], [-0.5, 0.9, 0.6]], dtype=torch.float64)
     v = speed * torch.tensor([[0.8, -0.5, 0.9], [0.7, 0.6, -0.4]], dtype=torch.float64)
-    return ConstraintManifold(model).project(q, v)
+    return onto_contacts(model, q, v)
 
 
 def physics(model: Model):

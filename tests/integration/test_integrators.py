@@ -164,4 +164,4 @@ def test_a_start_out_of_reach_is_refused_with_a_remedy():
     model = arm_model(baumgarte=None).with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 5.0))])
     q, v = start(free_system("plane"))
     with pytest.raises(NumericalError, match=r"state 0 .*nearer"):
-        ConstraintManifold(model).project(q, v)
+        onto_contacts(model, q, v)

@@ -41,7 +41,7 @@ def states(model, rows=3):
     """On the loop, with velocities that keep it closed, and inputs."""
     generator = torch.Generator().manual_seed(3)
     q, v, u = (torch.randn(rows, model.robot.nv, dtype=torch.float64, generator=generator) for _ in range(3))
-    q, v = ConstraintManifold(model).project(0.1 * q, v)
+    q, v = onto_contacts(model, 0.1 * q, v)
     return q, v, 5.0 * u
 
 

@@ -9,7 +9,7 @@ import torch
 
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.forces import ContactFriction
-from forcegp.integration import ConstraintManifold
+from forcegp.integration import onto_contacts
 from forcegp.mechanics import Contact, Held, Plane, RollingContact, Sphere, rolling
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -166,7 +166,7 @@ def test_a_rolling_disc_keeps_its_energy_and_does_not_slip():
     model = Model(robot, rolling("disc", 0.15, ground=ground))
     q, v = robot.neutral(), torch.zeros(6, dtype=torch.float64)
     q[2], v[3], v[4], v[5] = 0.15, 0.3, 8.0, 0.5
-    q, v = (x[0] for x in ConstraintManifold(model).project(q[None], v[None]))
+    q, v = (x[0] for x in onto_contacts(model, q[None], v[None]))
 
     def energy(q, v):
         return float(0.5 * v @ robot.mass_matrix(q) @ v + 2.0 * 9.81 * q[2])

@@ -17,7 +17,7 @@ from forcegp import (
     save_posterior,
 )
 from forcegp.data import contact_doubts, contact_rows
-from forcegp.integration import ConstraintManifold
+from forcegp.integration import onto_contacts
 from forcegp.mechanics import loop_frame
 from forcegp.scores import usual_forces
 
@@ -39,7 +39,7 @@ def model(tmp_path_factory):
 def dataset(model):
     generator = torch.Generator().manual_seed(0)
     q, v, u = (torch.randn(80, 3, dtype=torch.float64, generator=generator) for _ in range(3))
-    q, v = ConstraintManifold(model).project(0.3 * q, v)
+    q, v = onto_contacts(model, 0.3 * q, v)
     a = model.dynamics(q, v, u).acceleration(forces(v))
     noise = 0.01 * torch.randn(80, 3, dtype=torch.float64, generator=generator)
     columns = dict(zip("qvua", (x.numpy() for x in (q, v, u, a + noise)), strict=True))

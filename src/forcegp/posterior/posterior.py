@@ -15,8 +15,7 @@ from forcegp.evidence import Accelerations
 from forcegp.evidence.training_data import second_moments, shrunk
 from forcegp.forces import Force
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration import Feedback
-from forcegp.integration.integrators import check_time_step
+from forcegp.integration.integrators import Feedback, check_time_step
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import FORCE, Noise
@@ -209,10 +208,8 @@ class Posterior(Fitted):
         """
         return state_rows(self.model, q, v, u)
 
-    def programs(
-        self, model: Model | None = None, compressed: CompressedCovariance | None = None, key: str | None = None
-    ) -> Programs:
-        """What is compiled and exported, in another model if one is given; `key` is that of records on disk.
+    def programs(self, model: Model | None = None, compressed: CompressedCovariance | None = None) -> Programs:
+        """What is compiled and exported, in another model if one is given.
 
         Raises InvalidInput for models on another device and noisy torques, and when something is made of them for
         operations that no graph holds.
@@ -220,7 +217,7 @@ class Posterior(Fitted):
         model = self.model if model is None else model
         rows = rows_for(self.training, self.trained, model)
         example = [x[:1] for x in (rows.q, rows.v, rows.u)]
-        return Programs(Physics.of(self, model), example, self.latent, self.widening, compressed, key)
+        return Programs(Physics.of(self, model), example, self.latent, self.widening, compressed)
 
     def rollout(
         self,
@@ -245,9 +242,8 @@ class Posterior(Fitted):
         u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast. An `ObservedWrench`
             follows from the first row.
         dt: time step in s.
-        integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order),
-            "implicit-midpoint" (second order, for stiff friction) or "projected" (second order; contacts hold exactly
-            after every step, also in the first state, which is moved onto them).
+        integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order) or
+            "implicit-midpoint" (second order, for stiff friction).
         baumgarte: stabilisation in this rollout, instead of that of the model; None for none.
         feedback: a controller that adds to u: feedback(k, q, v) -> (..., nv) in Nm or N, asked once at the beginning of
             step k and constant until k + 1, with the batch dimensions of the motions (those of q0, for sampled motions
@@ -261,7 +257,7 @@ class Posterior(Fitted):
 
         A motion that diverges is NaN from then on, `Rollout.diverged_at` holds the row, and a NumericalWarning is
         given. Raises InvalidInput for arguments that do not fit, among them tensors that require a gradient without
-        `grad`, NumericalError where the initial state cannot be projected.
+        `grad`.
         """
         if baumgarte is not None and not self.model.contacts:
             raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")

@@ -20,7 +20,6 @@ from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
 from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
 from forcegp.posterior.programs import Programs, steps_of
@@ -29,9 +28,9 @@ from forcegp.posterior.rollout import (
     Motions,
     StepLinearization,
     checked_start,
-    fused,
     linearized_on_manifold,
     linearized_step,
+    moved,
     stepped,
 )
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
@@ -181,8 +180,8 @@ class Predictor(Summary):
         """The state (q, v) `dt` seconds later under constant u, (size,) or (n, size); differentiable as `mean`.
 
         `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/how-to/rollouts.md), which is
-        differentiable once. Raises InvalidInput for "projected", other names and a dt that is no positive number,
-        NumericalError where an implicit step is not found.
+        differentiable once. Raises InvalidInput for other names and a dt that is no positive number, NumericalError
+        where an implicit step is not found.
         """
         states, single = self._states(q, v, u)
         state = self._stepped(torch.cat(states, dim=-1), dt, integrator)
@@ -262,12 +261,7 @@ class Predictor(Summary):
             elif tuple(batch[:1]) != (functions,):
                 raise InvalidInput(f"divided motions need a first dimension of {functions} functions; given: {batch}.")
         with torch.no_grad():
-            if loops is None:
-                motion = integrate(method, acceleration, start, v, forces, dt)
-            else:
-                motion = fused(loops, method, acceleration, start, v, forces, dt, threads)
-        q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (motion.q, motion.v, motion.a))
-        return Motions(q, v, a, motion.diverged_at.reshape(batch))
+            return moved(batch, loops, method, acceleration, start, v, forces, dt, threads=threads)
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""

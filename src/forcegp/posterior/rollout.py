@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -13,23 +14,31 @@ from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.pathwise import draw_functions, mean_function
-from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
-from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
-from forcegp.integration.trajectory import Trajectory, check_start, warn_of_divergence
-from forcegp.mechanics import Baumgarte
+from forcegp.integration.integrators import (
+    Feedback,
+    ImplicitMidpoint,
+    Integrator,
+    Trajectory,
+    check_start,
+    check_time_step,
+    integrate,
+    integrator_named,
+    rows_jacobian,
+    violation,
+    warn_of_divergence,
+)
 from forcegp.model import Model
 from forcegp.posterior.motion_intervals import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
 from forcegp.posterior.programs import steps_of
 from forcegp.robots.arguments import broadcast_batch, whole_number
-from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
 """Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
-Quantity = Literal["q", "v", "a", "constraint", "velocity_constraint"]
+Quantity = Literal["q", "v", "a", "constraint"]
 
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
@@ -71,6 +80,25 @@ class Motions(NamedTuple):
     v: Tensor
     a: Tensor
     diverged_at: Tensor
+
+
+def moved(
+    batch: Sequence[int],
+    loops: Sequence[RowFunction] | None,
+    method: Integrator,
+    acceleration: AccelerationFunction,
+    *given: Any,
+    threads: int | None = None,
+    what: str = "motions",
+    **how: Any,
+) -> Motions:
+    """`integrate` with these batch dimensions, by compiled loops where there are some."""
+    if loops is None:
+        found = integrate(method, acceleration, *given, what=what, **how)
+    else:
+        found = fused(loops, method, acceleration, *given, threads, what)
+    rows = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (found.q, found.v, found.a))
+    return Motions(*rows, found.diverged_at.reshape(tuple(batch)))
 
 
 def fused(
@@ -119,39 +147,30 @@ def fused(
 class Rollout:
     """Motions of T steps from one or more initial states; batch dimensions are those of q0.
 
-    Fields
-    ------
-    time: (T+1,) in s, from 0.
-    q, v: (..., T+1, nv) in rad and rad/s (m and m/s), q of a base that moves (..., T+1, nq); row 0 is the initial
-        state, which `integrator="projected"` moves onto the constraint first. Angles are not wrapped.
-    a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
-    constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
-        signed distances).
-    velocity_constraint: A(q) v (..., T+1, m) in m/s.
-    initial_correction: (..., 2) largest change of any joint's position and velocity that the projection of the initial
-        state made; 0 for integrators that do not project.
-    diverged_at: (...) the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
-    integrator, baumgarte: how the motion was computed.
-    samples: with samples=S, the same for S functions drawn from the model's posterior, shapes (S, ..., T+1, nv);
-        None without. Each sample is one function: it answers the same state always with the same force.
-    intervals: calibrated widths of intervals, of the model; None without.
-    space: of the positions. Where a base moves they do not add up, so deviations of q are steps (nv,) from the q here,
-        in the axes of the base: `robot.difference(rollout.q, other)`.
+    `time` (T+1,) in s; `q`, `v` (..., T+1, nv) in rad and rad/s (m and m/s), of a base that moves q (..., T+1, nq),
+    angles not wrapped; `a` (..., T, nv) in rad/s^2 (m/s^2) at row k under u[k] and what feedback adds to it.
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    `samples` (S, ...) are the same under S functions drawn from the posterior, one function each; None without.
+    `intervals` are the calibrated widths of the posterior's. Where a base moves, deviations of q are steps (nv,) from
+    the q here, in the axes of the base: `robot.difference(rollout.q, other)`.
     """
 
     time: Float[Tensor, " rows"]
     q: Float[Tensor, "*batch rows nq"]
     v: Float[Tensor, "*batch rows nv"]
     a: Float[Tensor, "*batch steps nv"]
-    constraint: Float[Tensor, "*batch rows m"]
-    velocity_constraint: Float[Tensor, "*batch rows m"]
-    initial_correction: Float[Tensor, "*batch 2"]
     diverged_at: Int[Tensor, "*batch"]
     integrator: str
-    baumgarte: Baumgarte | None
+    model: Model
     samples: "Rollout | None" = None
     intervals: MotionIntervals | None = None
-    space: ConfigurationSpace = VECTORS
+
+    @cached_property
+    def constraint(self) -> Float[Tensor, "*batch rows m"]:
+        """c(q) (..., T+1, m) in m, the distance of every contact point from its surface, where that is signed."""
+        rows = (x.flatten(0, -2).split(ROWS_PER_BLOCK) for x in (self.q, self.v))
+        found = torch.cat([violation(self.model, *block)[0] for block in zip(*rows, strict=True)])
+        return found.reshape(*self.q.shape[:-1], -1)
 
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
         """Lower and upper ends (..., T+1, nv) of the 95 % interval.
@@ -164,7 +183,7 @@ class Rollout:
             low, high = self.quantiles((0.025, 0.975), quantity)
             return low, high
         center, enough = getattr(self, quantity), self.samples is not None and len(self.samples.q) > 1
-        if quantity == "q" and not self.space.is_vector_space:
+        if quantity == "q" and not self.model.robot.space.is_vector_space:
             center = torch.where(center.isnan().any(-1, keepdim=True), torch.nan, 0.0)
         half = self.intervals.half_width(quantity, self.time, self.std(quantity) if enough else None)
         return center - half, center + half
@@ -194,8 +213,8 @@ class Rollout:
                 f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
             )
         values: Tensor = getattr(self.samples, quantity)
-        on_manifold = quantity == "q" and not self.space.is_vector_space
-        return self.space.difference(self.q, values) if on_manifold else values
+        on_manifold = quantity == "q" and not self.model.robot.space.is_vector_space
+        return self.model.robot.space.difference(self.q, values) if on_manifold else values
 
 
 def roll_out(
@@ -217,38 +236,26 @@ def roll_out(
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model)
     require_type("grad", grad, bool)
-    robot = model.robot
-    q, v, forces, batch = checked_start(model.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
-    steps = forces.shape[0]
-    total = steps * (1 + bool(samples))
-    counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
+    remedy = None if grad else "give grad=True"
+    q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u, remedy)
+    steps = len(forces)
 
     def run(copies: int, what: str, before: int) -> Rollout:
         shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
-        start = q.repeat(count, 1), v.repeat(count, 1)
-        given = method, accelerations(posterior, model, copies, seed), *start, forces.repeat(1, count, 1), dt
-        loops = None
+        given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
+        loops, how = None, {}
         if feedback is None and not grad:
             loops = _loops(posterior, model, integrator, steps, copies, seed)
-        if loops is None:
-            control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
-            report = None if counted is None else counted(before)
-            motion = integrate(*given, feedback=control, what=what, progress=report)
-        else:
-            motion = fused(loops, *given, what=what)
-            if progress is not None:
-                progress(before + steps, total)
-        q_rows, v_rows, a_rows = (
-            x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
-        )
-        blocks = zip(*(x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q_rows, v_rows)), strict=True)
-        parts = zip(*(ConstraintManifold(model).violation(*block) for block in blocks), strict=True)
-        c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
-        change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
-        correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
+        if progress is not None:
+            total = steps * (1 + bool(samples))
+            how["progress"] = lambda done, _: progress(before + done, total)
+        if feedback is not None:
+            how["feedback"] = _flat_feedback(feedback, shape, forces.shape[-1])
+        found = moved(shape, loops, method, accelerations(posterior, model, copies, seed), *given, what=what, **how)
+        if loops and progress is not None:
+            progress(before + steps, total)
         time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
-        moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
-        return Rollout(time, *moved, integrator, model.baumgarte, space=robot.space)
+        return Rollout(time, *found, integrator, model)
 
     with torch.set_grad_enabled(grad), blas_threads(0):
         mean = run(0, "rollouts", 0)
@@ -429,10 +436,4 @@ def linearized_on_manifold(
 
 def _method(model: Model, dt: Any, integrator: Any) -> Integrator:
     check_time_step(dt)
-    method = integrator_named(integrator, model)
-    if integrator == "projected":
-        raise InvalidInput(
-            "a step is not 'projected': it would move the given state onto the contacts first; give "
-            f"{', '.join(map(repr, INTEGRATORS.keys() - {integrator}))}, or roll out with integrator='projected'."
-        )
-    return method
+    return integrator_named(integrator, model)
