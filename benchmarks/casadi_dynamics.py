@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from forcegp.robots import Robot
-from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.compiled import UnrolledRobot
 
 QUANTITIES = ("mass_bias", "fd")
 LOOP = """

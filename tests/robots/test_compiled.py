@@ -15,8 +15,7 @@ from forcegp.codegen.c_writer import write_program
 from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput
 from forcegp.robots import Robot
-from forcegp.robots.compiled import trace_dynamics
-from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.compiled import UnrolledRobot, trace_dynamics
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
 TEXT = """<robot name="small">

@@ -6,6 +6,7 @@ import warnings
 import pinocchio as pin
 import pytest
 import torch
+from forcegp.robots.problems import LISTED, Problems
 from tests.robots.test_base import LOOSE
 from tests.robots.test_urdf_errors import SMALL, changed
 
@@ -16,7 +17,6 @@ from forcegp.errors import (
     RobotModelError,
 )
 from forcegp.robots import Robot
-from forcegp.robots.problems import LISTED, Problems
 from forcegp.robots.urdf import without_comments
 
 FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'

@@ -8,7 +8,7 @@ from tests.robots.robot_models import MODELS, TREE
 
 from forcegp.codegen.graph import Graph, evaluated, node_of
 from forcegp.robots import Robot
-from forcegp.robots.unrolled import UnrolledKinematics, UnrolledRobot, factorize, solve_factorized
+from forcegp.robots.compiled import UnrolledKinematics, UnrolledRobot, factorize, solve_factorized
 
 COUNT = 6
 

@@ -33,8 +33,6 @@ class RobotFileOptions:
     base: Annotated[Literal["fixed", "floating", "planar", "spherical"] | None, BASES] = None
     """How the base is held. fixed: bolted to the world, also where the robot has legs, wheels or rotors.
     floating: free. planar: free in the plane z = 0. spherical: free to turn."""
-    root: Annotated[str | None, unless_given("LINK", "that of the file", str)] = None
-    """A link that the URDF does not define, such as world, which the base hangs on."""
     lock: Annotated[tuple[str, ...], listed(), unless_given("JOINT=RAD,...", "as recorded")] = ()
     """Hold joints of the URDF at these positions (rad or m), for instance a finger that was not recorded."""
     armature: Annotated[tuple[str, ...], listed(), unless_given("JOINT=VALUE,...", "as recorded, or 0")] = ()
@@ -44,7 +42,7 @@ class RobotFileOptions:
 
     def changes(self) -> dict[str, Any]:
         """Arguments of `Robot.from_file` by name."""
-        changes: dict[str, Any] = {name: value for name in ("base", "root") if (value := getattr(self, name))}
+        changes: dict[str, Any] = {"base": self.base} if self.base else {}
         if self.gravity:
             if len(self.gravity) != 3:
                 raise InvalidInput(f"--gravity holds {len(self.gravity)} numbers; write --gravity 0,0,-9.81.")

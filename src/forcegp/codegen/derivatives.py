@@ -1,8 +1,4 @@
-"""Derivatives of straight-line arithmetic, as nodes of the same graph.
-
-`gradients` accumulates backwards, for few outputs; `jacobian` carries the derivatives in every input forwards, where
-most of them are structurally zero (Griewank & Walther, "Evaluating Derivatives", 2008, ch. 3).
-"""
+"""Derivatives of straight-line arithmetic, as nodes of the same graph: backwards for few outputs, else forwards."""
 
 import math
 from collections.abc import Callable, Sequence

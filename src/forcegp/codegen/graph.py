@@ -1,10 +1,7 @@
 """Straight-line arithmetic on scalars: what every program that is made at run time is written from.
 
-A `Graph` holds each operation once: equal operations on equal operands are one node, what constants decide (products
-with zero, sums of known numbers) is never recorded, and negations move to where they cost nothing. Derivatives
-(`codegen.derivatives`) are nodes of the same graph, so they share what the values compute (Griewank & Walther,
-"Evaluating Derivatives", 2008, ch. 3 and 4). A node is a tuple of its operation and its operands, which have smaller
-numbers.
+A `Graph` holds each operation once, and none that constants decide. Derivatives (`codegen.derivatives`) are nodes of
+the same graph (Griewank & Walther, "Evaluating Derivatives", 2008, ch. 3 and 4).
 """
 
 import math
@@ -36,11 +33,10 @@ LEAVES = ("constant", "input")
 
 
 class Graph:
-    """All operations recorded so far.
+    """All operations recorded so far: tuples of an operation and its operands, which have smaller numbers.
 
-    Beside the functions of `UNARY` and `BINARY` there are "choose" (m != 0 ? x : y), "input" (its position), "constant"
-    (its value), "look up" (a table of numbers, the place in it), "call" (a name of a C function, its operands) and
-    "output" (a call, its position).
+    Beside `UNARY` and `BINARY`: "choose" (m != 0 ? x : y), "input" (position), "constant" (value), "look up" (table,
+    place), "call" (name of a C function, operands), "output" (call, position).
     """
 
     def __init__(self, inputs: int = 0) -> None:

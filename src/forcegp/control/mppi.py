@@ -28,23 +28,17 @@ SMALLEST_SCALE = 0.05
 class MPPI(Controller):
     """Torques that lower the expected cost of the next `steps` steps of `dt` seconds, found by random shooting.
 
-    Every call draws `samples` sequences of torques around the plan, rolls all of them out by `predictor.rollouts` and
-    moves the plan to their mean with the weights exp(-cost / temperature), and returns its first torque; the next call
-    starts from the rest of the plan (Williams, Aldrich, Theodorou 2017, "Model predictive path integral control",
-    without its penalty of the torque, which belongs into `cost`). The best sequence of a call takes part in the next
-    (Pinneri et al. 2020, "Sample-efficient cross-entropy method for real-time planning"). Call it once in `dt` seconds;
-    before the first call, some rounds of `improved` find a first plan.
+    A call draws `samples` sequences around the plan, rolls them out and moves the plan to their mean with the weights
+    exp(-cost / temperature) (Williams, Aldrich, Theodorou 2017); the best one takes part in the next call (Pinneri et
+    al. 2020). Call it once in `dt` seconds, after some rounds of `improved`.
 
-    * predictor: `posterior.predictor()`; compiled for speed. functions: 0 plans with the mean of the learned forces, k
-      with so many functions drawn from the posterior, whose costs are averaged, so that no plan relies on a force that
-      the data leave open.
-    * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
-    * torque_limits: largest absolute torques in Nm (N), a number or one per joint, 0 for a joint without a motor; None
-      takes the efforts of the URDF.
-    * noise: largest standard deviation of the sequences around the plan, as `torque_limits`; None for half of these. It
-      falls to a twentieth of that from sequence to sequence. correlation: of two successive torques, in [0, 1).
-    * temperature: in units of the cost; None takes 2 % of the distance from the least to the median cost.
-    * on_failure: "raise", or "hold" for the last torque where none can be computed.
+    * predictor: `posterior.predictor()`. functions: 0 plans with the mean of the learned forces, k with the mean cost
+    under k functions drawn from the posterior. * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (...,
+    T, nv), the last state included. * torque_limits: largest absolute torques in Nm (N), a number or one per joint;
+    None takes the efforts of the URDF. * noise: largest standard deviation around the plan, None for half the limits;
+    it falls to a twentieth from sequence to sequence. correlation: of two successive torques, in [0, 1). temperature:
+    None takes 2 % of the distance from the least to the median cost. on_failure: "raise", or "hold" for the last
+    torque.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
     """

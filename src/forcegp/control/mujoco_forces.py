@@ -29,15 +29,13 @@ class MujocoForces(Summary):
     """What was learned of a robot's forces, as MuJoCo's passive force: `with MujocoForces(predictor, model): ...`.
 
     Within the context every `mj_step`, `mj_forward` and `mujoco.rollout` of this process adds them, on any number of
-    threads; there is one such force at a time. With it `qacc` is what `posterior.predict` returns.
+    threads; one at a time. `qacc` then is what `posterior.predict` returns.
 
-    * predictor: `posterior.predictor()` without contacts, since those are MuJoCo's; its forces may depend on q and v.
-    * model: an `MjModel` with the joints of the robot, by their names, and its inertias and gravity. Damping and
-      friction that the URDF states are in it, too, and would act twice: InvalidInput names the joint.
-    * draw: 0 is the mean of the forces; k draws k functions with `seed`, the same as `predictor.rollouts(functions=k)`,
-      and `use(number)` chooses one, for example at the beginning of an episode.
+    * predictor: without contacts, since those are MuJoCo's; its forces may depend on q and v. * model: an `MjModel`
+    with the joints of the robot, its inertias and gravity, and no damping or friction of its own. * draw: 0 is the
+    mean; k draws k functions with `seed`, as `predictor.rollouts(functions=k)`, of which `use` takes one.
 
-    Raises InvalidInput for models that do not fit, CompilerError without a C compiler; leaving the context raises
+    Raises InvalidInput for models that do not fit, CompilerError without a C compiler; leaving the context
     NumericalError where a force was not finite meanwhile.
     """
 

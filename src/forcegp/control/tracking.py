@@ -1,7 +1,4 @@
-"""Tracking of a reference in joint space, with and without a model of the forces, and along a surface.
-
-All controllers keep torques within limits, and none gives one that is not finite.
-"""
+"""Tracking of a reference in joint space, with and without a model of the forces, and along a surface."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -28,8 +25,8 @@ OnFailure = Literal["raise", "hold"]
 class Controller(Summary):
     """Limits the torques of a call, and raises or holds the last ones where it cannot compute any.
 
-    `saturated` (nv,) are the joints whose torque was limited in the last call, `held` counts the calls that repeated
-    the torque `last` (nv,) of the call before, which is zero at first.
+    `saturated` (nv,) are the joints limited in the last call, `held` counts the calls that repeated `last` (nv,), 0 at
+    first.
     """
 
     def __init__(self, robot: Robot, torque_limits: Any, on_failure: OnFailure) -> None:
@@ -57,10 +54,7 @@ class Controller(Summary):
         return {"robot": self.robot.name, "on failure": self.on_failure, "held": self.held}
 
     def vectors(self, **given: Any) -> list[Tensor]:
-        """The vectors (nv,) as tensors, called within `limited`.
-
-        Raises InvalidInput for what is none, NumericalError for one that is not finite where that is to be held.
-        """
+        """Vectors (nv,), within `limited`. InvalidInput for others, NumericalError for not finite ones to hold."""
         try:
             return [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()]
         except InvalidInput as error:
@@ -70,10 +64,7 @@ class Controller(Summary):
             raise
 
     def limited(self, compute: Callable[[], Tensor]) -> Float[Tensor, " nv"]:
-        """The torques (nv,) that `compute` returns, within the limits.
-
-        Raises NumericalError where there are none or one is not finite, unless the last ones are to be held.
-        """
+        """The torques (nv,) of `compute` within limits. NumericalError where one is not finite, unless held."""
         try:
             asked = compute()
             if not bool(asked.isfinite().all()):
@@ -111,14 +102,13 @@ NO_TORQUES = (
 class TrackingController(Controller):
     """Feedback on a reference q_d, v_d, a_d (nv,), as an acceleration: a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum.
 
-    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically, 2 sqrt(Kp).
-      integral Ki in 1/s^3 needs the time `dt` between calls; a joint at its limit does not add to it.
-    * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
-    * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite; the
-      integral then stays as it was.
+    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically. integral Ki in 1/s^3
+    needs the time `dt` between calls; a joint at its limit does not add to it. * torque_limits: largest absolute
+    torques in Nm (N); None takes the efforts of the URDF. * on_failure: "raise", or "hold" for the last torque where
+    none can be computed or an input is not finite.
 
-    Raises InvalidInput for arguments that do not fit and a reference outside of the joints' range, NumericalError where
-    no torque is found.
+    Raises InvalidInput for arguments that do not fit and references out of range, NumericalError where no torque is
+    found.
     """
 
     def __init__(
@@ -179,10 +169,7 @@ class TrackingController(Controller):
 
 
 class PDGravity(TrackingController):
-    """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): no model but masses, the baseline of the others.
-
-    `robot` may be `robot.compile()`. Gains as `TrackingController` has them.
-    """
+    """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): masses alone; `robot` may be `robot.compile()`."""
 
     def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
         self._dynamics = robot
@@ -249,10 +236,7 @@ def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
 def torques_for(
     model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
 ) -> Float[Tensor, " nv"] | None:
-    """The u (nv,) under which known and learned forces at q, v are those `needed`, by Newton's method; None if none is.
-
-    It begins at u, where they are `at`: friction may depend on u. Raises NumericalError for forces that are not finite.
-    """
+    """The u (nv,) that gives the forces `needed` at q, v, by Newton's method from u, where they are `at`, or None."""
     if not bool(needed.isfinite().all()):
         raise NumericalError(NO_TORQUES)
     for _ in range(ROUNDS):
@@ -270,13 +254,10 @@ def torques_for(
 class HybridForce(TrackingController):
     """u = M a + h - A^T lambda_d - Q_U(lambda_d): a reference along the contacts, and wanted forces against them.
 
-    a is the acceleration of the feedback, freed from what the contacts would resist: of all that satisfy A a = b the
-    one nearest to it in the kinetic metric (Gauss' principle). lambda_d presses the robot onto the surface; friction
-    under load, learned or known, is that of lambda_d. So the force is right where the model is: no sensor is read.
+    a is the acceleration of the feedback nearest, in the kinetic metric, that satisfies A a = b (Gauss' principle);
+    lambda_d presses the robot onto the surface. No sensor is read: the force is right where the model is.
 
-    * predictor: `posterior.predictor()` of a model with contacts and analytical mean. Gains as `TrackingController`
-      has them. Forces are evaluated at (q, v_d), as in `ComputedTorque`. Newton's method goes on from the torques of
-      the last call, for friction under load depends on them.
+    * predictor: `posterior.predictor()` of a model with contacts and analytical mean; forces are those at (q, v_d).
     """
 
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
@@ -292,10 +273,7 @@ class HybridForce(TrackingController):
 
     @override
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
-        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) in N, one per contact.
-
-        A normal force is positive where the surface pushes the robot off; a surface only pushes.
-        """
+        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) >= 0 in N on the robot."""
         count = len(self.model.contacts)
         wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
         if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):

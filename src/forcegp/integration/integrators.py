@@ -26,7 +26,9 @@ def violation(
 ) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
     """c(q) in m and A(q) v in m/s of the contacts, for surfaces that are signed distances; NaN where q is."""
     lost = torch.isnan(q).any(-1, keepdim=True)  # no quaternion is made of NaN
-    c, A, _ = _constraint(model, torch.where(lost, model.robot.space.neutral().to(q), q) if model.robot.space.groups else q)
+    c, A, _ = _constraint(
+        model, torch.where(lost, model.robot.space.neutral().to(q), q) if model.robot.space.groups else q
+    )
     return c.masked_fill(lost, torch.nan), (A @ v[..., None])[..., 0].masked_fill(lost, torch.nan)
 
 
@@ -35,8 +37,8 @@ def onto_contacts(
 ) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
     """The states near (q, v) with c(q) = 0 to 1e-12 m and A v = 0: Newton's method along M^-1 A^T, M fixed.
 
-    Hairer, Lubich & Wanner (2006), Geometric Numerical Integration, sections IV.4 and VII.1.4. Redundant contacts are
-    legal. Raises NumericalError, naming the state, where no position on all surfaces is found.
+    Hairer, Lubich & Wanner (2006), sections IV.4 and VII.1.4; redundant contacts are legal. NumericalError names a
+    state for which no position on all surfaces is found.
     """
     lower = factors(model.mass_matrix_at(model.loaded_robot.kinematics(q)))[1]
     for iteration in range(MOST_CORRECTIONS + 1):
@@ -50,7 +52,7 @@ def onto_contacts(
         row = int(missing.nonzero()[0])
         raise NumericalError(
             f"state {row} cannot be moved onto the surfaces of the contacts: after {iteration} Newton steps |c| is "
-            f"still {float(c[row].abs().max()):.2e} m. Start nearer to the surfaces, and check that the robot can reach "
+            f"still {float(c[row].abs().max()):.2e} m. Start nearer, and check that the robot can reach "
             "them and that the contacts do not contradict each other."
         )
     inverse = lower.mT @ torch.linalg.pinv(A @ lower.mT, rtol=REDUNDANCY_TOLERANCE)
@@ -84,10 +86,9 @@ Rows = Callable[[Tensor], Tensor]
 def find_roots(residual: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], Bool[Tensor, " n"]]:
     """The roots that Newton's method reaches from x, and where it found them; differentiable once in `residual`'s own.
 
-    A step d is shortened, by the secant rule, where J^-1 r has turned round by more than half at its end: in one
-    dimension, where it overshoots the root by more. To ask for a smaller |r|, as textbooks do, ends at bumps of a
-    friction curve. A Jacobian with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with speed,
-    the plain step leads away from the root.
+    A step is shortened, by the secant rule, where J^-1 r has turned round by more than half at its end; a smaller |r|
+    ends at bumps of a friction curve. J with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with
+    speed, the plain step leads away from the root.
     """
     with torch.no_grad():
         x = x.detach()
@@ -206,8 +207,7 @@ class SymplecticEuler(Integrator):
 class RungeKutta4(Integrator):
     """The classical method of fourth order, four evaluations (Hairer, Norsett & Wanner 1993, table II.1.2).
 
-    On a manifold for the step from q in the chart of the exponential (Munthe-Kaas 1999; Hairer, Lubich & Wanner 2006,
-    section IV.8.2), of the same order.
+    On a manifold in the chart of the exponential (Munthe-Kaas 1999).
     """
 
     space: ConfigurationSpace = VECTORS
@@ -229,9 +229,8 @@ class RungeKutta4(Integrator):
 class ImplicitMidpoint(Integrator):
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
-    Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method, for
-    which torch has to be able to differentiate the acceleration. On a manifold by
-    the Cayley transform, with which a tumbling body in free fall keeps its energy and momentum exactly.
+    A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method with derivatives by torch. On a
+    manifold by the Cayley transform: a tumbling body in free fall keeps its energy and momentum.
     """
 
     space: ConfigurationSpace = VECTORS
@@ -290,10 +289,10 @@ Feedback = Callable[[int, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """n motions of T steps: q, v (T+1, n, nv) and a (T, n, nv), the acceleration at the beginning of each step.
+    """n motions of T steps: q, v (T+1, n, nv), a (T, n, nv) at the beginning of each step.
 
-    `diverged_at` (n,) is the first row of q and v that does not exist (NaN from there on), -1 for a motion that lasted
-    to the end; `not_found` marks those that the integrator could not carry on.
+    `diverged_at` (n,) is the first row of q and v that is NaN, else -1; `not_found` those the integrator could not
+    carry on.
     """
 
     q: Float[Tensor, "rows n nq"]
@@ -317,14 +316,10 @@ def integrate(
 ) -> Trajectory:
     """Carry n states through T steps of `dt` seconds; u[k] + feedback(k, q[k], v[k]) acts from row k to row k + 1.
 
-    Like u, what the feedback adds is constant over a step (a zero-order hold), whatever states the integrator visits
-    on the way: so it is asked once per step, of finite states only.
-
-    A motion whose state is no longer finite, that is faster than `SPEED_LIMIT`, or that the integrator cannot carry on
-    (`Integrator.failure`), ends there: the rest of it is NaN, `diverged_at` holds the row, and a NumericalWarning is
-    given. The others go on. `acceleration` is called with finite states only. `what` names the motions in the warning,
-    `progress(step, steps)` is called after every step. Differentiable in q0, v0, u and what `feedback` adds.
-    Raises InvalidInput where `dt` is no positive number or a start is faster than the limit.
+    A motion that is no longer finite, faster than `SPEED_LIMIT`, or that the integrator cannot carry on, is NaN from
+    there, and a NumericalWarning names `what`. `acceleration` and `feedback` see finite states only; `progress(step,
+    steps)` is called after every step. Differentiable in q0, v0, u and what `feedback` adds. InvalidInput for a dt that
+    is no positive number or a start beyond the limit.
     """
     check_start(v0, dt)
     q, v = q0, v0

@@ -1,21 +1,12 @@
 """Motions by the implicit midpoint rule, of many windows at once, with derivatives in start and parameters.
 
-With a step h and a constant u in each, the middle of a step obeys (`ImplicitMidpoint`)
-
-    v_m = v + h/2 a(q + h/2 v_m, v_m, u; p),    q+ = q + h v_m,    v+ = 2 v_m - v.
-
-Linearised at a guess (q_m, v_m) of the middle of every step, this is one affine recursion along each window,
+Linearised at a guess (q_m, v_m) of the middle of every step, the rule is one affine recursion along each window,
 
     (1 - h/2 a_v - h^2/4 a_q) v_m = v + h/2 (a - a_q (q_m - q) - a_v v_m + a_p dp)    (right side at the guess),
 
-whose pass gives new guesses of all middles, and the derivatives of the motion in its start and in p as well. Repeated,
-it is Newton's method on all steps of all windows at once (the lifted or multiple-shooting method of Bock & Plitt 1984;
-Albersmeyer & Diehl, "The lifted Newton method", SIAM J. Optim. 2010): accelerations are asked for all steps together,
-and a motion that explicit steps would lose is found, because the guess comes from a recording.
-
-Where a base moves, q+ = q exp(m(h v_m)), with the acceleration that belongs to this step (`midpoint_step`,
-`midpoint_acceleration`). Positions then follow from the guessed v_m exactly, and the recursion runs over steps from
-them in body axes: those at the end of a step are X dq + Y dv_m, those at its middle alike, with the exact derivatives.
+which is Newton's method on all steps of all windows at once when repeated (lifted: Bock & Plitt 1984; Albersmeyer &
+Diehl, SIAM J. Optim. 2010). Where a base moves, positions follow from the guessed v_m exactly, and the recursion runs
+over steps from them in body axes.
 """
 
 from collections.abc import Callable
@@ -35,10 +26,7 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Accelerations (n, nv) at states, and derivatives in q, v (n, nv, nv) and parameters (n, nv, P).
-
-    Where a base moves, the derivative in q is that in a step from there.
-    """
+    """Accelerations (n, nv), and derivatives in q, or a step from there, v (n, nv, nv) and parameters (n, nv, P)."""
 
     a: Float[Tensor, "*n nv"]
     a_q: Float[Tensor, "*n nv nv"]
@@ -48,10 +36,7 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Accelerations:
-    """The accelerations of states (q, v, u), each (n, nv), which torch can differentiate, and their `Linear`.
-
-    `linear` is asked with and without derivatives in the parameters; `space` is that of q.
-    """
+    """Accelerations (n, nv) of states (q, v, u), differentiable, and their `Linear`, with or without parameters."""
 
     mean: Callable[[Tensor, Tensor, Tensor], Tensor]
     linear: Callable[[Tensor, Tensor, Tensor, bool], Linear]
@@ -62,8 +47,7 @@ class Accelerations:
 class WindowMotions:
     """Motions of K windows of T steps: states, the middles of the steps, whether Newton's method found them.
 
-    `in_start` and `in_parameters` are the derivatives of q in (q_0, v_0) and in p; where a base moves, of steps from q
-    in steps from q_0.
+    `in_start` and `in_parameters` are derivatives of q, or of steps from it, in (q_0, v_0) and in p.
     """
 
     q: Float[Tensor, "K rows nq"]
@@ -88,8 +72,7 @@ def window_motions(
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
-    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that
-    `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
+    Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
@@ -143,10 +126,7 @@ def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameter
 def _along(
     accelerations: Accelerations, q0: Tensor, u: Tensor, w: Tensor, h: float, parameters: bool
 ) -> tuple[Tensor, Tensor, Linear, Tensor, Tensor]:
-    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations of the steps, X and Y (K, T, ...).
-
-    Derivatives of these accelerations are in the step from where a step begins and in its w.
-    """
+    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations, X and Y (K, T, ...)."""
     space, nv = accelerations.space, w.shape[-1]
     steps, path = space.midpoint_step(h * w), [q0]
     for step in steps.unbind(1):

@@ -1,24 +1,12 @@
-"""Constraints of other kinds than a point on a surface, as rows of the same A: closed loops, and wheels that roll.
+"""Closed loops and rolling wheels as rows of the same A.
 
-A tree with a loop is the tree whose two ends meet: with p_a - p_b = 0 along each axis n of the world,
+A loop: A = n^T (J_a - J_b) with p_a = p_b along axes n of the world; its multiplier is the force on the first frame
+(Featherstone 2008, section 8.2). Rows of the orientation have the error 2 tan(t/2) k for a turn by t about k, and
+torques as multipliers. A wheel of axis e touches at p + r d, d = -(n - (n.e) e) / |n - (n.e) e| (a ball: d = -n):
 
-    A = n^T (J_a - J_b),    b = -n^T (Jdot_a v - Jdot_b v) - 2 zeta omega A v - omega^2 n^T (p_a - p_b),
+    A v = t^T (p' + w x r d) = 0,    A' v = t^T (Jdot_p v + Jdot_w v x r d + w x r d')
 
-and the multiplier is the force on the first frame in N, its opposite that on the second one (Featherstone, "Rigid Body
-Dynamics Algorithms" (2008), section 8.2, whose loop constraints have axes of a link). Rows that hold the orientation
-are the same with angular velocities; their error is 2 tan(t/2) k for a turn by t about k from the second frame to the
-first, which is t k near 0, and their multiplier a torque in Nm. In planar mechanisms some rows constrain nothing: they
-are redundant, which is legal.
-
-The point of a wheel that touches the ground with normal n lies at p + r d, where p is its centre, e its axis and d the
-direction in its plane that points down most, d = -(n - (n.e) e) / |n - (n.e) e| (of a ball, d = -n). As a point of the
-link it has no velocity. Along a direction t of the world,
-
-    A v = t^T (p' + w x r d) = 0,    A' v = t^T (Jdot_p v + Jdot_w v x r d + w x r d'),
-
-with d' as it moves on the rim, not with the link. Along n this is the derivative of the height of the rim; along
-tangents it has no integral: such constraints are nonholonomic, and no position breaks them (Bloch, "Nonholonomic
-Mechanics and Control" (2015), section 1.4).
+with d' as it moves on the rim (nonholonomic along tangents: Bloch 2015, section 1.4).
 """
 
 import math
@@ -55,8 +43,7 @@ Point = tuple[float, float, float]
 class LoopClosure(Contact):
     """Two points of the robot do not move apart along one axis of the world; made by `loop_point` and `loop_frame`.
 
-    `second_point` is given in m in the axes of `second_frame`. With `turning` the frames do not turn against each other
-    about that axis instead.
+    `second_point` is in m in `second_frame`. With `turning` the frames do not turn against each other about that axis.
     """
 
     surface: Held
@@ -116,20 +103,15 @@ class LoopClosure(Contact):
 def loop_point(
     frame_a: str, point_a: Point, frame_b: str, point_b: Point, switch: str | None = None
 ) -> tuple[LoopClosure, ...]:
-    """A point of one frame is a point of another one, as in a joint that closes a loop: three rows, along x, y and z.
+    """A point (m) of one frame is a point of another one, as in a joint that closes a loop: rows along x, y and z.
 
-    Points are given in m in the axes of their frames. The multipliers are the force on the first frame in N, in the
-    axes of the world.
+    The multipliers are the force on the first frame in N, in the axes of the world.
     """
     return tuple(LoopClosure(frame_a, point_a, Held(axis), switch, frame_b, point_b) for axis in AXES)
 
 
 def loop_frame(frame_a: str, frame_b: str, switch: str | None = None) -> tuple[LoopClosure, ...]:
-    """Two frames are the same one, as where a loop is welded: six rows, along and about x, y and z of the world.
-
-    The multipliers are force in N and torque in Nm on the first frame. Half a turn from each other, the orientation has
-    no error that is finite.
-    """
+    """Two frames are one, as in a welded loop: six rows; multipliers in N and Nm on the first, in world axes."""
     origin = (0.0, 0.0, 0.0)
     turns = (LoopClosure(frame_a, origin, Held(axis), switch, frame_b, origin, turning=True) for axis in AXES)
     return (*loop_point(frame_a, origin, frame_b, origin, switch), *turns)
@@ -157,10 +139,10 @@ LYING = 1e-9
 
 @dataclass(frozen=True)
 class RollingContact(Contact):
-    """The rim does not move along one direction, that of `surface`, where it touches; made by `rolling`.
+    """The rim does not move along the direction of `surface` where it touches; made by `rolling`.
 
-    `point` is the centre of the wheel and `axis` its axis in the axes of `frame` (None for a ball), `radius` in m,
-    `normal` that of the ground in the world.
+    `point` is the centre of the wheel, `axis` its axis in `frame` (None for a ball), `radius` in m, `normal` the
+    ground's.
     """
 
     radius: float = math.nan
@@ -227,9 +209,9 @@ def rolling(
 ) -> tuple[RollingContact, RollingContact, RollingContact]:
     """A wheel on link `frame` rolls without slipping: it neither leaves the ground nor slides forwards or sideways.
 
-    `point` is its centre and `axis` its axis in the axes of the frame, None for a ball; `radius` in m. `ground` is a
-    `Plane`, or `Held(normal)` where its height does not matter; by default it is level. The multipliers are the force
-    on the wheel in N along the normal and two tangents, x and y on level ground.
+    `point` is its centre (m) and `axis` its axis in the frame, None for a ball; `radius` in m. `ground` is a `Plane`,
+    or `Held(normal)` where its height does not matter; by default level. Multipliers are N along normal and two
+    tangents.
     """
     ground = Held((0.0, 0.0, 1.0)) if ground is None else ground
     if not isinstance(ground, Held | Plane):

@@ -1,9 +1,7 @@
-"""Surfaces s(p) = 0 that a point of the robot can be held on.
+"""Surfaces s(p) = 0 that a point of the robot can be held on, with derivatives; p (..., 3) in m, world axes.
 
-A surface returns its value, gradient and Hessian at points p (..., 3) in m, world axes. The built-in surfaces are
-signed distances, so their gradient is a unit normal and the multiplier of a contact is the normal force in N. A new
-surface is one subclass of `Surface` that defines `value`; the derivatives follow by autograd unless it defines them. To
-be stored with a dataset or a model it also needs an entry in `SURFACES` and plain numbers as its fields.
+The built-in ones are signed distances, so a multiplier is the normal force in N. One of your own is a subclass with
+`value`; to be stored it needs an entry in `SURFACES` and plain numbers as its fields.
 """
 
 import math
@@ -24,10 +22,7 @@ Kind = TypeVar("Kind")
 
 
 def object_from_dict(what: str, registry: Mapping[str, type[Kind]], stored: object) -> Kind:
-    """The object that `stored` describes, its lists as tuples; `what` names its kind in messages.
-
-    Raises FileFormatError for anything but a mapping, an unknown type or wrong fields.
-    """
+    """The object that `stored` describes, lists as tuples; FileFormatError for anything else than a `what`."""
     if not isinstance(stored, Mapping):
         raise FileFormatError(f"a stored {what} is {stored!r}; expected an object with a type")
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
@@ -99,10 +94,7 @@ class Plane(_Flat):
 
 @dataclass(frozen=True)
 class Held(_Flat):
-    """No place but a direction: a point on it does not move along `normal`, wherever it stands.
-
-    Its value is 0 everywhere, so nothing pulls the point back, and the multiplier is the force along `normal` in N.
-    """
+    """A direction `normal` along which a point does not move, wherever it stands: its value is 0 everywhere."""
 
     normal: Vector
 
@@ -180,8 +172,7 @@ class Cylinder(_Round):
 class ImplicitSurface(Surface):
     """s(p) = function(p) for any twice differentiable `function` of one point (3,) -> scalar, written in torch.
 
-    The multiplier of a contact is then the normal force divided by |s_p|. A function cannot be stored in a file (files
-    never carry code): a subclass of `Surface` with numbers as fields can.
+    The multiplier of a contact is the normal force divided by |s_p|. Files never carry code, so it cannot be stored.
     """
 
     function: Callable[[Tensor], Tensor] = field(compare=True)
@@ -244,10 +235,7 @@ def _vector(name: str, values: object) -> Vector:
 
 
 def direction(name: str, values: object) -> tuple[Vector, float]:
-    """The unit vector along three numbers, and their length.
-
-    The length is 1 where it is so already up to rounding, so that storing changes nothing.
-    """
+    """The unit vector along three numbers, unchanged where it is one up to rounding, and their length."""
     entries = _vector(name, values)
     length = math.hypot(*entries)
     if not 0.0 < length < math.inf:
@@ -264,9 +252,8 @@ TURNED_OVER = -0.9
 def surface_axes(gradients: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Columns t1, t2, n of the rotation that turns the world's z axis the shortest way onto the normal n.
 
-    `gradients` are surface gradients of any positive length. On a table the tangents are x and y; they vary smoothly
-    with the normal wherever it does not point nearly straight down (there they start from -z, and t2 is -y). With
-    axis w = z x n and c = n_z, the rotation is I + [w] + [w]^2 / (1 + c) (Rodrigues' formula).
+    `gradients` have any positive length. On a table the tangents are x and y; they are smooth but where n points nearly
+    straight down (from -z there, and t2 is -y): I + [w] + [w]^2 / (1 + c) with w = z x n, c = n_z (Rodrigues' formula).
     """
     n = gradients / torch.linalg.vector_norm(gradients, dim=-1, keepdim=True)
     down = n[..., 2] < TURNED_OVER

@@ -1,8 +1,7 @@
 """`Estimates`: the numbers of a model that a fit found, how sure they are, and whether the log or the prior decides.
 
-Covariances come from leaving out each of `STRETCHES` stretches of the log in turn, by one step of the search (block
-jackknife; Kuensch 1989, "The jackknife and the bootstrap for general stationary observations"), so that errors that
-last, such as those of a law of friction, count; to that adds what the prior leaves open of what the log does not show:
+Covariances are a block jackknife over stretches of the log (Kuensch 1989), by one step of the search, so that errors
+that last count, and what the prior leaves open of what the log does not show:
 
     (K - 1) / K sum_k d_k d_k^T + F^-1 G F^-1,    F = J^T J + G
 
@@ -39,10 +38,7 @@ Decider = Literal["log", "prior"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """One number: its value and standard deviation in `unit`, and what decides it, with the reason.
-
-    `start` is what the model had, `prior_std` how far from it the number may be a priori.
-    """
+    """One number: value and std in `unit`, its start and prior std, and what decides it, with the reason."""
 
     name: str
     unit: str
@@ -70,10 +66,9 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimates(Summary, Mapping[str, Estimate]):
-    """The numbers that a fit estimated, by name: `estimates["payload.mass"].value`.
+    """The numbers that a fit estimated, by name: `estimates["payload.mass"].value`; `settled` if the search converged.
 
-    `covariance` (n, n) is that of all values, in SI units. `open_directions` are combinations that the prior decides,
-    since no row of the log tells their parts apart. `settled` tells whether the search converged.
+    `covariance` (n, n) is that of all values, in SI units; `open_directions` are combinations that the prior decides.
     """
 
     entries: tuple[Estimate, ...] = ()
@@ -167,10 +162,9 @@ class Estimates(Summary, Mapping[str, Estimate]):
         prior: Float[np.ndarray, "k k"],
         **more: Any,
     ) -> "Estimates":
-        """From a search: the Jacobian of whitened residuals with the residuals in its last column, rows by stretches.
+        """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
 
-        `slopes` are derivatives of the values in the coordinates, `prior` the Jacobian of the standardised prior. With
-        no stretches the covariance is F^-1: where whitening has made all rows independent.
+        `slopes` are derivatives of the values in the coordinates. Without stretches the covariance is F^-1.
         """
         J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
         information = J.T @ J

@@ -34,10 +34,9 @@ AnyFitted = TypeVar("AnyFitted", bound="Fitted")  # beartype cannot check Self w
 class Fitted(Summary):
     """a = M^-1 Q_b + H (Q_K + B f) + noise, f ~ GP (Rath et al. 2021, eqs. 6-7), conditioned on a log by `forcegp.fit`.
 
-    `trained` is the model with the numbers that were found; `hyperparameters` are those of kernels and noise by name;
-    `estimates` the numbers of laws and bodies (`parameters`); `settings` is the resolved configuration of the fit
-    (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
-    training data); `result` is the history of the search and why it ended.
+    `trained` is the model with the numbers that were found, `hyperparameters` those of kernels and noise by name,
+    `estimates` those of laws and bodies; `settings` is the resolved configuration (JSON values; `points`, `seed`,
+    `data`); `result` the history of the search.
     """
 
     trained: Model
@@ -75,11 +74,7 @@ class Fitted(Summary):
         solution: Tensor | None = None,
         estimates: Estimates | None = None,
     ) -> AnyFitted:
-        """The posterior at given hyper-parameters, without a search: what a stored one is loaded with.
-
-        `engine` computes it, where there is a choice; `solution` is what that engine had found (`Posterior.solution`),
-        which saves it most of its work.
-        """
+        """The posterior at given hyper-parameters, without a search; `solution` is what its `engine` had found."""
         likelihood = MarginalLikelihood(model, replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
         engine = engine or Exact()
         # now: a failure belongs to the fit, not to the first prediction
@@ -109,10 +104,7 @@ class Fitted(Summary):
 
     @cached_property
     def negative_log_likelihood(self) -> float:
-        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior.
-
-        With inducing points its upper bound.
-        """
+        """-log p(a | q, v, u) of the training data in nats, without hyperpriors; of inducing points the bound."""
         with torch.no_grad():
             if isinstance(self.latent, InducingPosterior):
                 return float(self.likelihood.bound(self.kernels, self.hyperparameters, self.latent.features))
@@ -175,8 +167,5 @@ class Fitted(Summary):
 
     @property
     def widening(self) -> float:
-        """How many times as wide intervals are as those of `latent`, whose hyper-parameters count as known.
-
-        `fit/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
-        """
+        """How many times as wide intervals are as at known hyper-parameters (`fit/widening.py`); 1.0 does without."""
         return float(self.settings.get("widening", 1.0))

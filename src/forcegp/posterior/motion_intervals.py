@@ -1,15 +1,8 @@
-"""Intervals of predicted motions that hold.
+"""Intervals of predicted motions that hold, from stretches of training time that were left out.
 
-Widths of intervals come from stretches of training time that were left out.
-A motion is wrong for more reasons than the functions that the data leave open: measured initial states, noise of u, and
-whatever the model cannot be. At horizon h, with the spread s of sampled functions and the root mean square r of errors
-of left-out motions, the half width of the 95 % interval of joint j is
-
-    c_hj 1.96 sqrt(s_hj^2 + r_hj^2),
-
-where c_hj makes the interval hold 95 % of the left-out motions (split conformal prediction with normalised scores: Lei,
-G'Sell, Rinaldo, Tibshirani & Wasserman 2018, "Distribution-free predictive inference for regression", JASA 113).
-Without samples the same holds with s = 0 and a factor of its own. Between horizons, numbers are linear in time.
+The half width of joint j at horizon h is c_hj 1.96 sqrt(s_hj^2 + r_hj^2), with the spread s of sampled functions (0
+without), the rms r of errors, and c_hj that makes it hold 95 % of the left-out motions (split conformal prediction: Lei
+et al. 2018, JASA 113). Between horizons, numbers are linear in time.
 """
 
 from collections.abc import Mapping
@@ -27,11 +20,7 @@ DEVIATIONS = 1.959963984540054  # of a normal distribution, which hold 95 % of i
 
 @dataclass(frozen=True, eq=False)
 class MotionIntervals:
-    """Widths by horizon [s], of q and v: `rms` in their units, `factors` with samples of functions and without.
-
-    Where a base moves, those of q belong to steps in its axes. `inputs` are the columns of u of these motions: some may
-    hold what an observer found.
-    """
+    """Widths by horizon [s] of q (or steps from it) and v: `rms`, and `factors` with samples and without."""
 
     horizons: Float[np.ndarray, " H"]
     rms: Float[np.ndarray, "H 2 nv"]

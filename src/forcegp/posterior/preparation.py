@@ -69,11 +69,7 @@ def prepared_predictor(
 
 
 def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingData:
-    """The training rows with the inputs of another system, such as one without the switches of contacts.
-
-    A wrench that an observer reports was 0 where nothing observed it. Raises InvalidInput for other inputs that they
-    lack.
-    """
+    """The training rows with another model's inputs, 0 for an observed wrench; InvalidInput for others."""
     had = trained.inputs
     if model.inputs == had:
         return training
@@ -111,10 +107,9 @@ def _compressed(
 def sample_states(
     training: TrainingData, space: ConfigurationSpace, count: int, seed: int, rows: int
 ) -> list[Float[Tensor, "_ size"]]:
-    """q, v and u of states of three kinds: `rows` training rows, or all, and a third of `count` of the others each.
+    """q, v, u: `rows` training rows, and a third of `count` each of two other kinds of states around them.
 
-    These are rows moved by a fraction of the difference of two others; and positions, velocities and forces of
-    different rows together.
+    Rows moved by a fraction of the difference of two others; and positions, velocities and forces of different rows.
     """
     generator = torch.Generator().manual_seed(seed)
     states = [training.q, training.v, training.u]

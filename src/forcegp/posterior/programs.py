@@ -1,9 +1,7 @@
-"""Predictions of a posterior as programs: one graph, traced once, and what is compiled of it, kept on disk.
+"""Predictions of a posterior as programs: one graph, traced once, and what is compiled of it.
 
-The Python code that `predict` runs is traced (`codegen.tracing`); processes are C functions that the graph calls
-(`inference.kernel_sums`). From the one graph come the mean, its Jacobians, the covariance and loops of steps, each
-compiled when it is first asked for. A step calls the program of the acceleration; the implicit one is Newton's method
-with its exact Jacobian, shortened where it overshoots.
+Processes are C functions that the graph calls (`inference.kernel_sums`). From it come the mean, its Jacobians, the
+covariance and loops of steps, each compiled when it is first asked for.
 """
 
 from collections.abc import Sequence
@@ -95,13 +93,9 @@ class Physics:
     ) -> list[Tensor]:
         """[lambda, b - A a, r, s, t, H, G], by which derivatives do not go through factors and pseudo-inverses.
 
-        With the acceleration, the multiplier and what is `left` of b - A a (redundant contacts) held,
-
-            r = Q - M a + A^T lambda,  s = b - A a,  t = A^T left,
-            da = H dr + G (ds + G^T dt),  G = M^-1 A^T (A M^-1 A^T)^+
-
-        which is implicit differentiation, and for `left` the derivative of a pseudo-inverse of constant rank (Golub &
-        Pereyra, SIAM J. Numer. Anal. 10, 1973, eq. 4.12).
+        With the acceleration, the multiplier and what is `left` of b - A a held, r = Q - M a + A^T lambda, s = b - A a
+        and t = A^T left: da = H dr + G (ds + G^T dt), G = M^-1 A^T (A M^-1 A^T)^+ (implicit differentiation; for `left`
+        Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973, eq. 4.12).
         """
         dynamics = self.model.dynamics(q, v, u)
         A, lower, inverse = dynamics.A, dynamics.inverse_lower, dynamics.pseudo_inverse
@@ -137,9 +131,9 @@ class Traced(NamedTuple):
 
 @dataclass(eq=False)
 class Programs:
-    """The programs of a posterior in a model, and their C text; `example` are one state's q, v and u (1, size).
+    """The programs of a posterior in a model; `example` is one state (1, size).
 
-    Raises InvalidInput, when something is traced, for what no graph holds.
+    InvalidInput for what no graph holds.
     """
 
     physics: Physics
@@ -333,10 +327,7 @@ class Programs:
         return RowFunction(library, inputs, outputs, self.tables(kind))
 
     def loops(self, integrator: str, samples: int = 0, seed: int = 0) -> list[RowFunction] | None:
-        """Over the mean or each drawn function; None where one has no form in pieces, or no such step is written in C.
-
-        Raises CompilerError.
-        """
+        """Over the mean or each drawn function; None without such a step or form. Raises CompilerError."""
         if integrator not in steps_of(self.space):
             return None
         if not samples:
@@ -345,5 +336,3 @@ class Programs:
             return None
         first = codes[0].function(integrator)
         return [first.with_tables(code.tables()) for code in codes]
-
-

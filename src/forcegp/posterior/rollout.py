@@ -45,10 +45,7 @@ AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0) -> AccelerationFunction:
-    """The mean acceleration of a `Posterior` at states (n, nv) of this model.
-
-    With `samples`, that of so many functions drawn from it, each at n / samples of the states.
-    """
+    """The mean acceleration of a `Posterior` at states (n, nv), or of `samples` functions, each at its part."""
     prior, standardize = posterior.trained.unknown, posterior.likelihood.standardization
     samples = samples if len(posterior.kernels.kernels) else 0  # without unknown forces all functions are the same
     latent, functions = posterior.latent, mean_function(posterior.latent)
@@ -114,9 +111,8 @@ def fused(
 ) -> Trajectory:
     """`integrate`, by compiled loops; each takes as many motions as the others, one after the other.
 
-    Several motions stand in the lanes of vector registers, with no Python per step, on several threads. Those that a
-    loop cannot carry to the end, because they diverge, because Newton's method fails, or because they leave the range
-    of a table, are integrated again by torch, with those of the other loops from the same place.
+    Those that a loop cannot carry to the end (they diverge, Newton's method fails, a table ends) are integrated again
+    by torch, with those of the other loops from the same place.
     """
     check_start(v, dt)
     own, (steps, count, _) = len(q) // len(loops), u.shape
@@ -173,11 +169,10 @@ class Rollout:
         return found.reshape(*self.q.shape[:-1], -1)
 
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
-        """Lower and upper ends (..., T+1, nv) of the 95 % interval.
+        """Lower and upper ends (..., T+1, nv) of the 95 % interval: calibrated, or quantiles of the samples.
 
-        Of a model with calibrated intervals (`forcegp.fit.calibrated`) those, centred on the mean; else the
-        quantiles of the samples. Where a base moves, ends of q are steps from q: another motion lies within where
-        `low <= robot.difference(rollout.q, other) <= high`. Raises InvalidInput where there is neither.
+        Of q where a base moves, as steps: `low <= robot.difference(rollout.q, other) <= high`. InvalidInput where there
+        is neither.
         """
         if self.intervals is None:
             low, high = self.quantiles((0.025, 0.975), quantity)
@@ -189,17 +184,13 @@ class Rollout:
         return center - half, center + half
 
     def std(self, quantity: Quantity = "q") -> Tensor:
-        """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.
-
-        Of q where a base moves, that of steps (..., T+1, nv).
-        Raises InvalidInput for a rollout with fewer than two samples.
-        """
+        """Standard deviation over two samples or more, NaN from where one diverged; of steps where a base moves."""
         return self._sampled(quantity, least=2).std(0)
 
     def quantiles(self, levels: Sequence[float] = (0.025, 0.5, 0.975), quantity: Quantity = "q") -> Tensor:
-        """Quantiles (levels, ...) over the samples; NaN from where one sample diverged. Where a base moves, of steps.
+        """Quantiles (levels, ...) over the samples, NaN from where one diverged.
 
-        Raises InvalidInput for a rollout without samples, or levels outside 0 to 1.
+        InvalidInput for levels not in 0 to 1.
         """
         if not all(0.0 <= level <= 1.0 for level in levels):
             raise InvalidInput(f"quantile levels are {tuple(levels)}; each must be from 0 to 1.")
@@ -320,10 +311,7 @@ def _flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedb
 def checked_start(
     sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
 ) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, size), u (T, n, size) as float64 tensors on the robot's device, and the batch dimensions.
-
-    Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
-    """
+    """q0, v0 (n, size), u (T, n, size), and the batch; InvalidInput, with `remedy` also for tensors with gradients."""
     given = {}
     for size, (name, values) in zip(sizes, (("q0", q0), ("v0", v0), ("u", u)), strict=True):
         tensor = given[name] = state_tensor(name, values, size, device).to(device)
@@ -349,9 +337,8 @@ def checked_start(
 class StepLinearization(NamedTuple):
     """The state (q, v) after a step from x = (q, v) under u, and the affine model of the step: x+ = A x + B u + c.
 
-    `q`, `v` (nv,); `A` (2 nv, 2 nv) and `B` (2 nv, nu) are the derivatives in x and u, and `c` (2 nv,) = x+ - A x - B u
-    makes the model exact at this x and u. All with the leading dimension of states. Where a base moves, q in x and x+
-    is a step (nv,) from the given q and from the `q` (nq,) here, at which both are 0.
+    `A` (2 nv, 2 nv), `B` (2 nv, nu), `c` (2 nv,), all with the leading dimension of states. Where a base moves, q in x
+    and x+ is a step (nv,) from the given q and from the `q` (nq,) here, at which both are 0.
     """
 
     q: Tensor

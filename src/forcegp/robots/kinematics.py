@@ -1,20 +1,12 @@
 """One kinematics pass over a batch of states, from which every dynamic and geometric quantity is read.
 
-A twist is the 3x4 matrix ``[[w]x, v]`` (the upper rows of an element of se(3)), with ``w`` the angular velocity and
-``v`` the velocity of the body point that passes the origin. The pseudo-inertia of a body in the world is
-``P_w = T P T^T``. With both,
+A twist is the 3x4 matrix S = [[w]x, v]. With pseudo-inertias P in the world and accelerations A_k = T''_k T_k^-1,
 
-    M_ij   = < S_i, S_j P_c,j >      for joint i above or equal to joint j, P_c,j summed over what joint j moves
-    tau_i  = < S_i, sum_k A_k P_k >  over the bodies k that joint i moves
+    M_ij = < S_i, S_j P_c,j > for i above j,    tau_i = < S_i, sum_k A_k P_k >
 
-where <., .> is the sum of products of entries and ``A_k = T''_k T_k^-1`` the acceleration of body k. These are the
-composite-rigid-body and recursive Newton-Euler algorithms (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6
-and 5) with their recursions over the tree written as products with the (n, n) descendant matrix.
-
-Tensors over joints or bodies have shape (n, rows, columns, batch): joints lead, so that sums over the tree are single
-matrix products; the batch, flattened to one dimension, trails, so that products of thousands of 4x4 matrices are
-vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the batch in front). All functions compose
-differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated differentiation apply.
+(composite rigid bodies, recursive Newton-Euler: Featherstone 2008, ch. 6 and 5), recursions over the tree as products
+with the (n, n) descendant matrix. Tensors over bodies are (n, rows, columns, batch): a trailing batch is vectorised 4
+to 5 times faster than `torch.bmm`. No branches on values, so vmap, jacrev, jacfwd and repeated derivatives apply.
 """
 
 from collections.abc import Callable
@@ -30,8 +22,7 @@ from forcegp.robots.arguments import JointValues, Vector, broadcast_batch, check
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
 from forcegp.robots.manifold import Group, pose
-from forcegp.robots.structure import RobotStructure
-from forcegp.robots.tree import Tree
+from forcegp.robots.structure import RobotStructure, Tree
 
 Bodies = Float[Tensor, "n 4 4 batch"]
 """A 4x4 matrix of every body: its pose or its pseudo-inertia."""
@@ -130,11 +121,7 @@ def _group_vectors(group: Group, body: Float[Tensor, "4 4 batch"]) -> Float[Tens
 def body_accelerations(
     tree: Tree, twists: Twists, v: Float[Tensor, "n batch"], a: Float[Tensor, "n batch"] | None = None
 ) -> Twists:
-    """Accelerations ``A = T'' T^-1`` of all bodies, without gravity; ``a`` of None is zero.
-
-    With V the body's and V_p its parent body's twist, ``A = A_p + (V_p + V) S v + S a``: differentiating ``T' = V T``
-    twice along a chain, the bracket and the squared terms collapse to that one product.
-    """
+    """A = A_p + (V_p + V) S v + S a of all bodies, without gravity, from their twists; ``a`` of None is 0."""
     moving = twists * v[:, None, None]
     step = product(over_tree(tree.velocity_sum, moving)[:, :, :3], moving)
     if a is not None:
@@ -149,12 +136,9 @@ def world_inertias(poses: Bodies, inertias: Float[Tensor, "n 4 4 #batch"]) -> Bo
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
+    """Poses, twists and accelerations at states (q, v), made by ``robot.kinematics(q, v)``; its fields are internal.
 
-    All methods are differentiable in q, v and their arguments. Batch dimensions broadcast. Methods that need velocities
-    raise :class:`~forcegp.errors.InvalidInput` if the kinematics was made without.
-
-    The fields are internal: the batch is flattened and trails.
+    Methods are differentiable, broadcast, and raise InvalidInput where they need velocities and it was made without.
     """
 
     robot: RobotStructure
@@ -223,9 +207,7 @@ class Kinematics:
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
         """Joint forces per unit of the standard parameters of each body (..., nv, bodies, 10), armature left out.
 
-        A body is what a joint moves as one, also a joint that mimics another: its child link and all that is fixed to
-        it. Parameters are about the origin and in the axes of the child link, in the order of
-        :func:`forcegp.robots.inertia.standard_basis`.
+        A body is what a joint moves as one; parameters are in the frame of the child link (`inertia.standard_basis`).
         """
         a = self.robot.checked_input("a", a)
         at = self._expanded("a", a.shape[:-1])
@@ -244,10 +226,7 @@ class Kinematics:
     def dynamics_of_bodies(
         self, parameters: Float[Tensor, "bodies 10"]
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
-        """Mass matrix and bias forces for any standard parameters of the bodies, as :meth:`torque_regressor` has them.
-
-        No body need have the parameters, so the mass matrix need not be positive definite.
-        """
+        """Mass matrix and bias forces for standard parameters of the bodies, which no body need have."""
         frames = self._child_frames()
         pseudo = frames @ pseudo_inertia_of_standard(parameters) @ frames.mT
         inertias = world_inertias(self.poses, pseudo[..., None])
@@ -272,10 +251,7 @@ class Kinematics:
         return at._rows(jacobian @ tree.coupling if tree.coupled else jacobian.contiguous())
 
     def frame_bias_acceleration(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6"]:
-        """Classical acceleration (..., 6) of a ``point`` fixed in ``frame`` at zero joint acceleration.
-
-        This is ``Jdot v`` for :meth:`frame_jacobian`: [linear; angular], in m/s^2 and rad/s^2, without gravity.
-        """
+        """Jdot v (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], m/s^2 and rad/s^2, no gravity."""
         at, body, position = self._world_point(frame, point)
         accelerations, _ = at._moving("frame_bias_acceleration")
         if body == WORLD:

@@ -1,28 +1,9 @@
 """Which body carries which link, in what order the joints come, and whether all of it is a tree.
 
-Movable joints are numbered depth first, children in the order in which their joints stand in the file. (Pinocchio
-visits children alphabetically; map by joint name when comparing.) Each of them moves a *body*: its child link and all
-links fixed to it. A body's frame is the child link's frame turned so that its z axis is the joint axis, which makes
-every joint a rotation about or a translation along z.
-
-A joint that mimics another one moves a body, too, but has no coordinate of its own (:mod:`forcegp.robots.layout`). The
-positions of the bodies' joints are ``G q + g`` with q those of the ``nv`` others; without mimic joints G is the
-identity and body i is that of joint i.
-
-A joint of several degrees of freedom stands for as many joints and bodies, one after the other, which all move together
-(:mod:`forcegp.robots.manifold`). The last of them carries the links; the bodies of the others are empty.
-
-A mimic joint moves its body by ``multiplier q + offset`` with q the position of another joint, or of the one that this
-one mimics in turn. With G from the coordinates to the joints of all bodies,
-
-    M = G^T M_all G,    bias = G^T bias_all,    J = J_all G,
-
-exact, and with the inertia that the other joint feels of it. Nothing is elastic, and nothing slips.
-
-A URDF begins at a root link, and nothing in the format tells an arm on a table from a robot that walks, drives or
-flies. To weld such a robot to the world would answer with wrong forces and no word. So the question is asked where
-links that stand still have mass, no link called world holds them by a fixed joint, and names speak of two legs, wheels
-or rotors, of a pelvis, or of something that flies (measured: benchmarks/robot_files.py).
+Movable joints are numbered depth first, children in file order (Pinocchio's: alphabetical). Each moves a body: its
+child link, turned so that z is the joint axis, and what is fixed to it. Of a joint of several degrees of freedom the
+last body carries the links. A mimic joint moves by ``multiplier q + offset``: with G from coordinates to joints of all
+bodies, M = G^T M_all G, bias = G^T bias_all, J = J_all G, exactly.
 """
 
 import re
@@ -42,9 +23,9 @@ from forcegp.errors import (
     UnsupportedJoint,
     require_known,
 )
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.manifold import MOTIONS, Group
-from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import FREE, MOVABLE, Joint, RobotDescription, free_joint
 
 BaseChoice = Literal["fixed", "floating", "planar", "spherical"]
@@ -68,15 +49,15 @@ def check_choice(base: str | None) -> None:
 
 
 def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
-    """Report a robot that nobody said is bolted to the world, unless that was done.
+    """Report a robot that nobody said is bolted to the world, where names speak of legs, wheels, rotors or flight.
 
-    ``standing`` are the links that do not move, the root first.
+    ``standing`` are the links that do not move, the root first (measured: benchmarks/robot_files.py).
     """
     if not standing:
         return  # nothing stands still
     root, still = standing[0], set(standing)
     mass = sum(inertial.mass for name in standing if (inertial := description.links[name]))
-    asked = "base" in problems.given or any(isinstance(error, UnstatedBase) for error in problems.errors)
+    asked = "base" in problems.given
     if asked or mass == 0.0:  # one that is NaN or negative is a mistake, and no sign of a robot that is bolted
         return
     holding = {joint.type for joint in description.joints if joint.parent == root}
@@ -106,10 +87,7 @@ class Drive(NamedTuple):
 def followed(
     description: RobotDescription, locked: Mapping[str, float], problems: Problems
 ) -> tuple[dict[str, float], dict[str, tuple[str, float, float]]]:
-    """Joints that stand still, with their positions, and of mimic joints the one that they follow in the end.
-
-    A joint that follows a locked or fixed one stands still, as does one with a multiplier of 0.
-    """
+    """Positions of joints that stand still, and of mimic joints the one that they follow in the end."""
     by_name = {joint.name: joint for joint in description.joints}
     held: dict[str, float] = dict(locked)
     drives: dict[str, tuple[str, float, float]] = {}
@@ -240,10 +218,7 @@ class Layout:
 def lay_out(
     description: RobotDescription, locked: Mapping[str, float], base: BaseChoice | None, problems: Problems
 ) -> Layout:
-    """Order the joints, turn ``locked`` ones into fixed ones and merge fixed links into the bodies that carry them.
-
-    Raises what makes the joints no tree; ``problems`` collects the others, as if their remedies were applied.
-    """
+    """Order the joints and merge links that are fixed or locked; raises what makes them no tree, collects the rest."""
     _check_locked(description, locked)
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)

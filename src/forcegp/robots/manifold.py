@@ -1,17 +1,13 @@
 """Joints of several degrees of freedom, and positions that are points of a manifold instead of vectors.
 
-| joint | q | v |
+| joint | q | v, of the child link in its own axes |
 |---|---|---|
 | floating | position of the child link (m), quaternion x, y, z, w | linear, then angular velocity |
 | planar | x, y (m), cos and sin of the angle | linear velocity along x and y, angular velocity |
 | spherical | quaternion x, y, z, w | angular velocity |
 
-Velocities are those of the child link in its own axes, as in Pinocchio. So `q' = q V` with V constant in the body, and
-the motion under a constant v is the exponential of v: `integrate`, whose inverse is `difference`.
-
-Pose and twist share one order of coordinates here, [linear; angular]. Formulas of the exponential of SE(3) and of the
-derivative of its logarithm: Sola, Deray & Atchuthan, "A micro Lie theory for state estimation in robotics" (2018),
-appendices B and D; Hairer, Lubich & Wanner, "Geometric Numerical Integration" (2006), eq. III.4.1 and lemma III.4.2.
+Formulas: Sola, Deray & Atchuthan, "A micro Lie theory for state estimation in robotics" (2018), appendices B and D;
+Hairer, Lubich & Wanner, "Geometric Numerical Integration" (2006), eq. III.4.1 and lemma III.4.2.
 """
 
 from collections.abc import Callable, Sequence
@@ -56,10 +52,7 @@ MOTIONS = {
 
 @dataclass(frozen=True)
 class Group:
-    """One such joint in a robot: its kind, its first entries of v and of q, and the first of its bodies.
-
-    It has as many bodies as entries of v, which all move together; the last of them carries the links.
-    """
+    """One such joint: its kind, its first entries of v and of q, and its first body, of as many as entries of v."""
 
     name: str
     kind: str
@@ -178,8 +171,8 @@ class ConfigurationSpace:
     def midpoint_acceleration(self, step: Tensor, a: Tensor, still: Tensor) -> Tensor:
         """The acceleration (..., nv) that belongs to :meth:`midpoint_step`, from those at the middle: `a`, and at rest.
 
-        What the velocity adds (a - still) acts for the stretched step; the rest, such as gravity, for the step as it
-        is, with what the middle hides of it across the axis of the turn given back. So a free body falls exactly.
+        What the velocity adds acts for the stretched step, the rest for the step as it is: so a free body falls
+        exactly.
         """
 
         def corrected(group: Group) -> Tensor:
@@ -212,11 +205,7 @@ class ConfigurationSpace:
         return self._joined(lambda _, places: q[..., places], unit)
 
     def check(self, q: Float[Tensor, "*batch nq"]) -> None:
-        """Raise InvalidInput, naming the entries, where a quaternion, or cos and sin, is far from length 1.
-
-        Inside `torch.func.vmap`, and where code is written, no number can be looked at; there only the direction counts
-        (:func:`pose`).
-        """
+        """Raise InvalidInput for a turn far from length 1, except inside `vmap` and where code is written."""
         for group in self.groups:
             turn = group.motion.turn
             length = torch.linalg.vector_norm(q.detach()[..., group.places][..., turn], dim=-1).flatten()
@@ -326,10 +315,7 @@ def difference(kind: str, start: Float[Tensor, "*batch positions"], end: Float[T
 def chart_velocity(
     kind: str, step: Float[Tensor, "*#batch velocities"], v: Float[Tensor, "*#batch velocities"]
 ) -> Tensor:
-    """d step / dt where `q0 integrated by step` moves with body velocity v: ad / (1 - exp(-ad)) v.
-
-    The series stops at the tenth power of ad: its error is below 1e-11 |v| for steps that turn by less than .5 rad.
-    """
+    """d step / dt where `q0 integrated by step` moves with velocity v: ad / (1 - exp(-ad)) v, to the tenth power."""
     motion = MOTIONS[kind]
     own, moved = _parts(motion, step), _parts(motion, v)
     total = torch.cat(moved, -1)
@@ -343,10 +329,8 @@ def chart_velocity(
 def cayley(kind: str, step: Float[Tensor, "*batch velocities"]) -> Tensor:
     """The step whose exponential is the Cayley transform (1 - ad/2)^-1 (1 + ad/2) of `step`, equal to third order.
 
-    It turns by 2 atan(t/2) for an angle t, about the same axis. The implicit midpoint rule in body axes keeps quadratic
-    invariants, and with this transform p+ = Ad* p for the momentum p of a free body: energy and momentum stay exactly
-    what they are (Lewis & Simo, "Conserving algorithms for the dynamics of Hamiltonian systems on Lie groups",
-    J. Nonlinear Sci. 1994; that 6 x 6 Cayley transforms are in SE(3): Selig, "Cayley maps for SE(3)", 2007).
+    With it the implicit midpoint rule keeps energy and momentum of a free body (Lewis & Simo, J. Nonlinear Sci. 1994;
+    that 6 x 6 Cayley transforms are in SE(3): Selig, "Cayley maps for SE(3)", 2007).
     """
     motion = MOTIONS[kind]
     linear, angular = _parts(motion, step)
@@ -357,10 +341,7 @@ def cayley(kind: str, step: Float[Tensor, "*batch velocities"]) -> Tensor:
 
 
 def _stretch(motion: Motion, step: Tensor) -> Tensor:
-    """By how much a step has to be longer for its Cayley transform to carry the centre of mass as far as it is fast.
-
-    2 / (1 + sqrt(1 - t^2)) for a turn of t; turns of almost 1 rad and more are stretched no further.
-    """
+    """2 / (1 + sqrt(1 - t^2)) for a turn of t, up to 1 rad: the centre of mass then goes as far as it is fast."""
     _, angular = _parts(motion, step)
     return 2.0 / (1.0 + torch.sqrt((1.0 - (angular * angular).sum(-1, keepdim=True)).clamp_min(0.04)))
 

@@ -7,9 +7,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
 from forcegp.robots.manifold import MOTIONS
-from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_parts
 
@@ -30,10 +30,7 @@ class LoopDescription:
 
 @dataclass(frozen=True)
 class Motor:
-    """What one unit of an actuator's input does: joint forces by joint, or a wrench on a link.
-
-    The wrench is a force [N] and a torque [Nm] about the origin of the link, in its axes.
-    """
+    """Joint forces by joint, or a wrench (N, Nm) about the origin of a link, of one unit of an actuator's input."""
 
     name: str
     column: dict[str, float]
@@ -208,11 +205,7 @@ class CompiledModel:
         return not any(kinds)
 
     def _motors(self) -> tuple[Motor, ...]:
-        """All motors, where some act at sites of bodies that move or turn a ball joint; at sites as wrenches.
-
-        Of an actuator with a law of its own, such as a servo, the input is the force on its joint, under the joint's
-        name. What drives no single joint, such as a tendon, is left out.
-        """
+        """All motors, where some act at sites or turn a ball joint; of a servo the input is its joint force."""
         model, found, taken, needed = self.model, [], set[str](), False
         for k in range(model.nu):
             gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])

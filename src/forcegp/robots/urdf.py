@@ -1,9 +1,4 @@
-"""Strict URDF reader: XML text -> plain description. Everything that could be silently wrong is an error.
-
-Format: http://wiki.ros.org/urdf/XML. Defaults are those of the format (origin: identity, axis: x); a missing
-``<limit>`` means no limit. Visual, collision, transmission, sensor and simulator elements are ignored (and kept when
-written back). Problems are collected (:mod:`forcegp.robots.problems`), so that one report names all of them.
-"""
+"""URDF text -> plain description (http://wiki.ros.org/urdf/XML). What could be silently wrong is a collected error."""
 
 import difflib
 import math
@@ -22,8 +17,8 @@ from forcegp.errors import (
     UnsafeXml,
     UnsupportedJoint,
 )
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
-from forcegp.robots.problems import Problems
 
 MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
@@ -36,10 +31,7 @@ DEFINITIONS = ("}arg", "}property", "}macro")
 
 
 def well_formed(text: str) -> str:
-    """The text, or where it is no XML, what other readers of robot files make of it.
-
-    Comments may hold anything, and attributes need no space between them.
-    """
+    """The text, or where it is no XML, what other readers make of it: any comments, no spaces between attributes."""
     if text.count("<") > MOST_TAGS:
         return text  # refused where it is read
     try:
@@ -91,10 +83,7 @@ def numbers(values: Iterable[float]) -> str:
 
 
 def refuse_xacro(root: Element, source: str) -> None:
-    """Macros, and expressions in what is read; those inside of <gazebo>, <sensor> or <visual> change no dynamics.
-
-    Nor do definitions that an expanded file still holds.
-    """
+    """Refuse macros, and expressions in what is read; not in <gazebo> or <visual>, nor definitions."""
     owners = [owner for owner in root if owner.tag in ("link", "joint")]
     read = [*owners, *(inner for owner in owners for part in owner if part.tag in MECHANICS for inner in part.iter())]
     left = DEFINITIONS if root.find("link") is not None else ()
@@ -121,10 +110,7 @@ ENDS = ("parent", "child")
 
 @dataclass(frozen=True)
 class InertialDescription:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), both in the axes of the link frame.
-
-    An inertia that the file does not give is NaN.
-    """
+    """Mass (kg), centre of mass (m), inertia about it (kg m^2; NaN if not given), in the axes of the link frame."""
 
     mass: float
     center_of_mass: np.ndarray
@@ -195,11 +181,6 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
             links[link] = _inertial(part, _Place(f"link {link!r}", source, problems))
     if not links:
         raise MalformedUrdf(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
-    root = _undefined_root(element, set(links))
-    if root is not None:
-        links = {root: None} | links
-        seen = f"{source}: the link {root!r} is a parent, and the file does not define it"
-        problems.errors.append(MalformedUrdf(seen, ". It can be the root, fixed in the world.", {"root": root}))
     joints = []
     for joint, part in parts.items():
         with problems.collected():
@@ -219,13 +200,6 @@ def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
                 raise MalformedUrdf(seen, f"; {kind} names must be unique, rename one.")
             found[name] = element
     return found
-
-
-def _undefined_root(element: Element, links: set[str]) -> str | None:
-    """The one parent that the file does not define, if everything hangs on it."""
-    parents, children = ({part.get("link", "") for part in element.iterfind(f"joint/{end}")} for end in ENDS)
-    undefined = (parents | children) - links
-    return None if len(undefined) != 1 or undefined & children or links - children else undefined.pop()
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,4 @@
-"""URDF files: read and written in the encoding that they declare; inertials and friction replaced in the text.
-
-Published URDFs break the triangle inequality at times (rounded numbers, unconstrained identification). With the second
-moments ``Sigma = tr(I)/2 1 - I`` about the centre of mass a body has the inertia I if and only if Sigma is positive
-semi-definite (:mod:`forcegp.robots.inertia`). The nearest one minimises ``|I' - I|_F``. Both matrices have the same
-axes and ``|dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2`` for changes s of the eigenvalues of Sigma, so it is a projection in
-three variables.
-"""
+"""URDF files in the encoding that they declare; inertials, friction and impossible inertias replaced in the text."""
 
 import contextlib
 import json
@@ -16,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float
@@ -34,9 +26,9 @@ from forcegp.errors import (
     UnreadableRobotFile,
     required_extra,
 )
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
-from forcegp.robots.problems import Problems
 from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, without_comments
 
 UNREADABLE = "\ufffd"
@@ -100,10 +92,7 @@ def write_text(text: str, path: Path) -> None:
 def replace_inertial(
     text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
 ) -> str:
-    """URDF text with the ``<inertial>`` element of ``link`` replaced or added, with digits that read back exactly.
-
-    ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, axes of the link frame.
-    """
+    """URDF text with the ``<inertial>`` (kg, m, kg m^2, link axes) of ``link`` replaced or added, read back exactly."""
     data = text.encode("utf-8")
     parts = [f"  {part}".encode() for part in inertial_parts(mass, center_of_mass, inertia)]
     element = [b"<inertial>", *parts, b"</inertial>"]
@@ -115,10 +104,7 @@ def replace_inertial(
 
 
 def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
-    """URDF text with attributes of the ``<dynamics>`` element of ``joint`` replaced or added ('damping', 'friction').
-
-    Attributes that are not named stay, with digits that read back exactly.
-    """
+    """URDF text with attributes ('damping', 'friction') of the ``<dynamics>`` of ``joint`` replaced or added."""
     data = text.encode("utf-8")
     unknown = UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
     head, dynamics = _find(data, "joint", joint, "dynamics", unknown)
@@ -140,10 +126,7 @@ REST_OF_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
 def _find(
     data: bytes, kind: str, name: str, part: str, unknown: UnknownName
 ) -> tuple[tuple[int, int], tuple[int, int] | None]:
-    """Byte offsets (first, one past last) of an element's start tag, and of the element ``part`` directly in it.
-
-    Raises ``unknown`` where there is no such element.
-    """
+    """Byte offsets (first, one past last) of an element's start tag, and of ``part`` in it; raises ``unknown``."""
     parser = expat.ParserCreate("utf-8")
     depth = 0
     inside = False
@@ -212,9 +195,9 @@ MARGIN = 1e-3
 
 
 def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The nearest inertia about the centre of mass (kg m^2) that a body of positive thickness can have.
+    """The nearest inertia I (kg m^2), in |I' - I|_F, of a body whose second moments are at least `MARGIN` of their sum.
 
-    Second moments are at least `MARGIN` of the sum of those that were positive.
+    A projection in three variables: |dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2 for changes s of the second moments.
     """
     moments, axes = np.linalg.eigh(inertia)
     second = 0.5 * moments.sum() - moments
@@ -234,11 +217,9 @@ def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def with_chosen_inertias(
     choice: str, text: str, description: RobotDescription, layout: Layout, problems: Problems
 ) -> tuple[str, RobotDescription]:
-    """URDF text and its description with possible inertias for impossible ones of moving links; every other byte stays.
+    """URDF text and description with possible inertias for impossible ones of moving links; every other byte stays.
 
-    With "strict" `problems` collects these links, and the text stays. With "nearest" it notes them, with the relative
-    change; a link without mass loses its inertia. What the inertia alone cannot mend (a negative mass) is collected in
-    both cases. Raises InvalidInput for another choice.
+    With "strict" `problems` collects these links, with "nearest" it notes them. Raises InvalidInput for another choice.
     """
     if choice not in get_args(InertiaChoice):
         raise InvalidInput(f"inertias is {choice!r}; give one of {', '.join(get_args(InertiaChoice))}.")
@@ -293,11 +274,6 @@ IN_THE_FILE = (
 )
 
 
-def with_root(text: str, root: str) -> str:
-    """URDF text that defines the link ``root``, which it does not name as one."""
-    return before_the_end(text, f"<link name={quoteattr(root)}/>\n")
-
-
 def before_the_end(text: str, added: str) -> str:
     """URDF text with more before its last tag, a comment for example."""
     end = text.rindex("</robot")
@@ -308,10 +284,7 @@ COMMENT = "<!-- rotor inertias (armature), which URDF has no element for, stand 
 
 
 def read_robot_file(path: str | Path) -> str:
-    """URDF text of a file, whose macros are expanded where it is called .xacro.
-
-    Raises UnreadableRobotFile, MissingExtra without the package xacro, and MalformedUrdf where it fails.
-    """
+    """URDF text of a file, .xacro expanded. Raises UnreadableRobotFile, MissingExtra, MalformedUrdf."""
     text = read_text(path)
     if Path(path).suffix != ".xacro":
         return text
