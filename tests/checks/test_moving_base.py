@@ -154,31 +154,6 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
     assert "--feet" in carried.advice
 
 
-@pytest.mark.parametrize("push", ["unknown", "logged", "none"])
-def test_a_base_that_drives_although_nothing_drives_it(push):
-    """Newton's law in the axes of a plate of 2 kg: m (v' + w x v) = f."""
-    time = np.arange(1000) / 200
-    v = np.stack([np.sin(2 * time), np.cos(3 * time), 0.5 * np.sin(time)], axis=1)
-    if push == "none":  # one velocity of the world, seen from a plate that turns
-        angle = 0.5 * (1 - np.cos(time))
-        v[:, :2] = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
-    robot = Robot.from_urdf_text(BODY, base="planar")
-    q = [robot.neutral()]
-    for step in torch.tensor(v[:-1] + np.diff(v, axis=0) / 2) / 200:
-        q.append(robot.integrate(q[-1], step))
-    a = np.gradient(v, time, axis=0)
-    force = robot.mass * (a[:, :2] + v[:, 2:] * np.stack([-v[:, 1], v[:, 0]], axis=1))
-    driven = push == "logged"
-    known = (*[Actuation(np.eye(3, 2), ("x", "y"))] * driven, RigidBodies())
-    log = Dataset(q=torch.stack(q).numpy(), v=v, u=force if driven else np.zeros((1000, 0)), a=a, time=time,
-                  model=Model(robot, (), known))  # fmt: skip
-    found = [each for each in quick_check(log) if each.about == "base force"]
-    assert len(found) == (push == "unknown")
-    if found:
-        assert "--wheels" in found[0].advice
-        assert found[0].numbers["force"] == pytest.approx(np.median(np.linalg.norm(force, axis=1)), rel=0.05)
-
-
 @pytest.mark.parametrize(("order", "shift"), [("wxyz", -1), ("xyzw", 1)])
 def test_the_order_of_quaternions_of_a_robot_that_stays_upright(order, shift):
     """Its rates are a small part of its speed, and either order of the log may have been stated."""

@@ -38,10 +38,12 @@ def test_json_holds_the_same(forcegp, file):
 
 
 def test_joints_that_stand_still_are_shown_as_locked(forcegp, file):
-    hung = '<link name="odom"/><joint name="root" type="planar"><parent link="odom"/><child link="{}"/></joint></robot>'
+    hung = (
+        '<link name="odom"/><joint name="root" type="floating"><parent link="odom"/><child link="{}"/></joint></robot>'
+    )
     root = CHAIN.split('<link name="')[1].split('"')[0]
     file.write_text(CHAIN.replace("</robot>", hung.format(root)))
-    assert "root (planar)" in forcegp("robot", file).stdout
+    assert "root (floating)" in forcegp("robot", file).stdout
     shown = forcegp("robot", file, "--base", "fixed").stdout
     assert "root (locked)" in shown
     assert shown.count("(locked)") == 1

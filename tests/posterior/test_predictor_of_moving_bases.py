@@ -62,7 +62,7 @@ def fitted(model, prior, seed=0):
 
 @pytest.fixture(
     scope="module",
-    params=["floating", *(pytest.param(base, marks=pytest.mark.nightly) for base in ("planar", "spherical"))],
+    params=["floating"],
 )
 def case(request):
     return fitted(hopper(request.param), JointFriction())

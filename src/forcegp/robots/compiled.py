@@ -33,7 +33,7 @@ from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.robots.arguments import broadcast_batch
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.layout import WORLD, Drive
-from forcegp.robots.manifold import MOTIONS, pose
+from forcegp.robots.manifold import NEUTRAL, pose
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure
 
 Scalars: TypeAlias = np.ndarray[Any, np.dtype[np.object_]]
@@ -47,7 +47,7 @@ ROUNDING = 1e-15
 
 @dataclass(frozen=True)
 class UnrolledJoint:
-    """A degree of freedom: velocity `axis` of the six of body `rows[-1]`; `kind` is that of a group."""
+    """A degree of freedom: velocity `axis` of the six of body `rows[-1]`."""
 
     parent: int
     axis: int
@@ -56,7 +56,6 @@ class UnrolledJoint:
     drive: Drive
     rows: range
     positions: slice
-    kind: str | None
 
     @property
     def revolute(self) -> bool:
@@ -82,11 +81,10 @@ class UnrolledRobot:
                 axis, rows = 2 if joint.type == "prismatic" else 5, range(body, body + 1)
                 positions = slice(place, place + 1)
             else:
-                axis, rows = group.motion.free[body - group.body], range(group.bodies.start, group.bodies.stop)
+                axis, rows = body - group.body, range(group.bodies.start, group.bodies.stop)
                 positions = group.places
             rotation, offset = (self._scalars(torch.as_tensor(part)) for part in (origin[:3, :3], origin[:3, 3]))
-            kind = None if group is None else group.kind
-            joints.append(UnrolledJoint(parent, axis, rotation, offset, drive, rows, positions, kind))
+            joints.append(UnrolledJoint(parent, axis, rotation, offset, drive, rows, positions))
         self.joints: tuple[UnrolledJoint, ...] = tuple(joints)
         self.coupled = layout.coupled
         merged = tree.inertias[..., 0]
@@ -97,7 +95,7 @@ class UnrolledRobot:
     @property
     def constants(self) -> list[object]:
         """All that decides the code."""
-        found: list[object] = [(joint.parent, joint.axis, joint.kind, *joint.drive) for joint in self.joints]
+        found: list[object] = [(joint.parent, joint.axis, *joint.drive) for joint in self.joints]
         found += [x.tolist() for joint in self.joints for x in (joint.rotation, joint.origin)]
         return [*found, self.gravity.tolist(), self.armature.tolist(), [body.tolist() for body in self.inertias]]
 
@@ -133,9 +131,9 @@ class UnrolledKinematics:
         self.rotations: list[Scalars] = []  # body axes -> parent's axes
         self.origins: list[Scalars] = []  # body's origin in the parent's frame
         for i, joint in enumerate(unrolled.joints):
-            if joint.kind is not None:
+            if len(joint.rows) > 1:
                 if i == joint.rows[0]:
-                    rotation, origin = _pose(joint.kind, q[joint.positions])
+                    rotation, origin = _pose(q[joint.positions])
                     self.rotations += [joint.rotation @ rotation] * len(joint.rows)
                     self.origins += [joint.origin + joint.rotation @ origin] * len(joint.rows)
                 continue
@@ -268,10 +266,10 @@ class UnrolledKinematics:
         return symmetric(np.block([[second, column], [column.T, mass]]))
 
 
-def _pose(kind: str, q: Any) -> tuple[Scalars, Scalars]:
-    """Rotation (3, 3) and translation (3,) of a joint of several degrees of freedom, by the code of the robot's."""
-    example = torch.tensor(MOTIONS[kind].neutral, dtype=torch.float64)
-    _, (rotation, origin) = trace(lambda x: pose(kind, x), [example], q[0].graph, q)
+def _pose(q: Any) -> tuple[Scalars, Scalars]:
+    """Rotation (3, 3) and translation (3,) of a floating joint, by the code of the robot's."""
+    example = torch.tensor(NEUTRAL, dtype=torch.float64)
+    _, (rotation, origin) = trace(pose, [example], q[0].graph, q)
     return expressions(q[0].graph, rotation), expressions(q[0].graph, origin)
 
 

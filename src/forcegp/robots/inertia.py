@@ -142,9 +142,8 @@ def axis_inertia_vanishes(pseudo: np.ndarray) -> bool:
     return bool(second_moments[:2].sum() <= SINGULAR * second_moments.sum())
 
 
-def turns_with_inertia(kind: str, pseudo: np.ndarray) -> bool:
-    """Whether a body (pseudo-inertia (4, 4)) under a joint of several degrees of freedom resists every turn."""
+def turns_with_inertia(pseudo: np.ndarray) -> bool:
+    """Whether a body (pseudo-inertia (4, 4)) that moves freely resists every turn."""
     first, mass = pseudo[:3, 3], pseudo[3, 3]
-    second = pseudo[:3, :3] - (0.0 if kind == "spherical" else np.outer(first, first) / mass)
-    least = second[0, 0] + second[1, 1] if kind == "planar" else np.linalg.eigvalsh(second)[1]
+    least = np.linalg.eigvalsh(pseudo[:3, :3] - np.outer(first, first) / mass)[1]
     return bool(least > SINGULAR * pseudo.diagonal()[:3].sum())

@@ -103,7 +103,7 @@ def _replaced(tree: Tree, values: Tensor, of_group: Callable[[Group], Tensor]) -
 
 
 def _group_pose(group: Group, q: Float[Tensor, "nq batch"]) -> Float[Tensor, "1 4 4 batch"]:
-    rotation, origin = pose(group.kind, q[group.places].mT)
+    rotation, origin = pose(q[group.places].mT)
     upper = torch.cat([rotation, origin[..., None]], -1).movedim(0, -1)
     last = q.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, q.shape[-1])
     return torch.cat([upper, last])[None]
@@ -115,7 +115,7 @@ def _group_vectors(group: Group, body: Float[Tensor, "4 4 batch"]) -> Float[Tens
     axes = rotation.movedim(1, 0)  # (3, 3, batch), one axis in the world each
     moments = torch.linalg.cross(origin.expand_as(axes), axes, dim=1)
     linear = torch.cat([torch.zeros_like(axes), axes], dim=1)
-    return torch.cat([linear, torch.cat([axes, moments], dim=1)])[list(group.motion.free)]
+    return torch.cat([linear, torch.cat([axes, moments], dim=1)])
 
 
 def body_accelerations(

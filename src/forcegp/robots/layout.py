@@ -25,11 +25,11 @@ from forcegp.errors import (
 )
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
-from forcegp.robots.manifold import MOTIONS, Group
-from forcegp.robots.urdf import FREE, MOVABLE, Joint, RobotDescription, free_joint
+from forcegp.robots.manifold import POSITIONS, VELOCITIES, Group
+from forcegp.robots.urdf import MOVABLE, Joint, RobotDescription, free_joint
 
-BaseChoice = Literal["fixed", "floating", "planar", "spherical"]
-"""How the root link is held: "fixed" in the world, free, free in the plane z = 0, or free to turn about its origin."""
+BaseChoice = Literal["fixed", "floating"]
+"""How the root link is held: in the world, or not at all."""
 
 WORLDS = ("world", "map", "odom", "ground", "universe")
 WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
@@ -95,7 +95,7 @@ def followed(
         multiplier, offset, at, passed = 1.0, 0.0, joint, {joint.name}
         while at.mimics is not None and at.name not in locked:
             above = by_name.get(at.mimics.joint)
-            if above is None or above.name in passed or above.type in FREE:
+            if above is None or above.name in passed or above.type == "floating":
                 problems.errors.append(_objection(description.source, joint, at, above is not None))
                 multiplier, offset = 0.0, 0.0
                 break
@@ -139,9 +139,6 @@ def with_followers(
 WORLD = -1
 BASE = "base"
 """Name of the joint between the world and a base that moves."""
-BASES: tuple[BaseChoice, ...] = ("floating", "planar")
-"""Joints by which a file itself holds its base."""
-BOLTED: BaseChoice = "fixed"
 OUTSIDE = "(world)"
 """What carries such a base; no link of the robot."""
 MOST_BODIES = 1000
@@ -181,7 +178,7 @@ class Layout:
         last = 0
         for group in self.groups:
             names += [joint.name for joint in self.joints[last : group.rows.start]]
-            names += [f"{group.name}.{each}" for each in group.motion.positions]
+            names += [f"{group.name}.{each}" for each in POSITIONS]
             last = group.rows.stop
         return (*names, *(joint.name for joint in self.joints[last:]))
 
@@ -234,21 +231,15 @@ def lay_out(
     massive = any(inertial.mass for link in still if (inertial := description.links[link]))
     hung = root.lower() in WORLDS or not massive  # else such a joint carries something else than the robot itself
     below = [joint for link in still if hung for joint in children[link] if joint.name not in held]
-    own: dict[str, BaseChoice] = {joint.name: kind for joint in below for kind in BASES if kind == joint.type}
-    if own and base not in (None, "fixed", *own.values()):
-        other = next(iter(own))
-        raise InvalidInput(
-            f"{description.source}: base is {base!r}, and the file holds its base by joint {other!r} of type "
-            f"{own[other]!r}; leave base out, give 'fixed', or take that joint out of the file."
-        )
-    if base not in (None, "fixed") and not own:
+    own = {joint.name for joint in below if joint.type == "floating"}  # the file's own hold of its base
+    if base == "floating" and not own:
         links = {OUTSIDE: Placement(WORLD, np.eye(4))}
-        stack = [free_joint(BASE, str(base), OUTSIDE, root)]
+        stack = [free_joint(BASE, OUTSIDE, root)]
     while stack:
         joint = stack.pop()
         above = links[joint.parent]
         offset = above.offset @ joint.origin
-        free = joint.type in MOTIONS
+        free = joint.type == "floating"
         bolted = joint.name in own and base == "fixed"
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else joint_motion(joint, held.get(joint.name, 0.0))
@@ -257,10 +248,10 @@ def lay_out(
             rows, turn = [joint], transform(rotation_of_z_onto(joint.axis), np.zeros(3))
             if free:
                 row = sum(body.name not in drives for body in bodies)
-                place = row + sum(group.extra for group in groups)
-                groups.append(Group(joint.name, joint.type, row, place, len(bodies)))
-                rows = _rows_of(joint)
-                turn = turn if joint.type == "planar" else np.eye(4)
+                groups.append(Group(joint.name, row, row + len(groups), len(bodies)))
+                kinds = {each: "continuous" if each.startswith("r") else "prismatic" for each in VELOCITIES}
+                rows = [replace(joint, name=f"{joint.name}.{each}", type=kind) for each, kind in kinds.items()]
+                turn = np.eye(4)
             links[joint.child] = Placement(len(bodies) + len(rows) - 1, inverse(turn))
             bodies += rows
             parents += [above.body] * len(rows)
@@ -288,14 +279,8 @@ def lay_out(
         tuple(origins),
         {name: place for name, place in links.items() if name != OUTSIDE},
         tuple(groups),
-        base or (*own.values(), BOLTED)[0],
+        base or ("floating" if own else "fixed"),
     )
-
-
-def _rows_of(joint: Joint) -> list[Joint]:
-    """A joint of several degrees of freedom as one for each, called "base.x", "base.rz" and so on."""
-    kinds = {each: "continuous" if each.startswith("r") else "prismatic" for each in MOTIONS[joint.type].velocities}
-    return [replace(joint, name=f"{joint.name}.{each}", type=kind) for each, kind in kinds.items()]
 
 
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
@@ -304,7 +289,7 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
         require_known("joint", name, description.source, by_name, UnknownJoint)
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
-        if by_name[name].type in FREE and position != 0.0:
+        if by_name[name].type == "floating" and position != 0.0:
             raise InvalidInput(
                 f"{description.source}: joint {name!r} is {by_name[name].type}, so it can be locked at 0 alone."
             )

@@ -18,9 +18,9 @@ import numpy as np
 
 from forcegp.errors import MalformedMjcf, RobotModelError, UnreadableRobotFile, required_extra
 from forcegp.robots.arguments import Problems
-from forcegp.robots.inertia import inverse, rotation_of_z_onto, transform
+from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
-from forcegp.robots.manifold import MOTIONS
+from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.mjcf_model import WORLD, CompiledModel, LoopDescription, Translation
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml, well_formed
@@ -150,7 +150,7 @@ def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
 
 SMALLEST = 2e-15
 """kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
-KINDS = {"floating": "free", "spherical": "ball", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
+KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
 class _Axis(NamedTuple):
@@ -189,8 +189,8 @@ class MjcfWriter:
         """The whole file."""
         robot, root = self.robot, next(iter(self.robot.layout.links))
         named = {joint.name for joint in robot.description.joints}
-        if BASE in self.groups and self.groups[BASE].kind == robot.base and BASE not in named:
-            self._chain(free_joint(BASE, robot.base, OUTSIDE, root), np.eye(4), 2)
+        if BASE in self.groups and BASE not in named:
+            self._chain(free_joint(BASE, OUTSIDE, root), np.eye(4), 2)
         elif root == "world" and not self._mass(root):
             self.lines += [f"    {site}" for site in self.sites.get(root, ())]
             self._below(root, 2)
@@ -241,7 +241,7 @@ class MjcfWriter:
         joints = self._axes(joint)
         while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
             below = self._next(joint.child)
-            if len(below) != 1 or joint.type in ("floating", "spherical"):
+            if len(below) != 1 or joint.type == "floating":
                 raise RobotModelError(
                     f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
                     "two joints of one degree of freedom; give it a mass."
@@ -279,16 +279,10 @@ class MjcfWriter:
         ]
 
     def _axes(self, joint: Joint) -> list[_Axis]:
-        """A joint as MuJoCo's; a planar one is two slides and a hinge."""
-        if joint.type == "planar":
-            parts = (("x", "slide", (1.0, 0.0, 0.0)), ("y", "slide", (0.0, 1.0, 0.0)), ("rz", "hinge", (0.0, 0.0, 1.0)))
-            pose = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
-            return [_Axis(self._attributes(joint, f"{joint.name}.{x}", kind), pose, axis) for x, kind, axis in parts]
-        kind = KINDS[joint.type]
-        name = joint.name
-        first = f"{name}.{MOTIONS[joint.type].velocities[-1]}" if joint.type in MOTIONS else name
-        axis = None if joint.type in MOTIONS else joint.axis
-        return [_Axis(self._attributes(joint, name, kind, first), np.eye(4), axis)]
+        """A joint as MuJoCo's."""
+        free, name = joint.type == "floating", joint.name
+        rotor = f"{name}.{VELOCITIES[-1]}" if free else name
+        return [_Axis(self._attributes(joint, name, KINDS[joint.type], rotor), np.eye(4), None if free else joint.axis)]
 
     def _attributes(self, joint: Joint, name: str, kind: str, rotor: str | None = None) -> str:
         given = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}

@@ -29,6 +29,7 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import BaseChoice, check_base, check_choice, lay_out
+from forcegp.robots.manifold import TURN
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
@@ -332,7 +333,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return self.space.neutral().to(self.device)
 
     def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
-        """q with quaternions, and pairs of cos and sin, divided by their lengths. Raises InvalidInput for length 0."""
+        """q with quaternions divided by their lengths. Raises InvalidInput for length 0."""
         unit = self.space.normalized(checked_tensor("q", q, self.nq, f"positions of {self.name}", self.device))
         self.space.check(unit)
         return unit
@@ -348,10 +349,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         share = torch.rand(rows, self.nv, dtype=torch.float64, generator=generator)
         q = self.space.integrate(self.space.neutral(), lower + share * (upper - lower))
         for group in self.layout.groups:  # directions of Gaussian vectors are uniform
-            turn = torch.randn(
-                rows, len(group.motion.positions[group.motion.turn]), dtype=torch.float64, generator=generator
-            )
-            q[:, group.places][:, group.motion.turn] = turn
+            q[:, group.places][:, TURN] = torch.randn(rows, 4, dtype=torch.float64, generator=generator)
         return self.space.normalized(q).to(self.device)
 
     @override

@@ -303,8 +303,7 @@ class RobotStructure(Summary):
     @property
     def posture_names(self) -> tuple[str, ...]:
         """Names of the entries of :meth:`posture`."""
-        parts = {"floating": (*DOWN, "height"), "spherical": DOWN, "planar": ()}
-        names = [f"{group.name}.{part}" for group in self.layout.groups for part in parts[group.kind]]
+        names = [f"{group.name}.{part}" for group in self.layout.groups for part in (*DOWN, "height")]
         return (*names, *self.single_joint_names)
 
     def posture(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch postures"]:
@@ -315,11 +314,8 @@ class RobotStructure(Summary):
         down = self.tree.gravity / strength if bool(strength > 0.0) else q.new_tensor([0.0, 0.0, -1.0])
         parts: list[Tensor] = []
         for group in self.layout.groups:
-            rotation, origin = pose(group.kind, q[..., group.places])
-            if group.kind != "planar":
-                parts.append((rotation.mT @ down[:, None])[..., 0])
-            if group.kind == "floating":
-                parts.append(-(origin @ down)[..., None])
+            rotation, origin = pose(q[..., group.places])
+            parts += [(rotation.mT @ down[:, None])[..., 0], -(origin @ down)[..., None]]
         return torch.cat([*parts, self.space.singles(q)], -1)
 
     @property
@@ -399,7 +395,7 @@ class RobotStructure(Summary):
         if self.layout.groups:
             group = self.layout.groups[0]
             raise InvalidInput(
-                f"{what} need a base that is fixed; {self.name} has the {group.kind} joint {group.name!r}. Fitting, "
+                f"{what} need a base that is fixed; {self.name} has the floating joint {group.name!r}. Fitting, "
                 "prediction, identification, predictors and `posterior.rollout` work without."
             )
 
@@ -429,7 +425,7 @@ def bodies_without_inertia(
             seen = f"{link} moves with joint {name!r} but has no mass, and nor has what it carries"
             advice = "; add an <inertial> element, make the joint fixed, or lock it."
             found.append((drive.joint, MissingInertia(seen, advice, remedy)))
-        elif body in whole and not turns_with_inertia(whole[body].kind, pseudo[body]):
+        elif body in whole and not turns_with_inertia(pseudo[body]):
             seen = f"{link} turns with joint {name!r} but has no rotational inertia about some axis"
             found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))
         elif body not in whole and joint.type != "prismatic" and axis_inertia_vanishes(pseudo[body]):

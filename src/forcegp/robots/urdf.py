@@ -103,8 +103,6 @@ def refuse_xacro(root: Element, source: str) -> None:
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
 MOVABLE = ("revolute", "continuous", "prismatic")
-FREE = ("floating", "planar", "spherical")
-"""Joints of several degrees of freedom; the format has no spherical ones, which MJCF calls ball."""
 ENDS = ("parent", "child")
 
 
@@ -131,7 +129,7 @@ class Joint:
     """One ``<joint>``. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
 
     name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic', of a file also 'fixed' and those of `FREE`
+    type: str  # 'revolute' | 'continuous' | 'prismatic', of a file also 'fixed' and 'floating'
     parent: str
     child: str
     axis: tuple[float, float, float]  # unit vector in the joint frame
@@ -145,10 +143,10 @@ class Joint:
     mimics: Mimic | None
 
 
-def free_joint(name: str, kind: str, parent: str, child: str) -> Joint:
-    """A joint without limits and friction, at the origin of its parent; one that is planar moves along x and y."""
+def free_joint(name: str, parent: str, child: str) -> Joint:
+    """A floating joint without limits and friction, at the origin of its parent."""
     limits = (-math.inf, math.inf, math.inf, math.inf)
-    return Joint(name, kind, parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
+    return Joint(name, "floating", parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
 
 
 @dataclass(frozen=True)
@@ -325,7 +323,7 @@ def _inertial(link: Element, place: _Place) -> InertialDescription | None:
 
 def _joint(element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place) -> Joint:
     kind = _attribute(element, "type", place)
-    kinds = (*MOVABLE, "fixed", *FREE)
+    kinds = (*MOVABLE, "fixed", "floating")
     if kind not in kinds:
         close = difflib.get_close_matches(kind, kinds, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
@@ -342,10 +340,8 @@ def _joint(element: Element, name: str, links: dict[str, InertialDescription | N
             )
     origin = _origin(_optional_child(element, "origin", place), place)
     axis_element = _optional_child(element, "axis", place)
-    if kind == "planar" and axis_element is None:  # x by the format: a base that moves up the wall
-        place.problems.note("a planar joint without <axis> moves along x and y", place.owner)
-    axis = _vector(axis_element, "xyz", (0.0, 0.0, 1.0) if kind == "planar" else (1.0, 0.0, 0.0), place)
-    length, directed = float(np.linalg.norm(axis)), kind in (*MOVABLE, "planar")
+    axis = _vector(axis_element, "xyz", (1.0, 0.0, 0.0), place)
+    length, directed = float(np.linalg.norm(axis)), kind in MOVABLE
     if directed and not (math.isfinite(length) and length > 0.0):
         held = (place.problems.given.get("locked") or {}).get(name)
         if held != 0.0:
