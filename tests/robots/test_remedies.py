@@ -3,7 +3,6 @@
 import re
 import warnings
 
-import pinocchio as pin
 import pytest
 import torch
 from tests.robots.test_base import LOOSE
@@ -16,7 +15,6 @@ from forcegp.errors import (
 )
 from forcegp.robots import Robot
 from forcegp.robots.arguments import LISTED, Problems
-from forcegp.robots.urdf import without_comments
 
 FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'
 FRAME = '<link name="frame"/><joint name="slip" type="prismatic"><parent link="FL_foot"/><child link="frame"/></joint>'
@@ -101,36 +99,6 @@ def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
         robot = Robot.from_urdf_text(text, **caught.value.remedy)
     assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(2 * 0.1**2, rel=1e-12)
     assert robot.tree.equals(Robot.from_urdf_text(robot.to_urdf()).tree)
-
-
-NOT_XML = {
-    "dashes in a comment": changed("<link", "<!-- a -- b ---><link"),
-    "no space": changed('"hinge" type', '"hinge"type'),
-}
-
-
-@pytest.mark.parametrize("what", NOT_XML)
-def test_what_other_readers_take_though_it_is_no_xml(what):
-    text = NOT_XML[what].replace('izz="0.1"', 'izz="0.9"')
-    with pytest.raises(NonPhysicalInertia) as caught:
-        Robot.from_urdf_text(text)
-    with warnings.catch_warnings(action="ignore"):
-        robot = Robot.from_urdf_text(text, **caught.value.remedy)
-    assert robot.joint_names == ("hinge",)
-    assert Robot.from_urdf_text(robot.to_urdf()).tree.equals(robot.tree)
-    assert pin.buildModelFromXML(text).nv == 1
-
-
-def test_comments_are_cut_in_linear_time_and_keep_their_lines():
-    assert without_comments("a<!-- 1\n2 -->b<!--") == "a\nb<!--"
-    assert without_comments("<!--->-->") == ""
-    assert len(without_comments("<!--" * 200_000)) == 800_000  # each start was searched to the end of the text before
-
-
-def test_comments_need_not_have_the_encoding_of_the_file(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_bytes(changed("<link", "<!-- \N{DEGREE SIGN} --><link").encode("latin-1"))
-    assert Robot.from_urdf(path).joint_names == ("hinge",)
 
 
 def test_a_joint_without_direction_is_offered_to_be_locked():

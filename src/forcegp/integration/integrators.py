@@ -230,7 +230,7 @@ class ImplicitMidpoint(Integrator):
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
     A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method with derivatives by torch. On a
-    manifold by the Cayley transform: a tumbling body in free fall keeps its energy and momentum.
+    manifold q+ = q exp(dt v_m).
     """
 
     space: ConfigurationSpace = VECTORS
@@ -241,14 +241,10 @@ class ImplicitMidpoint(Integrator):
         half = 0.5 * dt
 
         def moved(at: Tensor, share: float) -> Tensor:
-            return self.space.integrate(q, share * self.space.midpoint_step(dt * at))
+            return self.space.integrate(q, share * dt * at)
 
         def residual(at: Tensor) -> Tensor:
-            middle = moved(at, 0.5)
-            a = acceleration(middle, at)
-            if self.space.groups:
-                a = self.space.midpoint_acceleration(dt * at, a, acceleration(middle, torch.zeros_like(at)))
-            return at - v - half * a
+            return at - v - half * acceleration(moved(at, 0.5), at)
 
         middle, found = find_roots(residual, v)
         return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)

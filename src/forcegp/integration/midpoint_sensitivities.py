@@ -107,7 +107,7 @@ def _step_by_step(
         moved = ImplicitMidpoint(space).step(lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
         ended &= moved.found
         middle = torch.where(ended[:, None], 0.5 * (v + moved.v), v)  # the others only stay finite
-        step = space.midpoint_step(h * middle)
+        step = h * middle
         positions.append(space.integrate(q, 0.5 * step))
         velocities.append(middle)
         q, v = space.integrate(q, step), 2.0 * middle - v
@@ -126,38 +126,26 @@ def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameter
 def _along(
     accelerations: Accelerations, q0: Tensor, u: Tensor, w: Tensor, h: float, parameters: bool
 ) -> tuple[Tensor, Tensor, Linear, Tensor, Tensor]:
-    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations, X and Y (K, T, ...)."""
-    space, nv = accelerations.space, w.shape[-1]
-    steps, path = space.midpoint_step(h * w), [q0]
-    for step in steps.unbind(1):
-        path.append(space.integrate(path[-1], step))
+    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations, X and Y (K, T, ...).
+
+    Derivatives of these accelerations are in the step from where a step begins and in its w.
+    """
+    space, nv, path = accelerations.space, w.shape[-1], [q0]
+    for at in w.unbind(1):
+        path.append(space.integrate(path[-1], h * at))
     q = torch.stack(path, dim=1)
-    start, end, middle = q[:, :-1], q[:, 1:], space.integrate(q[:, :-1], 0.5 * steps)
+    start, end, middle = q[:, :-1], q[:, 1:], space.integrate(q[:, :-1], 0.5 * h * w)
 
     def moved(z: Tensor) -> Tensor:
-        at, step = space.integrate(start, z[..., :nv]), space.midpoint_step(h * (w + z[..., nv:]))
-        ends = (
-            space.difference(middle, space.integrate(at, 0.5 * step)),
-            space.difference(end, space.integrate(at, step)),
-        )
-        return torch.cat(ends, dim=-1)
-
-    def accelerated(z: Tensor) -> Tensor:
-        at, a, still = z.split(nv, dim=-1)
-        return space.midpoint_acceleration(h * at, a, still)
+        at, step = space.integrate(start, z[..., :nv]), h * (w + z[..., nv:])
+        halfway = space.difference(middle, space.integrate(at, 0.5 * step))
+        return torch.cat([halfway, space.difference(end, space.integrate(at, step))], dim=-1)
 
     _, slopes = _jacobian(moved, w.new_zeros(*w.shape[:2], 2 * nv), 2 * nv)
     half, whole = slopes.split(nv, dim=-2)
-    both = _at(accelerations, torch.cat([middle] * 2), torch.cat([w, 0.0 * w]), torch.cat([u] * 2), parameters)
-    parts = ([None] * 2 if x is None else x.chunk(2) for x in (both.a, both.a_q, both.a_v, both.a_p))
-    fast, still = (Linear(*each) for each in zip(*parts, strict=True))
-    a, slopes = _jacobian(accelerated, torch.cat([w, fast.a, still.a], dim=-1), nv)
-    of_w, of_fast, of_still = slopes.split(nv, dim=-1)
-    at_middle = of_fast @ fast.a_q + of_still @ still.a_q
-    a_q, a_w = (at_middle @ part for part in half.split(nv, dim=-1))
-    a_p = None if fast.a_p is None or still.a_p is None else of_fast @ fast.a_p + of_still @ still.a_p
-    at = Linear(a, a_q, a_w + of_w + of_fast @ fast.a_v, a_p)
-    return q, middle, at, whole[..., :nv], whole[..., nv:]
+    at = _at(accelerations, middle, w, u, parameters)
+    a_q, a_w = (at.a_q @ part for part in half.split(nv, dim=-1))
+    return q, middle, Linear(at.a, a_q, a_w + at.a_v, at.a_p), whole[..., :nv], whole[..., nv:]
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], x: Tensor, size: int) -> tuple[Tensor, Tensor]:

@@ -126,36 +126,6 @@ class ConfigurationSpace:
         axes = torch.eye(self.nv, dtype=step.dtype, device=step.device).expand(*step.shape, -1)
         return self.chart_velocity(step[..., None, :].expand_as(axes), axes).mT
 
-    def midpoint_step(self, step: Tensor) -> Tensor:
-        """The step (..., nv) of the implicit midpoint rule whose body velocity times dt is `step` (:func:`cayley`)."""
-        if not self.groups:
-            return step
-
-        def turned(group: Group) -> Tensor:
-            own = step[..., group.rows]
-            return cayley(_stretch(own) * own)
-
-        return self._joined(lambda rows, _: step[..., rows], turned)
-
-    def midpoint_acceleration(self, step: Tensor, a: Tensor, still: Tensor) -> Tensor:
-        """The acceleration (..., nv) that belongs to :meth:`midpoint_step`, from those at the middle: `a`, and at rest.
-
-        What the velocity adds acts for the stretched step, the rest for the step as it is: so a free body falls
-        exactly.
-        """
-
-        def corrected(group: Group) -> Tensor:
-            own, rest = step[..., group.rows], still[..., group.rows]
-            stretch = _stretch(own)
-            angular = stretch * own[..., 3:]
-            square = (angular * angular).sum(-1, keepdim=True)
-            share = 0.25 / (1.0 + torch.sqrt(1.0 + 0.25 * square))  # (sqrt(1 + t^2/4) - 1) / t^2
-            across = [-torch.linalg.cross(angular, torch.linalg.cross(angular, part)) for part in _parts(rest)]
-            hidden = share * torch.cat(across, -1)
-            return rest + hidden + stretch * (a[..., group.rows] - rest)
-
-        return self._joined(lambda rows, _: a[..., rows], corrected)
-
     def neutral(self) -> Float[Tensor, "nq"]:
         """q at 0 for every joint, bases upright at the origin."""
         return self._joined(
@@ -262,25 +232,6 @@ def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6
     return total
 
 
-def cayley(step: Float[Tensor, "*batch 6"]) -> Tensor:
-    """The step whose exponential is the Cayley transform (1 - ad/2)^-1 (1 + ad/2) of `step`, equal to third order.
-
-    With it the implicit midpoint rule keeps energy and momentum of a free body (Lewis & Simo, J. Nonlinear Sci. 1994;
-    that 6 x 6 Cayley transforms are in SE(3): Selig, "Cayley maps for SE(3)", 2007).
-    """
-    linear, angular = _parts(step)
-    square = (angular * angular).sum(-1, keepdim=True)
-    along = (linear * angular).sum(-1, keepdim=True) * angular
-    linear = _arctangent(square) * linear + _advance(square) * along
-    return torch.cat([linear, _arctangent(square) * angular], -1)
-
-
-def _stretch(step: Tensor) -> Tensor:
-    """2 / (1 + sqrt(1 - t^2)) for a turn of t, up to 1 rad: the centre of mass then goes as far as it is fast."""
-    angular = step[..., 3:]
-    return 2.0 / (1.0 + torch.sqrt((1.0 - (angular * angular).sum(-1, keepdim=True)).clamp_min(0.04)))
-
-
 _BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
 """Of x / (1 - exp(-x)), from the first power on."""
 
@@ -312,8 +263,6 @@ _SINE = (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
 _VERSINE = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
 _REST = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
 _COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000)
-_ARCTANGENT = tuple((-0.25) ** n / (2 * n + 1) for n in range(9))
-_ADVANCE = tuple((-0.25) ** n * 2 * n / (2 * n + 1) for n in range(1, 10))
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 
 
@@ -337,12 +286,6 @@ _rest = partial(_smooth, series=_REST, closed=lambda t: (t - t.sin()) / t**3)
 """(t - sin t) / t^3."""
 _cotangent = partial(_smooth, series=_COTANGENT, closed=lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
 """(1 - t/2 cot(t/2)) / t^2."""
-_arctangent = partial(_smooth, series=_ARCTANGENT, closed=lambda t: 2.0 * torch.atan(0.5 * t) / t)
-"""2 atan(t/2) / t."""
-_advance = partial(
-    _smooth, series=_ADVANCE, closed=lambda t: (1.0 / (1.0 + 0.25 * t * t) - 2.0 * torch.atan(0.5 * t) / t) / t**2
-)
-"""(1 / (1 + t^2/4) - 2 atan(t/2) / t) / t^2: how much less a screw advances than it turns."""
 
 
 def _arc(sine_square: Tensor, cosine: Tensor) -> Tensor:

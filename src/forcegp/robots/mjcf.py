@@ -23,7 +23,7 @@ from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
 from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.mjcf_model import WORLD, CompiledModel, LoopDescription, Translation
 from forcegp.robots.structure import RobotStructure
-from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml, well_formed
+from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml
 from forcegp.robots.urdf_file import read_text
 
 DEEPEST = 300
@@ -74,7 +74,7 @@ def translate(text: str, path: Path | None, for_system: bool, problems: Problems
 
 def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:
     """Refuse files that exhaust memory or stack of MuJoCo's reader; ``included`` receives the files that they name."""
-    root = parse_xml(well_formed(text), source)
+    root = parse_xml(text, source)
     count, deepest = 0.0, 0
     stack = [(root, 1, 1.0)]
     while stack:

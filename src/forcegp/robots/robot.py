@@ -33,10 +33,9 @@ from forcegp.robots.manifold import TURN
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
-from forcegp.robots.urdf import parse_urdf, well_formed
+from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import (
     InertiaChoice,
-    before_the_end,
     read_armature,
     read_robot_file,
     read_text,
@@ -44,6 +43,7 @@ from forcegp.robots.urdf_file import (
     replace_inertial,
     with_chosen_inertias,
     with_comment,
+    with_note,
     write_robot_file,
     write_text,
 )
@@ -99,7 +99,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         Raises a subclass of RobotModelError with all that is wrong, and the arguments that mend it (its ``remedy``).
         """
         given = {"locked": locked, "inertias": inertias, "base": base}
-        return cls._made(well_formed(text.lstrip()), Problems(source, given), gravity, armature)
+        return cls._made(text.lstrip(), Problems(source, given), gravity, armature)
 
     @classmethod
     @usable_arguments("Robot.from_mjcf")
@@ -217,7 +217,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def _again(cls, text: str, source: str, gravity: Any, armature: Any, locked: Any, base: BaseChoice) -> "Robot":
         """Of a text that was warned of before."""
         given = {"locked": locked, "inertias": "strict", "base": base}
-        return cls._made(well_formed(text.lstrip()), Problems(source, given), gravity, armature, quiet=True)
+        return cls._made(text.lstrip(), Problems(source, given), gravity, armature, quiet=True)
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
@@ -280,7 +280,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     def with_note(self, note: str) -> "Robot":
         """The same robot, whose URDF text ends with this comment."""
-        return self.with_text(before_the_end(self.urdf_text, f"<!-- {note.replace('--', '- -')} -->\n"))
+        return self.with_text(with_note(self.urdf_text, note))
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text, written to ``path`` if given, and rotor inertias beside it, with a RobotFileWarning."""

@@ -24,37 +24,13 @@ MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
-TAG = re.compile(r"""<[A-Za-z_](?:[^<>"']|"[^"<]*"|'[^'<]*')*>""")
-VALUE = re.compile(r"""("[^"]*"|'[^']*')""")
 DEFINITIONS = ("}arg", "}property", "}macro")
 """Elements of xacro that add nothing by themselves."""
 
 
-def well_formed(text: str) -> str:
-    """The text, or where it is no XML, what other readers make of it: any comments, no spaces between attributes."""
-    if text.count("<") > MOST_TAGS:
-        return text  # refused where it is read
-    try:
-        SafeElementTree.fromstring(_with_prefixes(text.lstrip()))
-    except (ParseError, UnicodeError):
-        return TAG.sub(lambda tag: VALUE.sub(r"\1 ", tag[0]), without_comments(text))
-    except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
-        pass  # refused where it is read
-    return text
-
-
-def without_comments(text: str) -> str:
-    """The text with every comment cut but for its lines, so that errors name the place; in linear time."""
-    parts, place = [], 0
-    while (start := text.find("<!--", place)) >= 0 and (end := text.find("-->", start + 4)) >= 0:
-        parts += [text[place:start], "\n" * text.count("\n", start, end)]
-        place = end + 3
-    return "".join([*parts, text[place:]])
-
-
 def parse_xml(text: str, source: str) -> Element:
     """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
-    text = _with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
+    text = with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
     if text.count("<") > MOST_TAGS:
         raise MalformedUrdf(f"{source}: holds more than {MOST_TAGS} tags; give the URDF file of one robot.")
     if not text:
@@ -70,7 +46,7 @@ def parse_xml(text: str, source: str) -> Element:
         raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.") from None
 
 
-def _with_prefixes(text: str) -> str:
+def with_prefixes(text: str) -> str:
     """The text with declarations for prefixes such as ``drake:``, which readers of URDF do not ask for."""
     used = set(re.findall(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]", text)) - {"xml", "xmlns"}
     declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(used) if f"xmlns:{prefix}" not in text)

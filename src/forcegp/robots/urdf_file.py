@@ -1,16 +1,14 @@
 """URDF files in the encoding that they declare; inertials, friction and impossible inertias replaced in the text."""
 
-import contextlib
 import json
-import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
-from xml.parsers import expat
 
 import numpy as np
+from defusedxml import minidom
 from jaxtyping import Float
 
 from forcegp.atomic_files import write_bytes, write_json
@@ -29,9 +27,8 @@ from forcegp.errors import (
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
-from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, without_comments
+from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
 
-UNREADABLE = "\ufffd"
 HEAVIEST = 1e9
 """kg and kg m^2, of one link: far from where products of inertias overflow."""
 LARGEST_FILE = 16 << 20
@@ -64,9 +61,6 @@ def read_text(path: str | Path) -> str:
     try:
         return data.decode(encoding)
     except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
-        with contextlib.suppress(ValueError, LookupError):  # comments are written in any language
-            if UNREADABLE not in (text := without_comments(data.decode(encoding, errors="replace"))):
-                return text
         raise UnreadableRobotFile(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'
@@ -93,90 +87,45 @@ def replace_inertial(
     text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
 ) -> str:
     """URDF text with the ``<inertial>`` (kg, m, kg m^2, link axes) of ``link`` replaced or added, read back exactly."""
-    data = text.encode("utf-8")
-    parts = [f"  {part}".encode() for part in inertial_parts(mass, center_of_mass, inertia)]
-    element = [b"<inertial>", *parts, b"</inertial>"]
-    head, inertial = _find(data, "link", link, "inertial", UnknownLink(f"{source}: no link {link!r} in the URDF text."))
-    if inertial is None:
-        return _with_child(data, head, b"link", element)
-    first, last = inertial
-    return (data[:first] + _line_start(data, first).join(element) + data[last:]).decode("utf-8")
+    document, owner = _found(text, "link", link, UnknownLink(f"{source}: no link {link!r} in the URDF text."))
+    parts = "".join(inertial_parts(mass, center_of_mass, inertia))
+    new = minidom.parseString(f"<inertial>{parts}</inertial>").documentElement
+    old = _child(owner, "inertial")
+    owner.replaceChild(new, old) if old else owner.appendChild(new)
+    return _written(document)
 
 
 def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
     """URDF text with attributes ('damping', 'friction') of the ``<dynamics>`` of ``joint`` replaced or added."""
-    data = text.encode("utf-8")
-    unknown = UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
-    head, dynamics = _find(data, "joint", joint, "dynamics", unknown)
-    if dynamics is None:
-        attributes = " ".join(f'{name}="{value!r}"' for name, value in values.items())
-        return _with_child(data, head, b"joint", [f"<dynamics {attributes}/>".encode()])
-    first, last = dynamics
-    element = data[first:last].decode("utf-8")
+    document, owner = _found(text, "joint", joint, UnknownJoint(f"{source}: no joint {joint!r} in the URDF text."))
+    dynamics = _child(owner, "dynamics") or owner.appendChild(document.createElement("dynamics"))
     for name, value in values.items():
-        written = f' {name}="{value!r}"'
-        element, found = re.subn(rf"\s{name}\s*=\s*(\"[^\"]*\"|'[^']*')", written, element, count=1)
-        element = element if found else element.replace("<dynamics", f"<dynamics{written}", 1)
-    return (data[:first] + element.encode() + data[last:]).decode("utf-8")
+        dynamics.setAttribute(name, repr(value))
+    return _written(document)
 
 
-REST_OF_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
+def with_note(text: str, note: str) -> str:
+    """URDF text with a comment before its last tag."""
+    document = minidom.parseString(with_prefixes(text))
+    document.documentElement.appendChild(document.createComment(f" {note.replace('--', '- -')} "))
+    return _written(document)
 
 
-def _find(
-    data: bytes, kind: str, name: str, part: str, unknown: UnknownName
-) -> tuple[tuple[int, int], tuple[int, int] | None]:
-    """Byte offsets (first, one past last) of an element's start tag, and of ``part`` in it; raises ``unknown``."""
-    parser = expat.ParserCreate("utf-8")
-    depth = 0
-    inside = False
-    found: list[int] = []
-    child: list[int] = []
-
-    def after_tag(position: int) -> int:
-        tag = REST_OF_TAG.match(data, position)
-        assert tag is not None, "the text is well-formed"
-        return tag.end()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, inside
-        position = parser.CurrentByteIndex
-        depth += 1
-        if depth == 2 and tag == kind and attributes.get("name") == name:
-            inside = True
-            found.extend((position, after_tag(position)))
-        elif inside and depth == 3 and tag == part:
-            child.append(position)
-
-    def end(tag: str) -> None:
-        nonlocal depth, inside
-        if inside and depth == 3 and tag == part:
-            child.append(after_tag(parser.CurrentByteIndex))
-        inside = inside and depth > 2
-        depth -= 1
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.Parse(data, True)
-    if not found:
-        raise unknown
-    return (found[0], found[1]), ((child[0], child[1]) if child else None)
+def _found(text: str, kind: str, name: str, unknown: UnknownName) -> tuple[Any, Any]:
+    """The document, and one of the elements directly in its root; raises ``unknown``."""
+    document: Any = minidom.parseString(with_prefixes(text))
+    for element in document.documentElement.childNodes:
+        if element.nodeName == kind and element.getAttribute("name") == name:
+            return document, element
+    raise unknown
 
 
-def _with_child(data: bytes, head: tuple[int, int], kind: bytes, lines: Sequence[bytes]) -> str:
-    """The text with one more element, of these lines, in the element whose start tag has the offsets ``head``."""
-    line_start, head_end = _line_start(data, head[0]), head[1]
-    element = b"".join(line_start + b"  " + line for line in lines)
-    before, after = data[:head_end], data[head_end:]
-    if before.endswith(b"/>"):  # <link name="tool"/> has no inside yet
-        before, after = before[:-2].rstrip() + b">", line_start + b"</" + kind + b">" + after
-    return (before + element + after).decode("utf-8")
+def _child(owner: Any, tag: str) -> Any:
+    return next((part for part in owner.childNodes if part.nodeName == tag), None)
 
 
-def _line_start(data: bytes, position: int) -> bytes:
-    """The end of a line of this text, and the indentation of the line of that offset."""
-    line = data[data.rfind(b"\n", 0, position) + 1 : position]
-    return (b"\r\n" if b"\r\n" in data else b"\n") + (b"" if line.strip() else line)
+def _written(document: Any) -> str:
+    return "".join(node.toxml() for node in document.childNodes) + "\n"
 
 
 def inertial_parts(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> list[str]:
@@ -274,13 +223,7 @@ IN_THE_FILE = (
 )
 
 
-def before_the_end(text: str, added: str) -> str:
-    """URDF text with more before its last tag, a comment for example."""
-    end = text.rindex("</robot")
-    return f"{text[:end]}{added}{text[end:]}"
-
-
-COMMENT = "<!-- rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json -->\n"
+COMMENT = "rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json"
 
 
 def read_robot_file(path: str | Path) -> str:
@@ -327,7 +270,7 @@ def with_comment(text: str, armature: Mapping[str, float], *, source: str, stack
         RobotFileWarning,
         stacklevel=stacklevel,
     )
-    return text if COMMENT in text else before_the_end(text, COMMENT)
+    return text if COMMENT in text else with_note(text, COMMENT)
 
 
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:
