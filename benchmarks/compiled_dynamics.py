@@ -33,8 +33,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.casadi_dynamics import QUANTITIES, CasadiLoops
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot
-from forcegp.robots.compiled import CompiledRobot, trace_dynamics
-from forcegp.robots.compiled import UnrolledRobot
+from forcegp.robots.compiled import CompiledRobot, UnrolledRobot, trace_dynamics
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 

@@ -12,7 +12,7 @@ from forcegp import JointFriction, fit, load_posterior, save_posterior
 from forcegp.data.views import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated as with_intervals
-from forcegp.posterior.motion_intervals import DEVIATIONS, MotionIntervals
+from forcegp.posterior.fitted import DEVIATIONS, MotionIntervals
 from forcegp.scores.motions import inside_interval, interval_about
 
 HORIZONS = (0.1, 0.25, 0.5)

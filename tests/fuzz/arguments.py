@@ -485,7 +485,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "ComputedTorque": (
         functools.partial(_control, forcegp.ComputedTorque, lambda: arm_model(0)),
-        lambda: {**TRACKING, "forces_at": "desired", "on_failure": "raise"},
+        lambda: {**TRACKING, "on_failure": "raise"},
     ),
     "PDGravity": (
         functools.partial(_control, forcegp.control.PDGravity, _robot),

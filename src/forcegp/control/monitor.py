@@ -1,9 +1,9 @@
 """Contacts that nobody modelled, from motion and torque alone: `ContactMonitor`."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,16 +11,14 @@ from jaxtyping import Bool, Float
 from scipy.signal import lfilter
 from scipy.stats import chi2, gumbel_r
 from torch import Tensor
-from typing_extensions import override
 
 from forcegp.control.tracking import Moving, joint_forces, model_of
-from forcegp.errors import DatasetError, InvalidInput, require_known
+from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.integration.integrators import check_time_step
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_array
-from forcegp.summary import Summary
 
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
@@ -57,7 +55,7 @@ class ContactPlace:
     also: tuple[str, ...]
 
 
-class ContactMonitor(Summary):
+class ContactMonitor:
     """A momentum observer around a model of the forces: what moves the robot beyond it is a contact.
 
     tau = M a - Q_K - Q_U in the middle of a step of `dt` s, filtered to first order with `bandwidth` Hz (De Luca &
@@ -67,14 +65,7 @@ class ContactMonitor(Summary):
     and a monitor that was not calibrated, DatasetError for free motion that is too short.
     """
 
-    def __init__(
-        self,
-        model: Moving,
-        *,
-        dt: float,
-        bandwidth: float = 5.0,
-        covariance: Literal["noise", "noise and posterior"] | None = None,
-    ) -> None:
+    def __init__(self, model: Moving, *, dt: float, bandwidth: float = 5.0) -> None:
         self.model, plain = model, model_of(model)
         plain.robot.require_vectors("monitors of contacts")
         if plain.contacts:
@@ -82,12 +73,7 @@ class ContactMonitor(Summary):
                 "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
                 "motion, or give posterior.with_contacts([])."
             )
-        known = not (isinstance(model, Predictor) and model.kind != "none")
-        covariance = ("noise" if known else "noise and posterior") if covariance is None else covariance
-        require_known("covariance", covariance, "ContactMonitor", ("noise", "noise and posterior"))
-        self.open = covariance != "noise"
-        if self.open and known:
-            raise InvalidInput(f"covariance={covariance!r} needs posterior.predictor() with a covariance.")
+        self.open = isinstance(model, Predictor) and model.kind != "none"
         check_time_step(dt)
         if not (isinstance(bandwidth, int | float) and 0.0 < bandwidth < 0.5 / dt):
             raise InvalidInput(f"bandwidth is {bandwidth!r}; give Hz above 0 and below {0.5 / dt:g}, half the rate.")
@@ -98,12 +84,6 @@ class ContactMonitor(Summary):
         self.threshold = math.inf
         self._maxima = (0.0, 1.0)
         self.restart()
-
-    @override
-    def facts(self) -> Mapping[str, object]:
-        """Whether and how it is calibrated."""
-        threshold = "not calibrated" if self.noise is None else f"{self.threshold:.3g}"
-        return {"robot": self.robot.name, "bandwidth": f"{self.bandwidth:g} Hz", "threshold": threshold}
 
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""

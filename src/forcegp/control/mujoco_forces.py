@@ -2,7 +2,6 @@
 
 import ctypes
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import mujoco as untyped
 import numpy as np
 import torch
-from typing_extensions import override
 
 from forcegp.codegen.c_writer import c_text, filled
 from forcegp.codegen.library import load_library
@@ -18,14 +16,13 @@ from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
-from forcegp.summary import Summary
 
 mujoco: Any = untyped
 STATES = 5  # random ones, at which robots are compared
 ALIKE = 1e-6  # relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF
 
 
-class MujocoForces(Summary):
+class MujocoForces:
     """What was learned of a robot's forces, as MuJoCo's passive force: `with MujocoForces(predictor, model): ...`.
 
     Within the context every `mj_step`, `mj_forward` and `mujoco.rollout` of this process adds them, on any number of
@@ -72,11 +69,6 @@ class MujocoForces(Summary):
         self._held = [each.tables() for each in codes]
         self._tables = [(ctypes.c_void_p * max(1, len(held)))(*(x.data_ptr() for x in held)) for held in self._held]
         self._chosen, self._active, self._failed = self._tables[0], False, False
-
-    @override
-    def facts(self) -> Mapping[str, object]:
-        """The robot, and how many functions there are."""
-        return {"robot": self.predictor.posterior.model.robot.name, "functions": self.draw or "the mean"}
 
     def use(self, number: int) -> None:
         """Take this of the drawn functions from now on; call it between two steps."""

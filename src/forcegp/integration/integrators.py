@@ -308,14 +308,12 @@ def integrate(
     *,
     feedback: Feedback | None = None,
     what: str = "motions",
-    progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Carry n states through T steps of `dt` seconds; u[k] + feedback(k, q[k], v[k]) acts from row k to row k + 1.
 
     A motion that is no longer finite, faster than `SPEED_LIMIT`, or that the integrator cannot carry on, is NaN from
-    there, and a NumericalWarning names `what`. `acceleration` and `feedback` see finite states only; `progress(step,
-    steps)` is called after every step. Differentiable in q0, v0, u and what `feedback` adds. InvalidInput for a dt that
-    is no positive number or a start beyond the limit.
+    there, and a NumericalWarning names `what`. `acceleration` and `feedback` see finite states only. Differentiable
+    in q0, v0, u and what `feedback` adds. InvalidInput for a dt that is no positive number or a start beyond the limit.
     """
     check_start(v0, dt)
     q, v = q0, v0
@@ -343,8 +341,6 @@ def integrate(
             for rows in (rows_q, rows_v, rows_a):
                 rows += [torch.full_like(rows[-1], math.nan)] * (steps - k - 1)
             break
-        if progress is not None:
-            progress(k + 1, steps)
     warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
     return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at, not_found)
 

@@ -1,6 +1,6 @@
 """`Posterior`: what a fit knows of a model, as a value that predicts."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
@@ -211,7 +211,6 @@ class Posterior(Fitted):
         samples: int = 0,
         seed: int = 0,
         grad: bool = False,
-        progress: Callable[[int, int], None] | None = None,
     ) -> Rollout:
         """Where the robot goes from (q0, v0) under the forces u: the integrated mean acceleration.
 
@@ -221,7 +220,7 @@ class Posterior(Fitted):
         friction); `baumgarte` stabilises instead of the model's, None: not at all. feedback(k, q, v) -> (..., nv) adds
         to u, asked at the beginning of step k, with the batch dimensions of the motions. `samples` functions drawn from
         the posterior with `seed` are integrated, too. `grad` keeps the graph in q0, v0, u and what `feedback` adds.
-        `progress(step, steps)` is called.
+
 
         A motion that diverges is NaN from then on, `diverged_at` holds the row, and a NumericalWarning is given. Raises
         InvalidInput for arguments that do not fit, and tensors that require a gradient without `grad`.
@@ -235,7 +234,7 @@ class Posterior(Fitted):
         if self.model.memory.names:
             given = state_tensor("u", u, self.model.sizes[2], self.model.robot.device)
             u, feedback = remembering(self.model, given, dt, feedback)
-        how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed, "progress": progress}
+        how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed}
         moved = roll_out(self, model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
         return replace(moved, intervals=self.motion_intervals)
 

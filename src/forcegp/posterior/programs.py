@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from forcegp.codegen.c_writer import ROWS, Program, c_text, filled, head, sections, write_entry, write_function
-from forcegp.codegen.derivatives import jacobian
-from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph
+from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph, jacobian
 from forcegp.codegen.library import RowFunction, aligned, load_library, vector_unit
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput

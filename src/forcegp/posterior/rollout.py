@@ -28,7 +28,7 @@ from forcegp.integration.integrators import (
     warn_of_divergence,
 )
 from forcegp.model import Model
-from forcegp.posterior.motion_intervals import MotionIntervals
+from forcegp.posterior.fitted import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
 from forcegp.posterior.programs import steps_of
 from forcegp.robots.arguments import broadcast_batch, whole_number
@@ -221,7 +221,6 @@ def roll_out(
     samples: int,
     seed: int,
     grad: bool,
-    progress: Callable[[int, int], None] | None,
 ) -> Rollout:
     """What `Posterior.rollout` documents, under the stabilisation of `model`."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
@@ -231,26 +230,21 @@ def roll_out(
     q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u, remedy)
     steps = len(forces)
 
-    def run(copies: int, what: str, before: int) -> Rollout:
+    def run(copies: int, what: str) -> Rollout:
         shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
         given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
         loops, how = None, {}
         if feedback is None and not grad:
             loops = _loops(posterior, model, integrator, steps, copies, seed)
-        if progress is not None:
-            total = steps * (1 + bool(samples))
-            how["progress"] = lambda done, _: progress(before + done, total)
         if feedback is not None:
             how["feedback"] = _flat_feedback(feedback, shape, forces.shape[-1])
         found = moved(shape, loops, method, accelerations(posterior, model, copies, seed), *given, what=what, **how)
-        if loops and progress is not None:
-            progress(before + steps, total)
         time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
         return Rollout(time, *found, integrator, model)
 
     with torch.set_grad_enabled(grad), blas_threads(0):
-        mean = run(0, "rollouts", 0)
-        return replace(mean, samples=run(samples, "sampled rollouts", steps)) if samples else mean
+        mean = run(0, "rollouts")
+        return replace(mean, samples=run(samples, "sampled rollouts")) if samples else mean
 
 
 def remembering(

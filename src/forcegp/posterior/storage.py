@@ -21,7 +21,7 @@ from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_a
 from forcegp.evidence.training_data import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.model import Model
-from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.posterior import Posterior
 
 KIND = "forcegp posterior"

@@ -150,9 +150,11 @@ def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.nd
 
 
 def checked_point(point: Vector, device: torch.device) -> Tensor:
-    """A point (..., 3) in m as a float64 tensor on ``device``; :class:`~forcegp.errors.InvalidInput` for others."""
+    """A point (3,) in m as a float64 tensor on ``device``; InvalidInput for others."""
     if not isinstance(point, Tensor):
         point = torch.as_tensor(finite_vector("point", point, 3), device=device)
+    if point.dim() != 1:
+        raise InvalidInput(f"point has shape {tuple(point.shape)}; give one point (3,), x, y, z in m.")
     return checked_tensor("point", point, 3, "x, y, z in m", device)
 
 

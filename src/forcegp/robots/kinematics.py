@@ -10,7 +10,7 @@ to 5 times faster than `torch.bmm`. No branches on values, so vmap, jacrev, jacf
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -186,42 +186,33 @@ class Kinematics:
 
     def inverse_dynamics(self, a: JointValues) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
-        a = self.robot.checked_input("a", a)
-        at = self._expanded("a", a.shape[:-1])
-        _, v = at._moving("inverse_dynamics")
-        tree, a = self.robot.tree, _columns(a, at.batch_shape)
-        forces = at._joint_forces(body_accelerations(tree, at.twists, v, of_bodies(tree, a)), at.inertias)
-        return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
+        tree, a = self.robot.tree, self._given("a", a)
+        forces = self._joint_forces(self._accelerations(a), self.inertias)
+        return self._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
     def forward_dynamics(self, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
-        tau = self.robot.checked_input("tau", tau)
-        at = self._expanded("tau", tau.shape[:-1])
-        net = _columns(tau, at.batch_shape).mT - at._bias_forces(at.inertias)
+        net = self._given("tau", tau).mT - self._bias_forces(self.inertias)
         try:
-            factor = torch.linalg.cholesky(at._mass_matrix(at.inertias))
+            factor = torch.linalg.cholesky(self._mass_matrix(self.inertias))
         except torch.linalg.LinAlgError as error:
             raise NumericalError(NOT_POSITIVE_DEFINITE) from error
-        return at._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
+        return self._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
 
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
         """Joint forces per unit of the standard parameters of each body (..., nv, bodies, 10), armature left out.
 
         A body is what a joint moves as one; parameters are in the frame of the child link (`inertia.standard_basis`).
         """
-        a = self.robot.checked_input("a", a)
-        at = self._expanded("a", a.shape[:-1])
-        _, v = at._moving("torque_regressor")
-        tree = self.robot.tree
-        accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, _columns(a, at.batch_shape)))
-        frames = product(at.poses, self._child_frames()[..., None])
+        tree, accelerations = self.robot.tree, self._accelerations(self._given("a", a))
+        frames = product(self.poses, self._child_frames()[..., None])
         basis, columns = standard_basis(self.robot.device), []
         for k in range(len(frames)):  # tau_i = tr((S_i T)^T (A_k - g) T P), P row by row
             frame = frames[k : k + 1]
-            left, right = product(at.twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
+            left, right = product(self.twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
             gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
             columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
-        return at._rows(of_joints(tree, torch.stack(columns, dim=2)))
+        return self._rows(of_joints(tree, torch.stack(columns, dim=2)))
 
     def dynamics_of_bodies(
         self, parameters: Float[Tensor, "bodies 10"]
@@ -240,27 +231,25 @@ class Kinematics:
         return self._rows(product(self.poses[body], offset[..., None]).movedim(-1, 0))
 
     def frame_jacobian(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
-        """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
-        at, body, position = self._world_point(frame, point)
+        """Jacobian (..., 6, nv) of a ``point`` (3,) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
+        body, position = self._world_point(frame, point)
         if body == WORLD:
-            return self.twists.new_zeros(*at.batch_shape, 6, self.robot.nv)
-        linear = product(at.twists, position)[:, :, 0]
-        jacobian = torch.cat([linear, at.vectors[:, :3]], dim=1)
+            return self.twists.new_zeros(*self.batch_shape, 6, self.robot.nv)
+        jacobian = torch.cat([product(self.twists, position)[:, :, 0], self.vectors[:, :3]], dim=1)
         tree = self.robot.tree
         jacobian = (jacobian * tree.descendants[:, body, None, None]).permute(2, 1, 0)
-        return at._rows(jacobian @ tree.coupling if tree.coupled else jacobian.contiguous())
+        return self._rows(jacobian @ tree.coupling if tree.coupled else jacobian.contiguous())
 
     def frame_bias_acceleration(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6"]:
         """Jdot v (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], m/s^2 and rad/s^2, no gravity."""
-        at, body, position = self._world_point(frame, point)
-        accelerations, _ = at._moving("frame_bias_acceleration")
+        body, position = self._world_point(frame, point)
+        accelerations, _ = self._moving("frame_bias_acceleration")
         if body == WORLD:
-            return self.twists.new_zeros(*at.batch_shape, 6)
-        acceleration = accelerations[body]
-        linear = product(acceleration, position)[:, 0]
+            return self.twists.new_zeros(*self.batch_shape, 6)
+        linear = product(accelerations[body], position)[:, 0]
         # A = [dw/dt]x + [w]x [w]x, whose second part is symmetric: the basis reads dw/dt off the antisymmetric half
-        angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ acceleration.flatten(0, 1))
-        return at._rows(torch.cat([linear, angular]).mT)
+        angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ accelerations[body].flatten(0, 1))
+        return self._rows(torch.cat([linear, angular]).mT)
 
     def _rows(self, values: Tensor) -> Tensor:
         """Give values (batch, ...) their batch dimensions back."""
@@ -300,35 +289,24 @@ class Kinematics:
             raise InvalidInput(f"{what} needs velocities; make the kinematics with robot.kinematics(q, v).")
         return self.accelerations, self.v
 
-    def _world_point(self, frame: str, point: Vector | None) -> "tuple[Kinematics, int, Tensor]":
-        """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
+    def _accelerations(self, a: Tensor) -> Twists:
+        _, v = self._moving("this")
+        return body_accelerations(self.robot.tree, self.twists, v, of_bodies(self.robot.tree, a))
+
+    def _world_point(self, frame: str, point: Vector | None) -> tuple[int, Tensor]:
+        """The body of ``frame``, and the point (4, 1, batch) of it in the world."""
         body, offset = self.robot.frame(frame)
-        at = self
-        if point is None:
-            local = offset[:, 3:, None]
-        else:
-            point = checked_point(point, self.robot.device)
-            homogeneous = offset[:, :3] @ point[..., None] + offset[:, 3:]
-            if point.dim() == 1:
-                local = homogeneous[..., None]
-            else:
-                at = self._expanded("point", point.shape[:-1])
-                local = _expand_trailing(homogeneous.movedim((-2, -1), (0, 1)), 2, at.batch_shape)
-        return at, body, local if body == WORLD else product(at.poses[body], local)
+        local = offset[:, 3:]
+        if point is not None:
+            local = offset[:, :3] @ checked_point(point, self.robot.device)[:, None] + local
+        return body, local[..., None] if body == WORLD else product(self.poses[body], local[..., None])
 
-    def _expanded(self, name: str, given: torch.Size) -> "Kinematics":
-        """These states, broadcast against the batch of the argument ``name``."""
-        batch = broadcast_batch({"the states": self.batch_shape, name: given})
-        if batch == self.batch_shape:
-            return self
-
-        def wider(values: Tensor) -> Tensor:
-            lead = values.shape[:-1]
-            return _expand_trailing(values.reshape(*lead, *self.batch_shape), len(lead), batch)
-
-        names = ("poses", "vectors", "twists", "v", "accelerations")
-        tensors = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return replace(self, batch_shape=batch, **{name: wider(value) for name, value in tensors.items()})
+    def _given(self, name: str, values: JointValues) -> Float[Tensor, "nv batch"]:
+        """Values at the joints, one for each state or one for all. Raises InvalidInput for others."""
+        values = self.robot.checked_input(name, values)
+        if broadcast_batch({"the states": self.batch_shape, name: values.shape[:-1]}) != self.batch_shape:
+            raise InvalidInput(f"{name} has shape {tuple(values.shape)} for states {tuple(self.batch_shape)}.")
+        return _columns(values, self.batch_shape)
 
 
 def _columns(values: Tensor, batch: torch.Size) -> Tensor:
@@ -337,10 +315,3 @@ def _columns(values: Tensor, batch: torch.Size) -> Tensor:
     if values.shape[:-1] != batch:
         values = values.expand(*batch, size)
     return values.reshape(batch.numel(), size).mT.contiguous()
-
-
-def _expand_trailing(values: Tensor, lead: int, batch: torch.Size) -> Tensor:
-    """Broadcast the batch dimensions that follow the first ``lead`` ones to ``batch``, and flatten them."""
-    head, own = values.shape[:lead], values.shape[lead:]
-    values = values.reshape(*head, *(1 for _ in range(len(batch) - len(own))), *own)
-    return values.expand(*head, *batch).reshape(*head, batch.numel())

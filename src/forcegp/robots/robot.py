@@ -354,14 +354,22 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     @override
     def _dynamics(self, function: str, *arguments: Tensor) -> Any:
-        return getattr(self.kinematics(*arguments[:2]), function)(*arguments[2:])
+        q, *others = arguments
+        if len(others) == 2:  # the third may have more rows than the states
+            given = {
+                x: self.checked_input(x, y)
+                for x, y in zip(("q", "v", "tau" if function == "forward_dynamics" else "a"), arguments, strict=True)
+            }
+            batch = broadcast_batch({name: x.shape[:-1] for name, x in given.items()})
+            q, *others = (x.expand(*batch, -1) for x in given.values())
+        return getattr(self.kinematics(q, *others[:1]), function)(*others[1:])
 
     def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
         return self.kinematics(q).frame_pose(frame)
 
     def frame_jacobian(self, q: Positions, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
-        """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
+        """Jacobian (..., 6, nv) of a ``point`` (3,) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
 
     def frame_bias_acceleration(
