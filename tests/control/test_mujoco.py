@@ -130,33 +130,6 @@ def test_a_force_that_is_not_finite_is_an_error(predictor):
     assert mujoco.get_mjcb_passive() is None
 
 
-def test_a_force_that_is_not_finite_is_an_error_also_after_another_was_taken(predictor):
-    model = model_of()
-    data = mujoco.MjData(model)
-    data.qvel[:] = np.nan
-    forces = MujocoForces(predictor, model, draw=2)
-    forces.__enter__()
-    mujoco.mj_forward(model, data)
-    forces.use(1)
-    with pytest.raises(NumericalError, match="not finite"):
-        forces.__exit__(None, None, None)
-
-
-def test_others_that_are_made_meanwhile_change_nothing(predictor):
-    """Drawn functions with the same program, whose tables differ."""
-    model = model_of()
-    q, v, u = states(1)
-    data = mujoco.MjData(model)
-    found = []
-    with MujocoForces(predictor, model, draw=2, seed=1):
-        for seed in (2, 3):
-            data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q[0], v[0], u[0]
-            mujoco.mj_forward(model, data)
-            found.append(data.qacc.copy())
-            MujocoForces(predictor, model, draw=2, seed=seed).use(1)
-    np.testing.assert_array_equal(*found)
-
-
 def test_one_callback_at_a_time(predictor):
     model = model_of()
     forces = MujocoForces(predictor, model)

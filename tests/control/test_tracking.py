@@ -80,13 +80,6 @@ def test_with_the_true_model_the_error_vanishes_with_the_step():
     assert fine < 0.2 * largest_error(ComputedTorque(URDF_ALONE, **GAINS), 0.01, seconds=1.0).max()
 
 
-def test_the_integral_removes_what_a_constant_push_leaves():
-    push = (4.0, -2.0)
-    without = largest_error(ComputedTorque(TRUE, **GAINS), 0.02, push=push)
-    summed = largest_error(ComputedTorque(TRUE, **GAINS, integral=300.0, dt=0.02), 0.02, push=push)
-    assert summed[-20:].max() < 0.3 * without[-20:].max()
-
-
 def test_torques_keep_their_limits_and_the_integral_waits():
     control = ComputedTorque(URDF_ALONE, **GAINS, integral=10.0, dt=0.01, torque_limits=[500.0, 1.0])
     u = control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
@@ -121,7 +114,7 @@ def test_learned_forces_are_compensated_and_uncertainty_stiffens(touching):
     q, v = state(free)
     e, a_d = np.full(3, 0.01), np.array([1.0, 2.0, -1.0])
     u = ComputedTorque(predictor, **GAINS, torque_limits=1e6)(q, v, q + e, v, a_d)
-    np.testing.assert_allclose(free.predict(q, v, u).mean, a_d + 100.0 * e, rtol=1e-7)
+    np.testing.assert_allclose(free.predict(q, v, u).mean, a_d + 100.0 * e, rtol=1e-7, atol=1e-9)
 
 
 def test_forces_that_depend_on_the_torque_are_compensated():
@@ -218,13 +211,6 @@ def test_it_raises_or_holds_but_never_gives_nan():
     assert torch.equal(control([2.9, 0.0], still, [-2.9, 0.0], still, still), safe)
     assert control.held == 1
     assert control.held == 1
-
-
-def test_motion_along_a_surface_raises_where_the_feedback_is_not_finite(touching):
-    q, v = state(touching)
-    control = HybridForce(touching.predictor(covariance="none"), stiffness=1e308, damping=0.0, torque_limits=1e6)
-    with pytest.raises(NumericalError, match="it is not finite"):
-        control(q, v, np.clip(q + 4.0, -2.9, 2.9), v, 0.0 * v, 5.0)
 
 
 def test_a_broken_sensor_is_held_and_leaves_the_integral_alone():

@@ -55,18 +55,6 @@ def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
     assert observed_order(errors) == pytest.approx(order, abs=0.15)
 
 
-def test_implicit_midpoint_is_cayleys_transform_of_a_linear_system():
-    generator = torch.Generator().manual_seed(0)
-    K, D = (torch.randn(2, 3, 3, dtype=torch.float64, generator=generator)).unbind()
-    q, v = torch.randn(2, 4, 3, dtype=torch.float64, generator=generator).unbind()
-    step = ImplicitMidpoint().step(lambda q, v: -q @ K.mT - v @ D.mT, q, v, 0.3)
-    F = torch.cat([torch.cat([0.0 * K, torch.eye(3).double()], 1), torch.cat([-K, -D], 1)])
-    identity = torch.eye(6, dtype=torch.float64)
-    dense = torch.linalg.solve(identity - 0.15 * F, (identity + 0.15 * F) @ torch.cat([q, v], -1).mT).mT
-    assert step.found.all()
-    torch.testing.assert_close(torch.cat([step.q, step.v], -1), dense, rtol=1e-12, atol=1e-12)
-
-
 def test_implicit_midpoint_follows_stiff_friction_where_explicit_steps_fail():
     model, n = light_arm(), 2
     q0 = torch.linspace(-0.3, 0.3, n, dtype=torch.float64)[:, None] + torch.tensor([1.4, 0.2], dtype=torch.float64)

@@ -63,18 +63,6 @@ def along(motion, step: float):
     return first, second
 
 
-@pytest.mark.parametrize("surface", SURFACES)
-@pytest.mark.parametrize("model", MODELS)
-def test_they_are_the_derivatives_of_the_distance(model, surface):
-    """On q(t) = q + v t + a t^2 / 2: c' = A v and c'' = A a - b, for any acceleration."""
-    touching, built = contact(model, surface), robot(model)
-    q, v, a = states(built.nv, 10, seed=1)
-    A, b, _ = constraint(model, surface, None, q, v, torch.zeros_like(q))
-    rate, second = along(lambda t: touching.distance(built.kinematics(q + v * t + 0.5 * a * t**2)), 1e-3)
-    assert_close(rate, (A * v).sum(-1), 1e-8)
-    assert_close(second, (A * a).sum(-1) - b, 1e-6)
-
-
 @pytest.mark.parametrize(("omega", "zeta"), [(10.0, 1.0), (3.0, 0.2), (0.0, 1.0), (4.0, 0.0)])
 @pytest.mark.parametrize("surface", SURFACES)
 def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, zeta):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.mechanics.systems import assert_close, normal, robot, states
+from tests.mechanics.systems import assert_close, robot, states
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS
 
@@ -119,29 +119,7 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
     assert_close(dynamics.acceleration(nothing), torch.linalg.solve(plain.M + added, plain.Q_K), 1e-10)
 
 
-def test_rotors_that_a_moving_link_carries():
-    """The kinetic energy of two rotors: the first sits in the base, the second turns with the first link, too."""
-    ratio, rotor = 6.0, [1e-3, 2e-3, 0.0, 0.0]
-    M = CoupledRotors(rotor, TRANSMISSION).bound_to(chain()).added_inertia(chain())
-    v = normal(4)
-    energy = 0.5 * rotor[0] * (ratio * v[0]) ** 2 + 0.5 * rotor[1] * (ratio * v[1] - v[0]) ** 2
-    assert_close(0.5 * v @ M @ v, energy, 1e-14)
-    q, v, u = states(4, 5)
-    added = known(Actuation(), RigidBodies(), CoupledRotors(rotor, TRANSMISSION)).dynamics(q, v, u).M
-    assert_close(added, Model(chain()).dynamics(q, v, u).M + M, 1e-13)
-    one_each = CoupledRotors(NUMBERS).bound_to(chain()).added_inertia(chain())
-    assert_close(one_each, Rotor(NUMBERS).bound_to(chain()).added_inertia(chain()), 1e-14)
-
-
 # ---------------------------------------------------------------- one number per joint
-
-
-def test_a_coefficient_may_be_learned():
-    damping = TENSOR.clone().requires_grad_()
-    q, v, u = states(4, 3)
-    known(Viscous(damping)).dynamics(q, v, u).Q_K.sum().backward()
-    assert_close(damping.grad, -v.sum(0), 1e-14)
-    assert known(Viscous(damping)).to_json() == known(Viscous(NUMBERS)).to_json()
 
 
 @pytest.mark.usefixtures("unchecked")  # forces check their numbers where they meet a robot

@@ -7,13 +7,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from tests.robots.mjcf_models import BAR, FOUR_BAR, QUADROTOR
+from tests.robots.mjcf_models import BAR, FOUR_BAR
 from tests.robots.mujoco_oracle import MujocoOracle
 
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.integration import integrate, onto_contacts, violation
 from forcegp.integration.integrators import integrator_named
-from forcegp.mechanics import Baumgarte, Held, LoopClosure, Plane, loop_frame, loop_point
+from forcegp.mechanics import Held, LoopClosure, Plane, loop_frame, loop_point
 from forcegp.mechanics.gauss_principle import Contact
 from forcegp.model import Model
 
@@ -137,20 +137,6 @@ def test_a_mechanism_keeps_its_energy_and_stays_closed(tmp_path):
     assert (total - total[0]).abs().max() < 1e-4 * (total.abs().max() + 1.0)
 
 
-@pytest.mark.nightly
-def test_baumgarte_pulls_a_loop_together(tmp_path):
-    model = model_of(WELD, tmp_path, baumgarte=Baumgarte(20.0))
-    q, v, _ = states(model, 1)
-    q = q + 0.01
-    zero = torch.zeros_like(v)
-    integrator = integrator_named("rk4", model)
-    forces = torch.zeros(400, 1, model.robot.nv).double()
-    motion = integrate(integrator, lambda q, v, u: model.dynamics(q, v, u).acceleration(zero), q, zero, forces, 2e-3)
-    c, _ = violation(model, motion.q, motion.v)
-    assert c[0].abs().max() > 1e-3
-    assert c[-1].abs().max() < 1e-3 * c[0].abs().max()
-
-
 def test_loops_survive_files_and_act_where_their_switch_is_on(tmp_path):
     robot = model_of(WELD, tmp_path).robot
     model = Model(robot, loop_frame("end", "b3", switch="latched"))
@@ -179,22 +165,6 @@ def test_states_that_do_not_fit_and_frames_of_one_body_are_refused(tmp_path):
         LoopClosure("crank", (0.0, 0.0, 0.0), Held((0, 0, 1)), None, "rocker", (0, 0))  # type: ignore[arg-type]
     assert model.touching == ()
     assert len(model.with_contacts([*model.contacts, Contact("crank", (0, 0, 1), Plane((0, 0, 1), 0))]).loops) == 3
-
-
-def test_motors_at_sites_of_a_free_body_are_inputs(tmp_path):
-    """A quadrotor whose second rotor sits on an arm of its own, tilted."""
-    tilted = '<body pos="-.1 .1 0" euler="20 5 0"><site name="r2"/></body>'
-    text = QUADROTOR.replace('<site name="r2" pos="-.1 .1 0"/>', tilted)
-    model, plain = model_of(text, tmp_path), mujoco.MjModel.from_xml_string(text)
-    robot, oracle = model.robot, MujocoOracle(plain)
-    assert (model.inputs, robot.nv) == (("1", "2", "3", "4"), 6)
-    generator = torch.Generator().manual_seed(0)
-    q, v = robot.random(generator, 1), torch.randn(1, 6, dtype=torch.float64, generator=generator)
-    u = torch.tensor([[1.0, 3.0, -2.0, 0.5]], dtype=torch.float64)
-    oracle.data.ctrl[:] = u[0].numpy()
-    oracle.at(q[0].numpy(), v[0].numpy())
-    np.testing.assert_allclose(model.state(q, v, u).delivered[0], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-12)
-    assert Model.from_json(model.to_json()).inputs == model.inputs
 
 
 @pytest.mark.parametrize("gear", ["0 0 1 0 0 .02", "1 2 -3 .4 .5 .6", "0 0 0 .1 .2 -.3", "0 0 0 0 0 0"])

@@ -13,8 +13,6 @@ from forcegp import (
     Noise,
     RigidBodies,
     fit,
-    load_posterior,
-    save_posterior,
 )
 from forcegp.data import contact_doubts, contact_rows
 from forcegp.integration import onto_contacts
@@ -61,17 +59,6 @@ def test_friction_inside_a_loop_is_learned(model, dataset, posterior):
     assert contact_rows(dataset).all()
     assert contact_doubts(dataset) == ()
     assert usual_forces(model) == "gp:joint-friction"
-
-
-def test_motions_stay_closed_and_stored_models_are_the_same(model, dataset, posterior, tmp_path):
-    q, v = (torch.tensor(getattr(dataset, name)[:2]) for name in "qv")
-    u = torch.zeros(2, 50, 3, dtype=torch.float64)
-    motion = posterior.rollout(q, v, u, 0.005, integrator="projected")
-    assert motion.constraint.abs().max() < 1e-10
-    save_posterior(posterior, tmp_path / "model")
-    again = load_posterior(tmp_path / "model")
-    assert again.model.contacts == model.contacts
-    torch.testing.assert_close(again.predict(q, v, u[:, 0]).mean, posterior.predict(q, v, u[:, 0]).mean)
 
 
 @pytest.mark.parametrize("kind", ["point", "frame"])

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from forcegp import Contact, Dataset, JointFriction, Model, Noise, Plane, Robot, export_c, fit
-from forcegp.codegen.branch_free_linalg import pseudo_inverse
 from forcegp.errors import InvalidInput
 from forcegp.forces import Actuation, JointForces, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_frame, fixed_point
@@ -132,15 +131,6 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     q_next, v_next = predictor.step(q[:3], v[:3], u[:, 0], 0.004, integrator)
     close(q_next, found.q[:, 1], 1e-9)
     close(v_next, found.v[:, 1], 1e-9)
-
-
-def test_motions_under_drawn_functions(case):
-    posterior, q, v, u = case
-    u = u[:2, None].expand(-1, 6, -1).clone()
-    found = posterior.predictor(covariance="none").rollouts(q[:2], v[:2], u, 0.004, functions=3, seed=4)
-    expected = posterior.rollout(q[:2], v[:2], u, 0.004, samples=3, seed=4).samples
-    for name in "qva":
-        close(getattr(found, name), getattr(expected, name), 1e-7)  # drawn functions are tables
 
 
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
@@ -280,28 +270,3 @@ def test_redundant_contacts_have_right_derivatives():
     expected = posterior.predictor(covariance="none", compile=False).linearize(q, v, u)
     for found, other in zip(predictor.linearize(q, v, u), expected, strict=True):
         close(found, other, 1e-9)
-
-
-@pytest.mark.parametrize(("rows", "columns", "rank"), [(7, 9, 7), (12, 18, 12), (9, 18, 6), (12, 18, 4)])
-def test_a_pseudo_inverse_of_many_rows(rows, columns, rank):
-    """Against torch's, with rows that are switched off, and in directions that keep the rank."""
-    generator = torch.Generator().manual_seed(rows + rank)
-
-    def random(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    A, M, N, weights = (
-        random(rows, rank) @ random(rank, columns),
-        random(rows),
-        random(columns, columns),
-        random(columns, rows),
-    )
-    A[-3:-1] = 0.0
-    found = []
-    for inverse in (pseudo_inverse, lambda matrix, tolerance: torch.linalg.pinv(matrix, rtol=tolerance)):
-        size = torch.zeros((), dtype=torch.float64, requires_grad=True)
-        moved = (1.0 + size * M)[:, None] * A @ (torch.eye(columns).double() + size * N)
-        value = inverse(moved, 1e-9)
-        found.append((value.detach(), *torch.autograd.grad((weights * value).sum(), size)))
-    for mine, expected in zip(*found, strict=True):
-        close(mine, expected, 1e-9)

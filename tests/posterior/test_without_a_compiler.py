@@ -1,6 +1,5 @@
 """Predictors where nothing can be compiled: torch computes the same, and one warning says so."""
 
-import pickle
 import shutil
 import warnings
 
@@ -77,13 +76,3 @@ def test_what_was_compiled_stays_and_what_cannot_be_is_done_by_torch(posterior, 
     torch.testing.assert_close(q.grad, linear.da_dq.sum(1))
     assert (tmp_path / "hangs.called").read_text().count("\n") == 1  # it is not waited for again
     torch.testing.assert_close(linear, posterior.predictor(covariance="none", compile=False).linearize(*states))
-
-
-def test_a_predictor_sent_to_a_process_without_compiler_works_there(posterior, states, monkeypatch):
-    monkeypatch.setenv("CC", "no-such-compiler")
-    predictor = posterior.predictor(covariance="none", compile=False)
-    with pytest.warns(NumericalWarning, match=SLOWER):
-        sent = pickle.loads(pickle.dumps(posterior.predictor(covariance="none")))
-    with pytest.warns(NumericalWarning, match=SLOWER):
-        found = sent.mean(*states)
-    torch.testing.assert_close(found, predictor.mean(*states))

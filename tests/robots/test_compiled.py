@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import re
 import stat
 import subprocess
 import sys
@@ -140,15 +139,6 @@ def test_default_folder(robot, monkeypatch, tmp_path):
     assert robot.compile().folder == tmp_path / "forcegp" / "compiled"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert robot.compile().folder == Path.home() / ".cache" / "forcegp" / "compiled"
-
-
-def test_the_page_on_compiled_dynamics_runs(repository, tmp_path, monkeypatch, capsys):
-    page = (repository / "docs" / "explanation" / "compiled-dynamics.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    exec(example, {})
-    assert capsys.readouterr().out.splitlines() == re.findall(r"# (tensor.*|torch\.Size.*)\n", example)
-    assert any((tmp_path / "forcegp" / "compiled").iterdir())
 
 
 # ---------------------------------------------------------------------- what cannot be

@@ -88,26 +88,6 @@ def test_batches_broadcast(chain):
         chain.frame_jacobian(q, "tool", torch.zeros(5, 3).double())
 
 
-def test_one_kinematics_serves_everything(chain):
-    q, v, a = torch.linspace(-1, 1, 24, dtype=torch.float64).reshape(3, 2, 4)
-    kinematics = chain.kinematics(q, v)
-    assert kinematics.batch_shape == (2,)
-    pairs = [
-        (kinematics.mass_matrix(), chain.mass_matrix(q)),
-        (kinematics.bias_forces(), chain.bias_forces(q, v)),
-        (kinematics.gravity_forces(), chain.gravity_forces(q)),
-        (kinematics.inverse_dynamics(a), chain.inverse_dynamics(q, v, a)),
-        (kinematics.forward_dynamics(a), chain.forward_dynamics(q, v, a)),
-        (kinematics.frame_pose("tool"), chain.frame_pose(q, "tool")),
-        (kinematics.frame_jacobian("tool"), chain.frame_jacobian(q, "tool")),
-        (kinematics.frame_bias_acceleration("tool"), chain.frame_bias_acceleration(q, v, "tool")),
-    ]
-    for ours, expected in pairs:
-        assert torch.equal(ours, expected)
-    with pytest.raises(InvalidInput, match=r"bias_forces needs velocities; .* robot\.kinematics\(q, v\)"):
-        chain.kinematics(q).bias_forces()
-
-
 # ---------------------------------------------------------------------- wrong names and inputs
 
 
