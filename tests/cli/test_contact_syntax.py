@@ -4,7 +4,7 @@ import pytest
 
 from forcegp.cli.robot_options import EXAMPLE, parse_contact, parse_contacts, parse_feet
 from forcegp.errors import InvalidInput
-from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_frame, fixed_point
+from forcegp.mechanics import Contact, Plane, Sphere, fixed_frame, fixed_point
 
 
 @pytest.mark.parametrize(
@@ -13,10 +13,6 @@ from forcegp.mechanics import Contact, Cylinder, Plane, Sphere, fixed_frame, fix
         (EXAMPLE, Contact("lbr_iiwa_link_7", (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), 0.055))),
         ("tool:plane:0,0,2,1", Contact("tool", (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.5))),
         ("arm:tool@1,-2,3e-1:sphere:0,0,0,1", Contact("arm:tool", (1.0, -2.0, 0.3), Sphere((0.0, 0.0, 0.0), 1.0))),
-        (
-            "tool@0,0,0:cylinder:0,1,0,1,0,0,0.1",
-            Contact("tool", (0.0, 0.0, 0.0), Cylinder((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.1)),
-        ),
         ("a@b@1,2,3:plane:1,0,0,0", Contact("a@b", (1.0, 2.0, 3.0), Plane((1.0, 0.0, 0.0), 0.0))),
     ],
 )

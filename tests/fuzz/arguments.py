@@ -404,10 +404,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Contact": (_contact, lambda: {"frame": "hand", "point": (0.0, 0.0, 0.2), "surface": forcegp.Plane(**SURFACES)}),
     "Plane": (functools.partial(_surface, forcegp.Plane), lambda: dict(SURFACES)),
     "Sphere": (functools.partial(_surface, forcegp.Sphere), lambda: {"center": (0.0, 0.0, 0.1), "radius": 0.5}),
-    "Cylinder": (
-        functools.partial(_surface, forcegp.Cylinder),
-        lambda: {"point": (0.0, 0.0, 0.1), "axis": (1.0, 0.0, 0.0), "radius": 0.5},
-    ),
     "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
     "viscous": (functools.partial(_forces, forcegp.Viscous), lambda: {"damping": 0.1}),
     "coulomb": (

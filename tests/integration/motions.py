@@ -1,7 +1,7 @@
 """Motions with known answers: the small arm of `tests.posterior.arm` on all surfaces, and damped oscillators."""
 
 from forcegp.forces import Actuation, RigidBodies, Stribeck
-from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
+from forcegp.mechanics import Contact, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -11,7 +11,6 @@ CONTACTS = {
     "plane": (PLANE,),
     "plane twice": (PLANE, PLANE),
     "sphere": (Contact("hand", TOOL, Sphere((0.0, 0.1, 0.4), 0.45)),),
-    "cylinder": (Contact("hand", TOOL, Cylinder((0.3, 0.0, 0.3), (0.0, 1.0, 0.2), 0.2)),),
 }
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data
 
-from forcegp.errors import ContactError, DataWarning, InvalidInput, NotEnoughMemory
+from forcegp.errors import ContactError, InvalidInput, NotEnoughMemory
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions, likelihood
@@ -175,19 +175,6 @@ def test_noise_of_every_row_must_be_stated_for_all_or_none(posterior):
 
 def stating(data, noise_std):
     return dataclasses.replace(data, noise_std=noise_std)
-
-
-def test_rows_that_state_another_noise_than_the_fit_are_warned_of(posterior, tmp_path):
-    rows = arm_data(3, seed=17)
-    other = stating(rows, rows.noise_std * [1.0, 1.0, 2.0])
-    say = r"0.05 \(0.05\), 0.05 \(0.05\), 0.1 \(0.05\).*level of the fit is used.*noise_std of shape \(rows, nv\)"
-    with pytest.warns(DataWarning, match=say):
-        grown = posterior.update(other)
-    assert_same(grown, posterior.update(rows), rows)
-    assert_same(grown, posterior.update(stating(rows, rows.noise_std * 1.09)), rows)  # warnings are errors here
-    save_posterior(posterior, tmp_path / "run")
-    with pytest.warns(DataWarning, match="another noise"):
-        load_posterior(tmp_path / "run").update(other)
 
 
 def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(posterior, monkeypatch):

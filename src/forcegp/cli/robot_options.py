@@ -221,8 +221,8 @@ class SearchOptions:
 
 # ---------------------------------------------------------------------- what the robot touches
 
-SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
-"""Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
+SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}
+"""Numbers of each surface in m: plane n . p = offset."""
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
 FEET, FLAT = "FRAME@x,y,z,...", ":flat"
@@ -256,10 +256,9 @@ def parse_contact(text: str) -> forcegp.Contact:
         values.append(numbers_of(given, needs))
         if len(values[-1]) != count:
             raise InvalidInput(needs)
-    (*given, size), (x, y, z) = values
-    vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
-    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere, "cylinder": forcegp.Cylinder}[kind]
-    return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
+    (*vector, size), (x, y, z) = values
+    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere}[kind]
+    return forcegp.Contact(frame, (x, y, z), surface(tuple(vector), size))
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:

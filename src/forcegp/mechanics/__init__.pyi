@@ -4,6 +4,6 @@ from .gauss_principle import (
 )
 from .constraints import LoopClosure as LoopClosure, loop_frame as loop_frame, loop_point as loop_point
 from .surfaces import (
-    Cylinder as Cylinder, Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
+    Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
     Surface as Surface, surface_axes as surface_axes,
 )

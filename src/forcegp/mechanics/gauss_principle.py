@@ -71,8 +71,7 @@ class Contact:
             raise InvalidInput(f"Contact frame is {self.frame!r}; give the name of a link.")
         if not isinstance(self.surface, Surface):
             raise InvalidInput(
-                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, Cylinder, "
-                "ImplicitSurface ..."
+                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, ImplicitSurface ..."
             )
         if self.switch is not None and not (isinstance(self.switch, str) and self.switch):
             raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")

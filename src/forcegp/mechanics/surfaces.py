@@ -106,34 +106,8 @@ class Held(_Flat):
         return torch.zeros_like(p[..., 0])
 
 
-class _Round(Surface):
-    """All points at distance `radius` from a centre or an axis."""
-
-    radius: float
-
-    @abstractmethod
-    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """The ray to p from the nearest point there, and its derivative d ray / dp, a projector."""
-
-    @override
-    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return torch.linalg.vector_norm(self._radial(p)[0], dim=-1) - self.radius
-
-    @override
-    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        ray = self._radial(p)[0]
-        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
-
-    @override
-    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-        ray, projector = self._radial(p)  # (projector - n n^T) / |ray|
-        distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
-        normal = ray[..., None] / distance
-        return (projector - normal @ normal.mT) / distance
-
-
 @dataclass(frozen=True)
-class Sphere(_Round):
+class Sphere(Surface):
     """The sphere |p - center| = radius; the normal points outwards."""
 
     center: Vector
@@ -144,28 +118,19 @@ class Sphere(_Round):
         object.__setattr__(self, "radius", positive("Sphere radius", self.radius))
 
     @override
-    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        return p - _tensor(self.center, p), torch.eye(3, dtype=p.dtype, device=p.device)
-
-
-@dataclass(frozen=True)
-class Cylinder(_Round):
-    """All points at distance `radius` from the line through `point` along `axis`; the normal points outwards."""
-
-    point: Vector
-    axis: Vector
-    radius: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", direction("Cylinder axis", self.axis)[0])
-        object.__setattr__(self, "point", _vector("Cylinder point", self.point))
-        object.__setattr__(self, "radius", positive("Cylinder radius", self.radius))
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1) - self.radius
 
     @override
-    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        axis = _tensor(self.axis, p)
-        projector = torch.eye(3, dtype=p.dtype, device=p.device) - torch.outer(axis, axis)
-        return (p - _tensor(self.point, p)) @ projector, projector
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        ray = p - _tensor(self.center, p)
+        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+
+    @override
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        normal = self.gradient(p)[..., None]  # (1 - n n^T) / |ray|
+        distance = torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1)[..., None, None]
+        return (torch.eye(3, dtype=p.dtype, device=p.device) - normal @ normal.mT) / distance
 
 
 @dataclass(frozen=True)
@@ -193,7 +158,7 @@ class ImplicitSurface(Surface):
         return value
 
 
-SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder, "held": Held}
+SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "held": Held}
 """Surfaces that files can carry, by the name they have there."""
 
 
