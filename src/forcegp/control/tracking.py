@@ -181,8 +181,7 @@ class ComputedTorque(TrackingController):
 
     * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
-    * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
-      velocity dry friction follows the noise of v and every overshoot, one sample late (docs/how-to/control.md).
+    Forces are those at (q, v_d): at the measured velocity dry friction would follow noise and overshoot.
     """
 
     def __init__(self, model: Moving, **settings: Any) -> None:

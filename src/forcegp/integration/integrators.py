@@ -41,13 +41,13 @@ def onto_contacts(
     state for which no position on all surfaces is found.
     """
     lower = factors(model.mass_matrix_at(model.loaded_robot.kinematics(q)))[1]
-    for iteration in range(MOST_CORRECTIONS + 1):
-        c, A, slope = _constraint(model, q)
-        missing = ~(c.abs() <= ON_SURFACE * slope).all(-1)
-        if iteration == MOST_CORRECTIONS or not bool(missing.any()) or not bool(A.isfinite().all()):
+    iteration, (c, A, slope) = 0, _constraint(model, q)
+    while bool((missing := ~(c.abs() <= ON_SURFACE * slope).all(-1)).any()) and bool(A.isfinite().all()):
+        if iteration == MOST_CORRECTIONS:
             break
         inverse = lower.mT @ torch.linalg.pinv(A @ lower.mT, rtol=REDUNDANCY_TOLERANCE)
         q = model.robot.space.integrate(q, -(inverse @ c[..., None])[..., 0])
+        iteration, (c, A, slope) = iteration + 1, _constraint(model, q)
     if bool(missing.any()):
         row = int(missing.nonzero()[0])
         raise NumericalError(

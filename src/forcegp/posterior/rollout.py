@@ -32,6 +32,7 @@ from forcegp.posterior.fitted import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
 from forcegp.posterior.programs import steps_of
 from forcegp.robots.arguments import broadcast_batch, whole_number
+from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
 """Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
@@ -93,9 +94,9 @@ def moved(
     if loops is None:
         found = integrate(method, acceleration, *given, what=what, **how)
     else:
-        found = fused(loops, method, acceleration, *given, threads, what)
-    rows = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (found.q, found.v, found.a))
-    return Motions(*rows, found.diverged_at.reshape(tuple(batch)))
+        found = fused(loops, method, acceleration, *given, threads=threads, what=what)
+    q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (found.q, found.v, found.a))
+    return Motions(q, v, a, found.diverged_at.reshape(tuple(batch)))
 
 
 def fused(
@@ -161,6 +162,11 @@ class Rollout:
     samples: "Rollout | None" = None
     intervals: MotionIntervals | None = None
 
+    @property
+    def space(self) -> ConfigurationSpace:
+        """Of the positions."""
+        return self.model.robot.space
+
     @cached_property
     def constraint(self) -> Float[Tensor, "*batch rows m"]:
         """c(q) (..., T+1, m) in m, the distance of every contact point from its surface, where that is signed."""
@@ -178,7 +184,7 @@ class Rollout:
             low, high = self.quantiles((0.025, 0.975), quantity)
             return low, high
         center, enough = getattr(self, quantity), self.samples is not None and len(self.samples.q) > 1
-        if quantity == "q" and not self.model.robot.space.is_vector_space:
+        if quantity == "q" and not self.space.is_vector_space:
             center = torch.where(center.isnan().any(-1, keepdim=True), torch.nan, 0.0)
         half = self.intervals.half_width(quantity, self.time, self.std(quantity) if enough else None)
         return center - half, center + half
@@ -204,8 +210,8 @@ class Rollout:
                 f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
             )
         values: Tensor = getattr(self.samples, quantity)
-        on_manifold = quantity == "q" and not self.model.robot.space.is_vector_space
-        return self.model.robot.space.difference(self.q, values) if on_manifold else values
+        on_manifold = quantity == "q" and not self.space.is_vector_space
+        return self.space.difference(self.q, values) if on_manifold else values
 
 
 def roll_out(

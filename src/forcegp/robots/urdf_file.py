@@ -106,7 +106,7 @@ def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, sour
 
 def with_note(text: str, note: str) -> str:
     """URDF text with a comment before its last tag."""
-    document = minidom.parseString(with_prefixes(text))
+    document: Any = minidom.parseString(with_prefixes(text))
     document.documentElement.appendChild(document.createComment(f" {note.replace('--', '- -')} "))
     return _written(document)
 
