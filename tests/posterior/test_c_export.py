@@ -14,7 +14,7 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
@@ -276,15 +276,6 @@ def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(pos
         made = export_c(posterior, tmp_path / "arm")
     assert made.differences == {}
     assert (tmp_path / "arm" / "arm.c").exists()
-
-
-def test_a_model_without_unknown_forces(tmp_path, states):
-    none = fitted()
-    export_c(none, tmp_path / "arm", jacobian=True)
-    _, (a,) = call(compiled(tmp_path / "arm", "arm.c").arm_mean, [3], *(x[0] for x in states))
-    np.testing.assert_allclose(a, none.predict(*states).mean[0], rtol=1e-11)
-    with pytest.raises(InvalidInput, match="has no covariance that could be exported"):
-        export_c(none, tmp_path / "other", covariance=True)
 
 
 @dataclass(frozen=True)

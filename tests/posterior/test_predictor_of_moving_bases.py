@@ -185,17 +185,6 @@ def test_the_program_in_c(floating, tmp_path):
     close(torch.as_tensor(made), posterior.model.robot.integrate(q[0], step), 1e-13)
 
 
-@pytest.mark.nightly
-def test_derivatives_in_c(floating, tmp_path):
-    posterior = floating[0]
-    written = export_c(posterior, tmp_path / "c", jacobian=True)
-    assert written.differences["hopper_linearize"] < 1e-9
-    with pytest.raises(InvalidInput, match="derivatives of exported steps need a base that is fixed"):
-        export_c(posterior, tmp_path / "d", jacobian=True, steps=0.01)
-    with pytest.raises(InvalidInput, match="not 'implicit-midpoint'; give one of 'symplectic-euler', 'rk4'"):
-        export_c(posterior, tmp_path / "d", steps=0.01, integrator="implicit-midpoint")
-
-
 def test_functions_of_casadi(case, tmp_path):
     posterior, q, v, u = case
     casadi = pytest.importorskip("casadi")

@@ -9,7 +9,7 @@ import torch
 from tests.posterior.arm import URDF, arm_data, arm_model
 
 from forcegp.atomic_files import SUMS, write_digests
-from forcegp.errors import ContactError, FileFormatError, InvalidInput
+from forcegp.errors import ContactError, FileFormatError
 from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
@@ -188,20 +188,3 @@ def test_a_model_that_was_carried_to_another_system_predicts_there_after_loading
     again = tmp_path / "again"
     save_posterior(loaded, again)
     assert torch.equal(load_posterior(again).predict(*states).mean, loaded.predict(*states).mean)
-
-
-def test_without_analytical_mean_a_model_moves_to_other_contacts_of_an_equal_robot_only(posterior, data, tmp_path):
-    same = Robot.from_urdf_text(URDF)  # another object, as read from another file
-    moved = posterior.with_model(data.model.with_robot(same).with_contacts(()))
-    save_posterior(moved, tmp_path / "run")
-    states = data.q, data.v, data.u
-    assert torch.equal(load_posterior(tmp_path / "run").predict(*states).mean, moved.predict(*states).mean)
-    heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.9"'))
-    with pytest.raises(InvalidInput, match="no rigid bodies"):
-        posterior.with_model(data.model.with_robot(heavier))
-
-
-def test_a_model_of_accelerations_cannot_move(data):
-    fitted = fit(data.model.black_box(), data, points=8)
-    with pytest.raises(InvalidInput, match="cannot move to another"):
-        fitted.with_model(data.model.with_contacts(()))
