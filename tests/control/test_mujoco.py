@@ -103,21 +103,6 @@ def test_threads_do_not_change_a_bit(predictor):
     assert np.abs(one - free).max() > 1e-3
 
 
-def test_drawn_functions_are_those_of_rollouts(predictor):
-    model = model_of()
-    q, v, u = (x[0] for x in states(1))
-    forces = MujocoForces(predictor, model, draw=3, seed=4)
-    found = []
-    for number in range(3):
-        forces.use(number)
-        found.append(accelerations(forces, model, [q], [v], [u])[0])
-    motions = predictor.rollouts(q, v, u[None], 1e-6, functions=3, seed=4)
-    np.testing.assert_allclose(found, motions.a[:, 0], atol=1e-8)
-    assert np.ptp(found, axis=0).min() > 0.0
-    with pytest.raises(InvalidInput, match="function 3 is asked for, of 3"):
-        forces.use(3)
-
-
 def test_a_force_that_is_not_finite_is_an_error(predictor):
     model = model_of()
     data = mujoco.MjData(model)

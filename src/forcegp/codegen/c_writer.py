@@ -48,13 +48,6 @@ _COS = _horner([(-1.0) ** n / factorial(2 * n) for n in range(8, -1, -1)], "z")
 _ATANH = _horner([2.0 / (2 * n + 1) for n in range(11, 0, -1)], "z")
 
 
-def lane_functions(lanes: int) -> str:
-    """The type `real` of that many doubles, and functions on it."""
-    words = {"LANES": lanes, "EXPM1": _EXPM1, "SIN": _SIN, "COS": _COS, "ATANH": _ATANH}
-    by_lane = (f"INLINE real r_{name}(real x) {{ return by_lane({name}, x); }}\n" for name in LANE_BY_LANE)
-    return filled(c_text(__name__, "lanes.h"), words) + "".join(by_lane)
-
-
 STATEMENTS = 500  # per part
 LONG_PART = 2500  # of dynamics, whose values are used again soon: 10-20 % faster, compiled as fast
 
@@ -166,7 +159,9 @@ def head(lanes: int) -> str:
     """What stands before all functions: the type `real`, and functions on it."""
     if lanes == 1:
         return "#include <math.h>\n" + c_text(__name__, "scalar.h")
-    return lane_functions(lanes)
+    words = {"LANES": lanes, "EXPM1": _EXPM1, "SIN": _SIN, "COS": _COS, "ATANH": _ATANH}
+    by_lane = (f"INLINE real r_{name}(real x) {{ return by_lane({name}, x); }}\n" for name in LANE_BY_LANE)
+    return filled(c_text(__name__, "lanes.h"), words) + "".join(by_lane)
 
 
 def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str, int]] | None = None) -> str:

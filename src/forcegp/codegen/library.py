@@ -232,7 +232,9 @@ class RowFunction:
         Batches of `least` states for each take as many threads as torch has, or `threads`.
         """
         parts = max(1, min(torch.get_num_threads() if threads is None else threads, count // least))
-        given = [x for each in (*inputs, *outputs) for x in (each.data_ptr(), _stride(count, each))]
+        given = [
+            x for each in (*inputs, *outputs) for x in (each.data_ptr(), each.shape[1] if len(each) == count else 0)
+        ]
         bounds = [MOST_LANES * (count * k // parts // MOST_LANES) for k in range(parts)] + [count]
 
         def part(k: int) -> int:
@@ -242,11 +244,6 @@ class RowFunction:
             return part(0)
         others = [_pool(parts - 1, os.getpid()).submit(part, k) for k in range(1, parts)]
         return reduce(or_, (other.result() for other in others), part(0))
-
-
-def _stride(count: int, rows: Tensor) -> int:
-    """Numbers from one state to the next."""
-    return rows.shape[1] if rows.shape[0] == count else 0
 
 
 @cache

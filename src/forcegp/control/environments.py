@@ -27,9 +27,10 @@ class RobotVectorEnv(VectorEnv):
     episode that ended, or whose motion diverges (`terminated`, `info["diverged"]`), begins anew with the next step.
 
     * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean, k draws k functions from the
-    posterior with `function_seed`, of which every episode takes one: domain randomisation. * reward(q, v, u, q_next,
-    v_next) -> (n,), terminated(q, v) -> (n,), start(generator, n) -> q, v take and return arrays of n rows; without
-    them 0, never, and at rest at q = 0. `steps` truncates an episode. torque_limits have to be finite.
+      posterior with `function_seed`, of which every episode takes one: domain randomisation.
+    * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,), start(generator, n) -> q, v take and return
+      arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode. torque_limits have to
+      be finite.
 
     Raises InvalidInput for settings that do not fit.
     """

@@ -99,9 +99,9 @@ class TrackingController(Controller):
     """Feedback on a reference q_d, v_d, a_d (nv,), as an acceleration: a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum.
 
     * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically. integral Ki in 1/s^3
-    needs the time `dt` between calls; a joint at its limit does not add to it. * torque_limits: largest absolute
-    torques in Nm (N); None takes the efforts of the URDF. * on_failure: "raise", or "hold" for the last torque where
-    none can be computed or an input is not finite.
+      needs the time `dt` between calls; a joint at its limit does not add to it.
+    * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
+    * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite.
 
     Raises InvalidInput for arguments that do not fit and references out of range, NumericalError where no torque is
     found.
@@ -299,12 +299,12 @@ class MPPI(Controller):
     al. 2020). Call it once in `dt` seconds, after some rounds of `improved`.
 
     * predictor: `posterior.predictor()`. functions: 0 plans with the mean of the learned forces, k with the mean cost
-    under k functions drawn from the posterior. * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (...,
-    T, nv), the last state included. * torque_limits: largest absolute torques in Nm (N), a number or one per joint;
-    None takes the efforts of the URDF. * noise: largest standard deviation around the plan, None for half the limits;
-    it falls to a twentieth from sequence to sequence. correlation: of two successive torques, in [0, 1). temperature:
-    None takes 2 % of the distance from the least to the median cost. on_failure: "raise", or "hold" for the last
-    torque.
+      under k functions drawn from the posterior.
+    * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
+    * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
+    * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
+      to sequence. correlation: of two successive torques, in [0, 1). temperature: None takes 2 % of the distance from
+      the least to the median cost. on_failure: "raise", or "hold" for the last torque.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
     """

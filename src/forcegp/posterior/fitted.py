@@ -130,18 +130,13 @@ class Estimates(Summary, Mapping[str, Estimate]):
             "converged": self.settled,
         }
 
-    def std_of(self, names: Sequence[str], weights: Sequence[float] | None = None) -> float:
-        """Standard deviation of a weighted sum of numbers, for example the mass of all bodies."""
-        assert self.covariance is not None, "there are estimates"
-        places = [list(self).index(name) for name in names]
-        w = np.ones(len(places)) if weights is None else np.array(weights)
-        return float(np.sqrt(max(w @ self.covariance[np.ix_(places, places)] @ w, 0.0)))
-
     @property
     def total_mass(self) -> tuple[float, float]:
         """Of all bodies that were estimated, and its standard deviation in kg."""
-        names = [each.name for each in self.entries if each.name.endswith(".mass")]
-        return sum(self[name].value for name in names), self.std_of(names)
+        own = [k for k, each in enumerate(self.entries) if each.name.endswith(".mass")]
+        assert self.covariance is not None, "there are estimates"
+        variance = float(self.covariance[np.ix_(own, own)].sum())
+        return sum(self.entries[k].value for k in own), max(variance, 0.0) ** 0.5
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON values."""

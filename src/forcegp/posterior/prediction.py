@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, UnknownName, UnknownRow, require_known
+from forcegp.errors import InvalidInput, NumericalError, UnknownName, require_known
 from forcegp.evidence import Accelerations
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
@@ -28,7 +28,6 @@ Positions = Float[Tensor, "rows nq"]
 Inputs = Float[Tensor, "rows nu"]
 """One number per state and input of the system."""
 Array = Tensor | np.ndarray | Sequence[Any]
-AnyGaussian = TypeVar("AnyGaussian", bound="Gaussian")  # beartype cannot check Self where a module is hooked
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,21 +62,6 @@ class Gaussian(Summary):
     def entries(self, which: slice) -> "Gaussian":
         """The distribution of some entries."""
         return Gaussian(self.mean[..., which], None if self.covariance is None else self.covariance[..., which, which])
-
-    def __getitem__(self: AnyGaussian, index: Any) -> AnyGaussian:
-        """Some of the states: `prediction[i]`, `[:10]`, `[mask]`, of the batch. UnknownRow for others."""
-        batch = self.mean.shape[:-1]
-        try:
-            rows = torch.arange(batch.numel(), device=self.mean.device).reshape(batch)[index]
-        except (IndexError, TypeError) as error:
-            raise UnknownRow(f"no states {index!r} in a batch of shape {tuple(batch)}: {error}") from None
-
-        def chosen(part: Any) -> Any:
-            if isinstance(part, Tensor):
-                return part.flatten(0, len(batch) - 1)[rows] if batch else part[None][rows]
-            return part[index] if isinstance(part, Gaussian) else part
-
-        return type(self)(**{item.name: chosen(getattr(self, item.name)) for item in fields(self)})
 
     @override
     def facts(self) -> dict[str, object]:

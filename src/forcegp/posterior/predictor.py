@@ -264,7 +264,9 @@ class Predictor(Summary):
         """
         states, single = self._states(q, v, a, "qva")
         found = inverse_dynamics(self.posterior, states, normal_force, self.kind != "none")
-        return found[0] if single else found
+        if not single:
+            return found
+        return Gaussian(found.mean[0], None if found.covariance is None else found.covariance[0])
 
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
         """The outputs (n, size) of a program at states (n, nv) that were checked, without a graph."""

@@ -252,7 +252,10 @@ class Programs:
             finish = {"covariance": ("covariance", self.sizes[1] ** 2)}
         text.append(write_function("program", program.graph, program.nodes, lanes, names))
         if integrator:
-            text += [*self.motion_source(lanes), ROWS, self._loop_source(integrator, len(program.nodes))]
+            words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
+            words |= {"OUTPUTS": len(program.nodes), "LIMIT": SPEED_LIMIT}
+            words["STEP"] = self.step_source(integrator, "program")
+            text += [*self.motion_source(lanes), ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
         else:
             text.append(entry or write_entry(program, "program", finish))
         return "\n".join(text)
@@ -261,11 +264,6 @@ class Programs:
         """The text of a step that calls `function`, whose slopes are those in a step from q, v and u."""
         columns = 2 * self.sizes[1] + self.sizes[2]
         return filled(steps_of(self.space)[integrator], {"PROGRAM": function, "COLUMNS": columns})
-
-    def _loop_source(self, integrator: str, outputs: int) -> str:
-        words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
-        words |= {"OUTPUTS": outputs, "LIMIT": SPEED_LIMIT, "STEP": self.step_source(integrator, "program")}
-        return filled(c_text(__name__, "rollout_loop.c"), words)
 
     def motion_source(self, lanes: int) -> list[str]:
         """C functions that steps on a manifold call: q after a step, and the rate of a step under a velocity."""

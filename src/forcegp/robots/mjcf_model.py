@@ -93,7 +93,9 @@ class CompiledModel:
         gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)
         text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
         locked = {self.joints[joint]: value for joint, value in self.locked.items()}
-        springs = self._springs() if self.for_system else {}
+        model, sprung = self.model, [k for k in range(self.model.njnt) if self.for_system and self._is_sprung(k)]
+        rest = {k: float(model.qpos_spring[model.jnt_qposadr[k]]) for k in sprung}
+        springs = {self.joints[k]: (float(model.jnt_stiffness[k]), rest[k]) for k in sprung}
         return Translation(text, gravity, self._rotor_inertias(), locked, loops, motors, springs)
 
     @staticmethod
@@ -262,14 +264,6 @@ class CompiledModel:
 
     def _equality(self, k: int) -> str:
         return self.model.equality(k).name or f"equality {k}"
-
-    def _springs(self) -> dict[str, tuple[float, float]]:
-        model, found = self.model, {}
-        for joint in range(model.njnt):
-            if self._is_sprung(joint):
-                rest = model.qpos_spring[model.jnt_qposadr[joint]]
-                found[self.joints[joint]] = float(model.jnt_stiffness[joint]), float(rest)
-        return found
 
     def _is_sprung(self, joint: int) -> bool:
         """Whether it has a linear spring, and one coordinate of its own."""

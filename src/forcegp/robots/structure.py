@@ -56,7 +56,6 @@ class Tree:
     order: Tensor | None  # joint i's position when the levels are laid end to end; None where that is i
     revolute: Tensor  # (n, 1, 1): 1 for revolute and continuous joints, 0 for prismatic ones
     all_revolute: bool
-    is_chain: bool
     descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i, and is not empty
     ancestors: Tensor  # its transpose, empty bodies included
     is_above: Tensor  # (n, n, 1): the same the other way round, as truth values
@@ -67,7 +66,6 @@ class Tree:
     gravity: Tensor  # (3,)
     fall: Tensor  # (3, 4, 1): the acceleration T'' T^-1 of free fall
     armature: Tensor  # (nv,)
-    has_armature: bool
     coupling: Tensor  # (n, nv): G, the velocity of each body's joint per unit of those with a coordinate
     shift: Tensor  # (n, 1): g, their positions at q = 0
     coupled: bool  # whether some joint mimics another; else G is the identity and g is zero
@@ -127,41 +125,38 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
             inertias[placement.body] += placement.offset @ local @ placement.offset.T
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
-    related = np.maximum(moves, moves.T)
     coupling = np.zeros((n, len(layout.joints)))
     for body, drive in enumerate(layout.drives):
         coupling[body, drive.joint] = drive.multiplier
     levels, order = _levels(layout.parents)
 
-    def constant(array: Any) -> Tensor:
-        return torch.tensor(array, dtype=torch.float64)
-
+    constants = {
+        "rest": rest[..., None],
+        "sine": sine[..., None],
+        "cosine": cosine[..., None],
+        "slide": slide[..., None],
+        "revolute": revolute[:, None, None],
+        "descendants": descendants,
+        "ancestors": moves.T,
+        "related": np.maximum(moves, moves.T)[..., None],
+        "velocity_sum": 2.0 * moves.T - own,
+        "twist_basis": twist_basis.reshape(6, 12).T,
+        "inertias": inertias[..., None],
+        "gravity": gravity,
+        "fall": fall[..., None],
+        "armature": armature,
+        "coupling": coupling,
+        "shift": [[drive.offset] for drive in layout.drives],
+    }
     return Tree(
         groups=layout.groups,
         positions=torch.as_tensor(positions) if layout.groups else None,
-        rest=constant(rest[..., None]),
-        sine=constant(sine[..., None]),
-        cosine=constant(cosine[..., None]),
-        slide=constant(slide[..., None]),
         levels=levels,
         order=order,
-        revolute=constant(revolute[:, None, None]),
         all_revolute=bool(revolute.all()),
-        is_chain=bool(related.all()),
-        descendants=constant(descendants),
-        ancestors=constant(moves.T),
-        is_above=constant(moves[..., None]) > 0,
-        related=constant(related[..., None]),
-        velocity_sum=constant(2.0 * moves.T - own),
-        twist_basis=constant(twist_basis.reshape(6, 12).T),
-        inertias=constant(inertias[..., None]),
-        gravity=constant(gravity),
-        fall=constant(fall[..., None]),
-        armature=constant(armature),
-        has_armature=bool(armature.any()),
-        coupling=constant(coupling),
-        shift=constant([[drive.offset] for drive in layout.drives]),
+        is_above=torch.tensor(moves[..., None]) > 0,
         coupled=layout.coupled,
+        **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},
     )
 
 
