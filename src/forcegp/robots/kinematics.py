@@ -188,7 +188,7 @@ class Kinematics:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
         tree, a = self.robot.tree, self._given("a", a)
         forces = self._joint_forces(self._accelerations(a), self.inertias)
-        return self._rows(forces + tree.armature * a.mT)
+        return self._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
     def forward_dynamics(self, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
@@ -265,10 +265,12 @@ class Kinematics:
         momenta = tree.twist_basis.mT @ momenta.flatten(1, 2)
         above = product(self.vectors, momenta.transpose(0, 1))
         # right where the row's joint moves the column's body; elsewhere the transpose is, or neither on other branches
-        out = torch.where(tree.is_above, above, above.transpose(0, 1)) * tree.related
+        out = torch.where(tree.is_above, above, above.transpose(0, 1))
+        out = out if tree.is_chain else out * tree.related
         if tree.coupled:
             out = torch.einsum("ki,klb,lj->ijb", tree.coupling, out, tree.coupling)
-        out = out + torch.diag(tree.armature)[..., None]
+        if tree.has_armature:
+            out = out + torch.diag(tree.armature)[..., None]
         return out.movedim(-1, 0).contiguous()
 
     def _bias_forces(self, inertias: Bodies) -> Float[Tensor, "batch nv"]:

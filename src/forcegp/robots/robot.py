@@ -355,11 +355,9 @@ class Robot(RobotStructure, RigidBodyDynamics):
     @override
     def _dynamics(self, function: str, *arguments: Tensor) -> Any:
         q, *others = arguments
-        if len(others) == 2:  # the third may have more rows than the states
-            given = {
-                x: self.checked_input(x, y)
-                for x, y in zip(("q", "v", "tau" if function == "forward_dynamics" else "a"), arguments, strict=True)
-            }
+        if len(others) == 2 and len({getattr(x, "shape", ())[:-1] for x in arguments}) > 1:
+            names = "q", "v", "tau" if function == "forward_dynamics" else "a"
+            given = {name: self.checked_input(name, x) for name, x in zip(names, arguments, strict=True)}
             batch = broadcast_batch({name: x.shape[:-1] for name, x in given.items()})
             q, *others = (x.expand(*batch, -1) for x in given.values())
         return getattr(self.kinematics(q, *others[:1]), function)(*others[1:])

@@ -68,6 +68,8 @@ class Tree:
     armature: Tensor  # (nv,)
     coupling: Tensor  # (n, nv): G, the velocity of each body's joint per unit of those with a coordinate
     shift: Tensor  # (n, 1): g, their positions at q = 0
+    is_chain: bool
+    has_armature: bool
     coupled: bool  # whether some joint mimics another; else G is the identity and g is zero
 
     def to(self, device: torch.device | str) -> "Tree":
@@ -130,7 +132,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         coupling[body, drive.joint] = drive.multiplier
     levels, order = _levels(layout.parents)
 
-    constants = {
+    constants: dict[str, Any] = {
         "rest": rest[..., None],
         "sine": sine[..., None],
         "cosine": cosine[..., None],
@@ -156,6 +158,8 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         all_revolute=bool(revolute.all()),
         is_above=torch.tensor(moves[..., None]) > 0,
         coupled=layout.coupled,
+        is_chain=bool(constants["related"].all()),
+        has_armature=bool(armature.any()),
         **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},
     )
 
