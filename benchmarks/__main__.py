@@ -14,8 +14,7 @@ from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 
-from benchmarks.performance_page import PAGE, performance_page
-from benchmarks.questions import TITLES
+from benchmarks.performance_page import PAGE, QUESTIONS, performance_page
 from forcegp.atomic_files import write_text
 from forcegp.jobs import machine
 
@@ -25,15 +24,15 @@ RESULTS = FOLDER / "results.json"
 
 def main(questions: list[str]) -> None:
     """Run the questions named (all by default) and store what they answer."""
-    unknown = [name for name in questions if name not in TITLES]
+    unknown = [name for name in questions if name not in QUESTIONS]
     if unknown:
-        raise SystemExit(f"no benchmark {unknown[0]!r}; there are: {', '.join(TITLES)}")
+        raise SystemExit(f"no benchmark {unknown[0]!r}; there are: {', '.join(QUESTIONS)}")
     import torch
     from threadpoolctl import threadpool_limits
 
     stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     torch.set_num_threads(1)
-    for name in questions or TITLES:
+    for name in questions or QUESTIONS:
         print(f"\n== {name}", flush=True)
         module = import_module(f"benchmarks.{name}")
         with threadpool_limits(1):  # entered after the libraries are loaded, or it would miss them

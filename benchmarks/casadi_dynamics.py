@@ -13,12 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
+import casadi as untyped
 import numpy as np
 
 from forcegp.robots import Robot
 from forcegp.robots.compiled import UnrolledRobot
 
+ca: Any = untyped
 QUANTITIES = ("mass_bias", "fd")
 LOOP = """
 void loop(long n, const double *const *a, double *const *o) {

@@ -3,21 +3,16 @@
 One process, one thread, all sides in turn, CPU seconds, medians; the robot is the KUKA iiwa, 1,000 and 10,000 random
 states. All sides are first checked to agree. CasADi's is in `benchmarks.casadi_dynamics`, and the stronger of the two.
 The Pinocchio side is a C++ loop over the states (see `benchmarks.rigid_body`).
-`pin.abaInParallel` is in the table as well, with one thread and with two (wall-clock time there).
 
 "Cold" is the time to compile into an empty folder, "warm" the time in a new process from ``robot.compile(folder)`` to
 the first result of forward dynamics, with torch and the robot loaded (wall-clock time both).
 
     python -m benchmarks.compiled_dynamics
-    python -m benchmarks.compiled_dynamics inductor     the same operations through torch.compile (minutes)
-    python -m benchmarks.compiled_dynamics chain 30     compiling forward dynamics of 30 skew joints in series
 """
 
 from __future__ import annotations
 
 import ctypes
-import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -33,7 +28,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.casadi_dynamics import QUANTITIES, CasadiLoops
 from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
 from forcegp.robots import Robot
-from forcegp.robots.compiled import CompiledRobot, UnrolledRobot, trace_dynamics
+from forcegp.robots.compiled import CompiledRobot
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
 
@@ -93,16 +88,6 @@ def against_casadi(states: States, mine: Ours, folder: Path) -> dict[str, float]
     return found
 
 
-def aba_in_parallel(states: States) -> list[float]:
-    """Wall-clock seconds of `pin.abaInParallel`, one thread and two."""
-    pool, given = pin.ModelPool(states.model, 2), [np.asfortranarray(x.T) for x in (states.q, states.v, states.tau)]
-    out = np.zeros_like(given[0], order="F")
-    return [
-        statistics.median(seconds(lambda: pin.abaInParallel(threads, pool, *given, out)) for _ in range(20))  # noqa: B023
-        for threads in (1, 2)
-    ]
-
-
 def agreement(mine: Ours, loops: Loops) -> float:
     """Largest error of all results."""
     mass, bias = mine.mass_and_bias()
@@ -129,54 +114,6 @@ def cold(robot: Robot, folder: Path) -> dict[str, float]:
         "mass matrix + bias": seconds(lambda: compiled_robot.mass_matrix_and_bias(q, v)),
         "forward dynamics": seconds(lambda: compiled_robot.forward_dynamics(q, v, tau)),
     }
-
-
-def inductor() -> None:
-    """Print what torch.compile makes of the unrolled forward dynamics, and how long it takes to."""
-    states = States(BATCH)
-    program = trace_dynamics(UnrolledRobot(states.robot), "forward_dynamics")
-    graph = program.graph
-
-    @torch.compile(dynamic=True, fullgraph=True)
-    def forward(q: torch.Tensor, v: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
-        inputs = [*q.unbind(-1), *v.unbind(-1), *tau.unbind(-1)]
-        found: dict[int, torch.Tensor] = {}
-        for node in graph.needed(program.nodes):
-            operation, *rest = graph.nodes[node]
-            match operation:
-                case "constant":
-                    found[node] = torch.tensor(rest[0], dtype=torch.float64)
-                case "input":
-                    found[node] = inputs[rest[0]]
-                case _:
-                    found[node] = getattr(torch, operation.replace("negate", "neg"))(*(found[x] for x in rest))
-        return torch.stack([found[node] for node in program.outputs["result 0"]], dim=-1)
-
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder
-        taken = seconds(lambda: forward(*states.tensors))
-        error = largest_error(forward(*states.tensors), states.robot.forward_dynamics(*states.tensors))
-        (own,) = in_turn(lambda: forward(*states.tensors), repetitions=REPETITIONS)
-    print(f"forward dynamics by torch.compile: compiled in {taken:.0f} s, {1e3 * own:.2f} ms, error {error:.1e}")
-
-
-def chain(joints: int) -> None:
-    """Print how long forward dynamics of a chain without any structural zeros takes to compile."""
-    inertial = """<inertial><origin xyz="0.1 0.02 0.03"/><mass value="1"/>
-        <inertia ixx="0.01" ixy="0.001" ixz="0.0005" iyy="0.012" iyz="0.0004" izz="0.009"/></inertial>"""
-    parts = [
-        f"""<joint name="j{k}" type="continuous"><origin xyz="0.1 0.05 0.2" rpy="0.3 -0.2 {0.1 * k}"/>
-        <parent link="l{k - 1}"/><child link="l{k}"/><axis xyz="1 {k % 3} -1"/></joint>
-        <link name="l{k}">{inertial}</link>"""
-        for k in range(1, joints + 1)
-    ]
-    robot = Robot.from_urdf_text(f"""<robot name="chain"><link name="l0"/>{"".join(parts)}</robot>""")
-    operations = trace_dynamics(UnrolledRobot(robot), "forward_dynamics").operations
-    with tempfile.TemporaryDirectory() as folder:
-        start = sum(os.times()[:4])  # with those of the compiler
-        robot.compile(folder).prepare("forward_dynamics")
-        taken = sum(os.times()[:4]) - start
-    print(f"forward dynamics of {joints} joints: {operations} operations, compiled in {taken:.1f} CPU s")
 
 
 def run() -> dict[str, float]:
@@ -222,13 +159,11 @@ def run() -> dict[str, float]:
             fewer = States(count)
             own = Ours(fewer, mine.of)
             results |= against_casadi(fewer, own, folder / str(count))
-        parallel = aba_in_parallel(states)
     print(f"\n{f'CPU ms, medians, {BATCH} states':56s}{'compiled':>10s}{'eager':>10s}{'C++ loops':>18s}{'ratio':>8s}")
     for label, own, slow, others in rows:
         listed = " / ".join(f"{1e3 * other:.1f}" for other in others)
         print(f"{label:56s}{1e3 * own:10.2f}{1e3 * slow:10.1f}{listed:>18s}{own / min(others):8.3f}")
     print(f"{'forward dynamics, 1 state (pin.aba)':56s}{1e3 * single:10.4f}{1e3 * alone:28.4f}")
-    print("pin.abaInParallel, one thread and two, wall-clock ms: " + ", ".join(f"{1e3 * x:.1f}" for x in parallel))
     return results
 
 
@@ -238,12 +173,6 @@ def main(arguments: list[str]) -> None:
         robot = Robot.from_urdf(URDF)
         q, v, tau = torch.zeros(3, robot.nv, dtype=torch.float64)
         print(seconds(lambda: robot.compile(arguments[1]).forward_dynamics(q, v, tau)))
-        return
-    if arguments[:1] == ["inductor"]:
-        inductor()
-        return
-    if arguments[:1] == ["chain"]:
-        chain(int(arguments[1]))
         return
     with threadpool_limits(1):
         for key, value in run().items():

@@ -32,7 +32,7 @@ NOISE_V, NOISE_U = 0.002, 0.05
 def moved(robot: Robot, seed: int, seconds: float, newton: float = 0.0) -> dict[str, np.ndarray]:
     """q, v, u (T, 7) as measured, and the joint torques of the pushes."""
     plant, law, reference = robot.compile(), JointFrictionLaw(CONFIG, robot), Reference.random(seed, 0.4, 3.5)
-    control, rng = PDGravity(plant, **GAINS), np.random.default_rng(seed)
+    control, rng, force = PDGravity(plant, **GAINS), np.random.default_rng(seed), np.zeros(3)
     (q, v, _), rows, push = reference(0.0), [], np.zeros(7)
     for k in range(round(seconds * RATE)):
         since = (k / RATE) % EVERY

@@ -1,4 +1,4 @@
-"""The pictures of docs/how-to/control.md, of one seed: `tracking` over time and as a film, contacts, and an excitation.
+"""The pictures of docs/how-to/control.md, of one seed: `tracking` as a film, and contacts.
 
 python -m benchmarks.control_pictures
 """
@@ -15,14 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-import forcegp
 from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
-from benchmarks.excitation import LIMITS, Learner
 from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
-    MIDDLE,
     RATE,
     controllers,
     error,
@@ -34,26 +31,22 @@ from benchmarks.tracking import (
     task_of,
 )
 from forcegp import Model, Robot
-from forcegp.control import Excitation, PDGravity
+from forcegp.control import PDGravity
 from forcegp.posterior import Posterior
-from forcegp.scores import contacts_figure, curve_panels
+from forcegp.scores import contacts_figure
 from forcegp.scores.figures.style import (
     IDENTIFIED,
     KNOWN_PHYSICS,
     MEASUREMENT,
     PREDICTION,
     QUANTILE,
-    QUIET,
     SMALL,
     TRUTH,
     draw_band,
-    draw_line,
-    heading,
     legend_below,
     new_figure,
     quiet,
     save_figure,
-    short_joint_names,
 )
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
@@ -68,34 +61,6 @@ COLORS = {
 }
 
 
-def excitation_figure(chosen: Excitation) -> Figure:
-    """Velocity over position of every joint; below, where each has one friction curve, this before and after."""
-    robot, model, fastest = chosen.robot, chosen.model, chosen.limits["velocity"][1]
-    panels = [] if model is None else curve_panels(model)
-    rows = 2 if len(panels) == robot.nv else 1
-    figure = new_figure(max(2.2 * robot.nv, 6.0), 1.2 + 2.2 * rows)
-    grid = figure.subplots(rows, robot.nv, squeeze=False)
-    for j, name in enumerate(short_joint_names(robot.joint_names)):
-        axes, (length, force) = grid[0, j], ("m", "N") if robot.joints[j].type == "prismatic" else ("rad", "Nm")
-        if model is not None:
-            log = model.training.q[:, j], model.training.v[:, j]
-            axes.plot(*log, ".", markersize=3, color=QUIET, label="log so far", zorder=3)
-        draw_line(axes, chosen.motion.q[:, j], chosen.motion.v[:, j], PREDICTION, 1.0, "chosen motion")
-        axes.locator_params(nbins=4)
-        quiet(axes, title=name, x=f"position [{length}]", y="" if j else f"velocity [{length}/s]")
-        if model is None or chosen.expected is None or rows == 1:
-            continue
-        axes, v = grid[1, j], np.linspace(-fastest[j], fastest[j], 301)
-        for posterior, color, when in ((model, QUIET, "so far"), (chosen.expected, PREDICTION, "after")):
-            std = posterior.curve(panels[j].latent, v).std
-            draw_line(axes, v, std, color, 1.2, f"standard deviation {when}")
-        axes.set_yscale("log")
-        quiet(axes, x=f"velocity [{length}/s]", y="" if j else f"standard deviation\nof friction [{force}]")
-    legend_below(figure, *grid[:, 0])
-    heading(figure, f"The next {chosen.seconds:g} s")
-    return figure
-
-
 def motions() -> tuple[Robot, Posterior, dict[str, dict[str, np.ndarray]]]:
     """The arm, the model that learned, and controller -> what the arm did."""
     robot = robot_of()
@@ -104,26 +69,6 @@ def motions() -> tuple[Robot, Posterior, dict[str, dict[str, np.ndarray]]]:
     found = controllers(rows, given, robot, SEED)
     done = {name: followed(robot, task, control, SECONDS) for name, control in found.items()}
     return robot, fits(rows, given, SEED)["learned"], done
-
-
-def errors(done: dict[str, dict[str, np.ndarray]]) -> Figure:
-    """Root mean square over the joints, over time."""
-    figure = new_figure(8.0, 3.4)
-    axes = figure.subplots()
-    for name, motion in done.items():
-        time = np.arange(len(motion["e"])) / RATE
-        size = 1e3 * np.sqrt(np.mean(motion["e"] ** 2, axis=1))
-        style = "--" if name == "true model" else "-"
-        axes.semilogy(time, np.maximum(size, 1e-2), style, color=COLORS[name], linewidth=1.4, label=name)
-    axes.set_ylim(0.1, 400.0)
-    quiet(
-        axes,
-        title="KUKA iiwa with Stribeck friction, equal gains, 100 rows to learn from",
-        x="time [s]",
-        y="error [mrad]",
-    )
-    figure.legend(fontsize=SMALL, frameon=False, loc="outside lower center", ncols=5)
-    return figure
 
 
 def links(robot: Robot, q: np.ndarray) -> np.ndarray:
@@ -273,10 +218,6 @@ if __name__ == "__main__":
     for name, figure in zip(("monitor", "monitor-rates"), contacts(), strict=True):
         save_figure(figure, FOLDER / f"{name}.png")
     arm, model, found = motions()
-    save_figure(errors(found), FOLDER / "tracking.png")
     first, *others = film(arm, model, found)
     more = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0, "optimize": True}
     first.save(FOLDER / "tracking.gif", save_all=True, append_images=others, **more)
-    learner = Learner(SEED)
-    chosen = forcegp.excitation(learner.before, limits=LIMITS, start=MIDDLE, task=learner.task, seed=SEED)
-    save_figure(excitation_figure(chosen), FOLDER / "excitation.png")

@@ -14,8 +14,6 @@ acceleration, against the noise-free ones of the simulation, on every fifth seco
 rows are learned. CPU: process time of update and refresh over the number of rows. Coverage: of the noise-free
 acceleration by 95 % intervals. Five seeds, medians.
 
-"Without a pause": the controller runs for 20 s at 240 Hz by the wall clock, while another thread learns.
-
     python -m benchmarks drift
 """
 
@@ -23,9 +21,7 @@ from __future__ import annotations
 
 import math
 import statistics
-import sys
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -164,50 +160,6 @@ def drifted(seed: int, seconds: int = SECONDS, horizons: tuple[float, ...] = ())
     return found
 
 
-def late_calls(seconds: float = 20.0) -> dict[str, float]:
-    """Share of the controller's calls that end after their period: alone, and while another thread learns."""
-    plant, reference, found = Plant(), task_of(1), {}
-    first, _ = first_model(plant, 1)
-    for learning in (False, True):
-        posterior, control = first, ComputedTorque(first.predictor(covariance="none"), **GAINS)
-        durations, pending, (q, v, _) = [], [], reference(0.0)
-        control(q, v, *reference(0.0))  # compiles
-        control.model = control.model.refreshed(posterior)  # traces
-        job: Future | None = None
-
-        def learn(posterior: Posterior, predictor, rows: Dataset):
-            posterior = posterior.update(rows, horizon=HORIZON)
-            return posterior, predictor.refreshed(posterior)
-
-        with ThreadPoolExecutor(1) as worker:
-            start = time.perf_counter()
-            for k in range(round(seconds * RATE)):
-                while time.perf_counter() < start + k / RATE:
-                    pass
-                begin = time.perf_counter()
-                u = control(q, v, *reference(k / RATE)).numpy()
-                if job is not None and job.done():
-                    posterior, control.model = job.result()
-                    job = None
-                pending.append((q, v, u))
-                if learning and job is None and len(pending) > RATE:
-                    Q, V, U = (np.array(x) for x in zip(*pending, strict=True))
-                    pending = []
-                    job = worker.submit(learn, posterior, control.model, plant.rows(Q, V, U[:-1], k / RATE, 1))
-                durations.append(time.perf_counter() - begin)
-                for _ in range(FINE):
-                    v = v + plant.acceleration(q, v, u, 0.0) / (RATE * FINE)
-                    q = q + v / (RATE * FINE)
-        late = np.array(durations) > 1.0 / RATE
-        print(
-            f"{'learning' if learning else 'alone'}: calls of {1e3 * np.median(durations):.2f} ms (median), "
-            f"{1e3 * np.quantile(durations, 0.999):.2f} ms (99.9 %), longest {1e3 * max(durations):.2f} ms, "
-            f"{int(late.sum())} of {len(late)} longer than a period"
-        )
-        found["learning" if learning else "alone"] = float(late.mean())
-    return found
-
-
 def run() -> dict[str, float]:
     found: dict[str, list[tuple[float, ...]]] = {}
     for seed in SEEDS:
@@ -227,11 +179,6 @@ def run() -> dict[str, float]:
             f"{name:15s} {1e3 * torque:8.2f} mNm {acceleration:7.4f} rad/s^2, over refit {over[0]:.2f} {over[1]:.2f}, "
             f"coverage {coverage:.3f}, {spent:.3f} ms CPU per row"
         )
-    for interval in (5e-3, 2e-4):  # for which a thread of Python keeps the interpreter while another waits
-        sys.setswitchinterval(interval)
-        print(f"threads switch after {1e3 * interval:g} ms")
-        late_calls()
-    sys.setswitchinterval(5e-3)
     return {
         "drift_online_over_refit_torque": statistics.median(x[0] for x in ratios["online"]),
         "drift_online_over_refit_acceleration": statistics.median(x[1] for x in ratios["online"]),

@@ -1,7 +1,7 @@
 """The pictures of docs/how-to/forces.md: what every prior learns from few points, beside the truth.
 
 python -m benchmarks.force_pictures                          all of them, into docs/how-to/forces
-python -m benchmarks.force_pictures joint-forces joint-ripple     these
+python -m benchmarks.force_pictures joint-friction friction-map   these
 python -m benchmarks.force_pictures --out elsewhere
 
 The KUKA of `forcegp simulate kuka-surface`. Where that scenario has no such force, the states of a recording keep their
@@ -11,8 +11,9 @@ torques, and the acceleration is computed anew with the force (`with_force`).
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,34 +21,72 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from benchmarks.force_recordings import (
-    F64,
-    Law,
-    across_the_strip,
-    fitted,
-    plane_of,
-    recording,
-    roughness,
-    turntable,
-    visited,
-    with_force,
-)
-from forcegp import ContactFriction, JointForces, JointFriction, KukaSurfaceConfig, ToolForces
-from forcegp.forces import JointAccelerations, PeriodicJointForces
+from forcegp import ContactFriction, Dataset, JointFriction, KukaSurfaceConfig, fit, simulate_kuka_surface
+from forcegp.forces import Unknown
 from forcegp.forces.contact_friction import ExpectedFriction
+from forcegp.mechanics import surface_axes
 from forcegp.scores import friction_curves_figure, normal_force_figure, save_figure
 from forcegp.scores.figures.style import (
     KNOWN_PHYSICS,
-    MEASUREMENT,
     NORMAL,
     PREDICTION,
     TRUTH,
     new_figure,
     quiet,
-    window,
 )
 
 BAND = 1.959963984540054
+NOISE = 0.1
+"""rad/s^2"""
+TOOL = "lbr_iiwa_link_7"
+F64 = torch.float64
+
+Law = Callable[[torch.Tensor], torch.Tensor]
+
+
+@cache
+def recording(seed: int, **options: Any) -> Dataset:
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=40.0, seed=seed, **options))
+
+
+def with_force(data: Dataset, prior: Unknown, *laws: Law, seed: int = 5) -> Dataset:
+    """The states and torques of `data` with the acceleration under another unknown force, one law per latent."""
+    assert data.model is not None
+    q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
+    dynamics = data.model.dynamics(q, v, u)
+    latents = [law(z[:, 0]) for law, z in zip(laws, prior.features(dynamics), strict=True)]
+    a = dynamics.acceleration((prior.direction(dynamics) @ torch.stack(latents, -1)[..., None])[..., 0]).numpy()
+    return replace(data, a=a + NOISE * np.random.default_rng(seed).standard_normal(a.shape), truth={"a": a})
+
+
+def fitted(data: Dataset, prior: Unknown | tuple[Unknown, ...], points: int) -> Any:
+    assert data.model is not None
+    model = data.model.with_forces(*(prior if isinstance(prior, tuple) else (prior,)))
+    return fit(model, data, points=points, restarts=1)
+
+
+def across_the_strip() -> tuple[torch.Tensor, torch.Tensor]:
+    """Places x (201, 1) across the strip, and the points (201, 3) on the plane at y = 0.5 m."""
+    x = torch.linspace(-0.5, 0.5, 201, dtype=F64)
+    return x[:, None], torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.055)], -1)
+
+
+def roughness(x: torch.Tensor) -> torch.Tensor:
+    """Viscous coefficient in N/(m/s) of a patch of factor 4."""
+    return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25))
+
+
+def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
+    """The two tangents (3, 2) of the plane, of which the first is x, and where the tool was in x."""
+    dynamics = posterior.likelihood.dynamics
+    tool = dynamics.state.kinematics.frame_pose(TOOL)
+    points = tool[:, :3, 3] + 0.1 * tool[:, :3, 2]
+    return surface_axes(dynamics.normals[:1, 0, :])[0, :, :2], points[:, 0].numpy()
+
+
+def visited(posterior: Any, latent: int, feature: int = 0) -> np.ndarray:
+    features = posterior.model.unknown.features(posterior.likelihood.dynamics)
+    return features[latent][:, feature].numpy()
 
 
 def draw_curve(axes: Any, curve: Any, law: Law | None, ticks: np.ndarray | None = None) -> None:
@@ -78,64 +117,10 @@ def finish(figure: Any, *axes: Any) -> Any:
     return figure
 
 
-def joint_forces() -> Any:
-    """Left: a torque of an arm on a surface over time. Right: what a turning joint gains from sines and cosines."""
-    data, test = recording(1), window(recording(2), 4.0, 3.0)
-    force = fitted(data, JointForces(), 100).predict(test.q, test.v, test.u).unknown_force
-    figure = new_figure(10.0, 3.2)
-    left, *right = figure.subplots(1, 3, width_ratios=(1.5, 1.0, 1.0))
-    joint = 0
-    seconds = torch.tensor(test.time - test.time[0])[:, None]
-    drawn = _Line(seconds, force.mean[:, joint], force.std[:, joint])
-    draw_curve(left, drawn, lambda _: torch.tensor(test.truth["Q_U"][:, joint]))
-    quiet(left, title="KUKA, joint 1: unknown torque, 100 points", x="time [s]", y="torque [Nm]")
-
-    def torque(q: torch.Tensor) -> torch.Tensor:
-        return 2.0 * torch.sin(q) + 0.8 * torch.cos(2.0 * q)
-
-    rows = turntable(torque)
-    turn = torch.linspace(-math.pi, 3.0 * math.pi, 300, dtype=F64)[:, None]
-    for axes, angles in zip(right, ("plain", "sin-cos"), strict=True):
-        posterior = fitted(rows, JointForces(inputs=("q",), angles=angles), 25)
-        there = posterior.predict(turn, 0.0 * turn, 0.0 * turn).unknown_force
-        draw_curve(axes, _Line(turn, there.mean[:, 0], there.std[:, 0]), torque, rows.q[:, 0])
-        axes.set_xticks([-math.pi, 0.0, math.pi, 2.0 * math.pi, 3.0 * math.pi], ["−π", "0", "π", "2π", "3π"])
-        axes.set_ylim(-4.5, 4.5)
-        quiet(axes, title=f"turntable, angles={angles}", x="joint position [rad]", y="torque [Nm]")
-    return finish(figure, left, *right)
-
-
 def joint_friction() -> Any:
     data = recording(1, surface="none", joint_friction="stribeck")
     posterior = fitted(data, JointFriction(), 100)
     return friction_curves_figure(posterior, recording(2, surface="none", joint_friction="stribeck"))
-
-
-def tool_forces() -> Any:
-    """Left: the two friction curves. Right: a force that depends on the place."""
-    plain = fitted(recording(1), ToolForces(), 20)
-    rough = recording(1, patch_factor=4.0)
-    kernel = "matern-3/2"
-    posterior = fitted(rough, ToolForces(inputs=("velocity", "position"), kernel=kernel), 300)
-    figure = new_figure(10.0, 3.2)
-    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.4))
-    speed = torch.linspace(-2.8, 2.8, 121, dtype=F64)
-    features = torch.stack([speed, torch.zeros_like(speed)], -1)
-    curve = plain.curve("force-tangent-1", features)
-    draw_curve(left, curve, lambda v: -v, visited(plain, 0))
-    quiet(left, title="tool-friction, 20 points", x="velocity along tangent-1 [m/s]", y="force along tangent-1 [N]")
-    tangents, visited_x = plane_of(posterior)
-    x, place = across_the_strip()
-    one_along = torch.tensor([1.0, 0.0], dtype=F64).expand(len(x), 2)
-    curve = posterior.curve("force-tangent-1", torch.cat([one_along, place @ tangents], -1))
-    draw_curve(right, _Line(x, curve.mean, curve.std), lambda p: -roughness(p), visited_x)
-    quiet(
-        right,
-        title="tool-forces across a rough strip, 300 points",
-        x="position x [m]",
-        y="force at 1 m/s [N]",
-    )
-    return finish(figure, left, right)
 
 
 def contact_friction() -> Any:
@@ -177,58 +162,6 @@ def contact_friction() -> Any:
     return finish(figure, one, two, three)
 
 
-def joint_ripple() -> Any:
-    """Cogging of two joints with 12 pole pairs, of which the data saw a part of the turn only."""
-    joints = ("lbr_iiwa_joint_1", "lbr_iiwa_joint_4")
-    prior = PeriodicJointForces(2.0 * math.pi / 12.0, joints)
-
-    def cogging(q: torch.Tensor) -> torch.Tensor:
-        return 0.8 * torch.sin(12.0 * q) + 0.3 * torch.sin(24.0 * q + 1.0)
-
-    free = recording(1, surface="none")
-    posterior = fitted(with_force(free, prior, cogging, cogging), prior, 25)
-    figure = new_figure(10.0, 3.2)
-    grid = figure.subplots(1, 2)
-    for index, (axes, joint) in enumerate(zip(grid, joints, strict=True)):
-        at = visited(posterior, index)
-        curve = posterior.curve(joint, torch.linspace(at.min() - 0.8, at.max() + 0.8, 400, dtype=F64))
-        draw_curve(axes, curve, cogging, at)
-        quiet(axes, title=f"joint {joint[-1]}, 25 points", x="joint position [rad]", y="torque [Nm]")
-    return finish(figure, *grid)
-
-
-def joint_accelerations() -> Any:
-    """Two joints over the same seconds as in the picture of `no_forces`."""
-    test = window(recording(2), 4.0, 2.5)
-    predicted = fitted(recording(1), JointAccelerations(), 100, "zero").predict(test.q, test.v, test.u)
-    figure = new_figure(10.0, 3.2)
-    grid = figure.subplots(1, 2)
-    seconds = torch.tensor(test.time - test.time[0])[:, None]
-    for axes, joint in zip(grid, (4, 6), strict=True):
-        axes.plot(seconds[:, 0], test.a[:, joint], ".", color=MEASUREMENT, markersize=2, label="measured", zorder=1)
-        truth = torch.tensor(test.truth["a"][:, joint])
-        draw_curve(axes, _Line(seconds, predicted.mean[:, joint], predicted.std[:, joint]), lambda _, a=truth: a)
-        quiet(axes, title=f"joint {joint + 1}, 100 points, mean=zero", x="time [s]", y="acceleration [rad/s²]")
-    return finish(figure, *grid)
-
-
-def no_forces() -> Any:
-    """What known physics leaves unexplained."""
-    test = window(recording(2), 4.0, 2.5)
-    predicted = fitted(recording(1), (), 100).predict(test.q, test.v, test.u).mean.numpy()
-    figure = new_figure(10.0, 3.2)
-    grid = figure.subplots(1, 2)
-    seconds = test.time - test.time[0]
-    for axes, joint in zip(grid, (4, 6), strict=True):
-        own, truth = predicted[:, joint], test.truth["a"][:, joint]
-        axes.fill_between(seconds, truth, own, color=KNOWN_PHYSICS, alpha=0.2, linewidth=0, label="left to be learned")
-        axes.plot(seconds, truth, color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
-        axes.plot(seconds, own, color=KNOWN_PHYSICS, linewidth=1.5, label="known physics alone")
-        axes.margins(x=0)
-        quiet(axes, title=f"joint {joint + 1}", x="time [s]", y="acceleration [rad/s²]")
-    return finish(figure, *grid)
-
-
 def friction_curves() -> Any:
     """All friction of an arm that rubs on a surface, in its joints and at its tool, from one fit."""
     options = {"friction": "stribeck", "joint_friction": "stribeck"}
@@ -266,14 +199,9 @@ class _Line:
 
 
 PICTURES: dict[str, Callable[[], Any]] = {
-    "joint-forces": joint_forces,
     "joint-friction": joint_friction,
-    "tool-forces": tool_forces,
     "contact-friction": contact_friction,
     "friction-map": friction_map,
-    "joint-ripple": joint_ripple,
-    "joint-accelerations": joint_accelerations,
-    "no-forces": no_forces,
     "friction-curves": friction_curves,
     "normal-force": normal_force,
 }

@@ -50,7 +50,7 @@ def seconds_per_step(model: Any, data: Any) -> float:
 def ends(model: Any, begin: np.ndarray, threads: int) -> np.ndarray:
     with rollout.Rollout(nthread=threads) as runner:
         data = [mujoco.MjData(model) for _ in range(threads)]
-        return runner.rollout([model] * len(begin), data, begin, nstep=300)[0]
+        return np.asarray(runner.rollout([model] * len(begin), data, begin, nstep=300)[0])
 
 
 def run() -> dict[str, float]:

@@ -103,7 +103,8 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
     wanted = contact.position(task.model.robot.kinematics(torch.tensor(task.q))).numpy()
     off = np.linalg.norm(np.array(places) - wanted, axis=1)
     first = round(1.0 / CONFIG.time_step)
-    return tuple(float(np.sqrt(np.mean(np.square(x[first:])))) for x in (np.array(forces), 1e3 * off))
+    force, place = (float(np.sqrt(np.mean(np.square(x[first:])))) for x in (np.array(forces), 1e3 * off))
+    return force, place
 
 
 def controllers(data: Dataset, seed: int) -> dict[str, HybridForce]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import operator
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.questions import MEANINGS, TITLES
-
+QUESTIONS: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("questions.toml").read_text("utf-8"))
+"""By question its title, and by key the bound and the meaning; in the order in which they are asked."""
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "benchmarks"
 PAGE = DOCS / "performance.md"
 SCALING = DOCS / "performance" / "scaling.json"
@@ -30,14 +31,14 @@ COMPARISONS = {"<=": operator.le, ">=": operator.ge}
 def performance_page(results: Mapping[str, Any]) -> str:
     """The whole page."""
     parts = [INTRODUCTION]
-    for question, title in TITLES.items():
-        known = {key: meaning for key, meaning in MEANINGS[question].items() if key in results}
+    for question, asked in QUESTIONS.items():
+        known = {key: each for key, each in asked.items() if key in results}
         if not known:
             continue
         rows = ["| what | measured | required | met |", "|:---|---:|:---|:---|"]
         for key, (bound, meaning) in known.items():
             rows.append(f"| {meaning} (`{key}`) | {results[key]:.4g} | {bound} | {kept(results[key], bound)} |")
-        parts += [f"## {title}\n\n`python -m benchmarks {question}`\n", "\n".join(rows) + "\n"]
+        parts += [f"## {asked['title']}\n\n`python -m benchmarks {question}`\n", "\n".join(rows) + "\n"]
         if question == "scaling" and SCALING.exists():
             parts += ["![CPU time and memory over the number of training rows](performance/scaling.png)\n", scaling()]
     parts.append(f"{results['machine']}, {results['date']} (the newest of the measurements above).\n")

@@ -19,6 +19,8 @@ import torch
 
 from benchmarks.swing_up import DT, LIMITS, SEEDS, Arm, models, recorded
 from forcegp import casadi_function
+from forcegp.posterior import Posterior
+from forcegp.posterior.predictor import Predictor
 
 STEPS = 100
 HANGING, UPRIGHT = np.array([math.pi, 0.0, 0.0, 0.0]), np.zeros(4)
@@ -28,7 +30,7 @@ ENOUGH = {"tol": 1e-3, "acceptable_tol": 0.1, "acceptable_constr_viol_tol": 1e-4
 """IPOPT's tolerances: the slopes of friction curves jump, on which its own (1e-8) are met late or never."""
 
 
-def planned(posterior: object, start: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
+def planned(posterior: Posterior, start: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """States (STEPS + 1, 4) and torques (STEPS, 2), from another plan or a straight line.
 
     Raises RuntimeError where IPOPT finds no plan.
@@ -51,10 +53,10 @@ def planned(posterior: object, start: tuple[np.ndarray, np.ndarray] | None = Non
     settings = {"print_level": 0, "sb": "yes", "max_iter": 500, "acceptable_obj_change_tol": 1e-3, **ENOUGH}
     problem.solver("ipopt", {"print_time": False}, settings)
     found = problem.solve()
-    return found.value(X).T, found.value(U).T
+    return np.asarray(found.value(X)).T, np.asarray(found.value(U)).T
 
 
-def regulator(predictor: object, X: np.ndarray, U: np.ndarray) -> list[np.ndarray]:
+def regulator(predictor: Predictor, X: np.ndarray, U: np.ndarray) -> list[np.ndarray]:
     """Gains K_k (2, 4) by the Riccati recursion."""
     Q, R = np.diag([100.0, 100.0, 1.0, 1.0]), 0.01 * np.eye(2)
     P, gains = 10.0 * Q, []
@@ -67,7 +69,7 @@ def regulator(predictor: object, X: np.ndarray, U: np.ndarray) -> list[np.ndarra
     return gains[::-1]
 
 
-def end_error(posterior: object, start: tuple[np.ndarray, np.ndarray]) -> float:
+def end_error(posterior: Posterior, start: tuple[np.ndarray, np.ndarray]) -> float:
     """Largest angle from upright [rad] after the plan was played on the simulated arm."""
     X, U = planned(posterior, start)
     arm, limits = Arm(), np.array(LIMITS)

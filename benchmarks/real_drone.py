@@ -83,7 +83,7 @@ def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
 
 def compared(model: Model, train: Dataset, test: Dataset, points: int) -> dict[str, tuple[float, float]]:
     linear = model.with_forces(AerodynamicForce(kernel="linear", observe=0.0))
-    usual = replace(linear, prior=AerodynamicForce(kernel="linear"))
+    usual = model.with_forces(AerodynamicForce(kernel="linear"))
     parametric, own = (fit(each, train, points=min(1000, len(train)), restarts=1) for each in (linear, usual))
     seconds = min(TIMES, key=lambda each: training_error(parametric, train, each))
     force = fit(model.with_forces(AerodynamicForce()), train, points=min(points, len(train)), restarts=1)

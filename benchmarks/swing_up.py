@@ -20,6 +20,7 @@ import torch
 
 from forcegp import MPPI, Coulomb, Dataset, JointFriction, Model, Noise, Robot, Stribeck, Viscous, fit
 from forcegp.evidence import Accelerations
+from forcegp.posterior import Posterior
 
 SEEDS = (1, 2, 3, 4, 5)
 DT, STEPS, FINE = 0.02, 200, 20  # s, of the controller, and steps of the simulation in each
@@ -105,7 +106,7 @@ def swung_up(predictor: object, seed: int) -> tuple[float, float]:
     return total, 1e3 * seconds / STEPS
 
 
-def models(data: Dataset, seed: int) -> dict[str, object]:
+def models(data: Dataset, seed: int) -> dict[str, Posterior]:
     """Name -> posterior, all of the same rows."""
     how = {"restarts": 1, "seed": seed}
     laws = model_of(Viscous(), Coulomb(None, 0.05))

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.paper.reproduction import ALL, PAPER_PAGE, experiments_of, reproduce
+from benchmarks.paper.reproduction import ALL, PROGRAM, experiments_of, page_of, reproduce
 from forcegp.errors import ForceGPError
 from forcegp.parallel import checked_jobs
 
@@ -24,7 +24,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Compute what is missing and write all summaries; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=PAPER_PAGE.program, description=__doc__)
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__)
     parser.add_argument("figure", help=f"fig2b, fig2c, fig3, fig4 or {ALL}")
     parser.add_argument("--preset", default="smoke", help="smoke: in a few minutes. paper: CPU-hours")
     parser.add_argument("--out", type=Path, help="the folder of results (default: reproduction-PRESET)")
@@ -34,7 +34,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="pieces of work at once")
     parser.add_argument("--json", action="store_true", help="print the summaries as JSON")
     given = parser.parse_args(words)
-    command = [PAPER_PAGE.program, given.figure, "--preset", given.preset]
+    command = [PROGRAM, given.figure, "--preset", given.preset]
     out = given.out or Path(f"reproduction-{given.preset}")
     try:
         checked_jobs(given.jobs)
@@ -47,9 +47,9 @@ def main(words: Sequence[str] | None = None) -> int:
         how = {"command": " ".join(command), "docs": given.docs, "jobs": given.jobs}
         summaries = reproduce(experiments, given.preset, out, **how, progress=_progress)
     except (ForceGPError, OSError) as error:
-        print(f"{PAPER_PAGE.program}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{PROGRAM}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    page = out / PAPER_PAGE.file(experiments)
+    page = out / page_of(experiments)
     print(json.dumps({"figures": summaries}) if given.json else f"{page} reports the results")
     return 0
 

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -57,15 +57,13 @@ ALL = "all"
 def experiments_of(
     preset: str,
     figure: str,
-    presets: Mapping[str, tuple[Experiment, ...]] = PRESETS,
-    program: str = "python -m benchmarks.paper",
 ) -> tuple[Experiment, ...]:
-    """One experiment of a preset by name, or all. Raises InvalidInput, with the program's name, for unknown names."""
-    require_known("preset", preset, program, presets)
-    experiments = {experiment.name: experiment for experiment in presets[preset]}
+    """One experiment of a preset by name, or all. Raises InvalidInput for unknown names."""
+    require_known("preset", preset, PROGRAM, PRESETS)
+    experiments = {experiment.name: experiment for experiment in PRESETS[preset]}
     if figure == ALL:
         return tuple(experiments.values())
-    require_known("figure", figure, program, [*experiments, ALL])
+    require_known("figure", figure, PROGRAM, [*experiments, ALL])
     return (experiments[figure],)
 
 
@@ -79,39 +77,29 @@ and never by hand; the numbers lie beside it as JSON and CSV. Every pair of trai
 way-points and noise, so no test row is a training row. Medians over seeds come with the least and the largest value."""
 
 
-@dataclass(frozen=True)
-class Page:
-    """What experiments are published on: the command that writes it, for messages, and what stands at its top.
-
-    `name` is that of the file and of the folder beside it; `introduction` holds `{command}`.
-    """
-
-    program: str
-    name: str
-    title: str
-    introduction: str
-
-    def file(self, experiments: Sequence[Experiment]) -> str:
-        """`reproduction.md` for all experiments, `fig3.md` for one: a part does not take the place of the whole."""
-        return f"{experiments[0].name}.md" if len(experiments) == 1 else f"{self.name}.md"
-
-
-PAPER_PAGE = Page("python -m benchmarks.paper", "reproduction", "Reproduction of the paper", PAPER_INTRODUCTION)
+PROGRAM, NAME = "python -m benchmarks.paper", "reproduction"
+"""The command that writes the page, and the name of its file and of the folder beside it."""
 TRIAL = "smoke"  # the preset that tests the machinery; its numbers mean nothing for the models
 
 
-def report(
-    experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]], page: Page = PAPER_PAGE
-) -> str:
+def page_of(experiments: Sequence[Experiment]) -> str:
+    """`reproduction.md` for all experiments, `fig3.md` for one: a part does not take the place of the whole."""
+    return f"{experiments[0].name}.md" if len(experiments) == 1 else f"{NAME}.md"
+
+
+def report(experiments: Sequence[Experiment], documents: Mapping[str, Mapping[str, Any]]) -> str:
     """Markdown from the documents of the experiments: one section for each, then the times."""
     preset = documents[experiments[0].name]["preset"]
-    parts = [f"# {page.title}", page.introduction.format(command=documents[experiments[0].name]["command"])]
+    parts = [
+        "# Reproduction of the paper",
+        PAPER_INTRODUCTION.format(command=documents[experiments[0].name]["command"]),
+    ]
     if preset == TRIAL:
         parts.append(f"**Preset `{preset}`: a test of the machinery. Its numbers mean nothing for the models.**")
     for experiment in experiments:
         document = documents[experiment.name]
         parts.append(f"## {experiment.title}")
-        parts += [f"![{experiment.title}]({page.name}/{name}.png)" for name in document["figures"]]
+        parts += [f"![{experiment.title}]({NAME}/{name}.png)" for name in document["figures"]]
         parts.append(experiment.section(document["summary"]).strip())
         told = [(text, job) for job, texts in document["warnings"].items() for text in texts]
         lines = [f"* jobs: {len(found)}, for example `{found[0][1]}`: {found[0][0]}" for found in alike(told)]
@@ -142,23 +130,22 @@ def reproduce(
     out: Path,
     *,
     command: str,
-    page: Page = PAPER_PAGE,
     docs: Path | None = None,
     jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
-    Writes the page (`Page.file`) and, in the folder of its name, `<name>.json`, `<name>.csv` and the figures as PNG,
+    Writes the page (`page_of`) and, in the folder of its name, `<name>.json`, `<name>.csv` and the figures as PNG,
     into `out` and, if given, into `docs`, too. `command` is the command that the page names as its
     source. Raises InvalidInput for experiments that the data do not allow and for folders that cannot be written, and
     as `JobStore.open` and `run_jobs`.
     """
     for experiment in experiments:
         experiment.require_possible()
-    results = JobStore.open(out, page.program, {"preset": preset})
+    results = JobStore.open(out, PROGRAM, {"preset": preset})
     roots = (out,) if docs is None else (out, docs)
-    for folder in (root / page.name for root in roots):
+    for folder in (root / NAME for root in roots):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             require_writable(folder / "trial")
@@ -173,7 +160,7 @@ def reproduce(
         pictures |= figures
         stored = {job.name: results.load(job.name) for job in experiment.jobs()}
         documents[experiment.name] = {
-            "kind": page.program,
+            "kind": PROGRAM,
             "forcegp_version": __version__,
             "preset": preset,
             "command": command,
@@ -185,14 +172,14 @@ def reproduce(
             "summary": summary,
         }
     for root in roots:
-        beside = root / page.name
+        beside = root / NAME
         for name, figure in pictures.items():
             save_figure(figure, beside / f"{name}.png")
         for experiment in experiments:
             document = documents[experiment.name]
             write_json(beside / f"{experiment.name}.json", document)
             write_text(beside / f"{experiment.name}.csv", as_csv(experiment.rows(document["summary"])))
-        write_text(root / page.file(experiments), report(experiments, documents, page))
+        write_text(root / page_of(experiments), report(experiments, documents))
     return {name: document["summary"] for name, document in documents.items()}
 
 

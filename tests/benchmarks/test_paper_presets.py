@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from benchmarks.paper.reproduction import PAPER_PAGE, PRESETS, as_csv, experiments_of, report
+from benchmarks.paper.reproduction import NAME, PRESETS, as_csv, experiments_of, report
 
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job
@@ -46,13 +46,13 @@ def test_unknown_names_list_the_known():
 
 
 def test_the_committed_page_is_made_of_the_committed_numbers():
-    folder = DOCS / PAPER_PAGE.name
+    folder = DOCS / NAME
     experiments = [each for each in PRESETS["paper"] if (folder / f"{each.name}.json").exists()]
     documents = {
         experiment.name: json.loads((folder / f"{experiment.name}.json").read_text()) for experiment in experiments
     }
     assert {document["preset"] for document in documents.values()} == {"paper"}
-    assert (DOCS / f"{PAPER_PAGE.name}.md").read_text() == report(experiments, documents)
+    assert (DOCS / f"{NAME}.md").read_text() == report(experiments, documents)
     for experiment in experiments:
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))

@@ -51,12 +51,14 @@ def _into_a_file(name: str) -> Iterator[IO[bytes]]:
     stream.flush()
     descriptor = {"stdout": 1, "stderr": 2}[name]
     kept = os.dup(descriptor)
-    with tempfile.TemporaryFile() as file, _like(name, os.dup(file.fileno())) as ours:
+    with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), descriptor)
+        ours = _like(name, descriptor)
         setattr(sys, name, ours)
         try:
             yield file
         finally:
+            ours.close()  # which flushes, and leaves the descriptor
             setattr(sys, name, stream)
             os.dup2(kept, descriptor)
             os.close(kept)
@@ -64,7 +66,13 @@ def _into_a_file(name: str) -> Iterator[IO[bytes]]:
 
 def _like(name: str, descriptor: int) -> IO[str]:
     """A stream to that descriptor, with what Python does there to letters that cannot be encoded."""
-    return os.fdopen(descriptor, "w", encoding="utf-8", errors={"stderr": "backslashreplace"}.get(name, "strict"))
+    return open(
+        descriptor,
+        "w",
+        closefd=False,
+        encoding="utf-8",  # a descriptor
+        errors={"stderr": "backslashreplace"}.get(name, "strict"),
+    )
 
 
 def _text(file: IO[bytes]) -> str:

@@ -1,6 +1,7 @@
 """Whatever goes wrong ends in one line that names it, exit code 2, and no output files."""
 
 import dataclasses
+import json
 import os
 import signal
 import warnings
@@ -10,6 +11,7 @@ import pytest
 from tests.cli.one_line import assert_refused
 from tests.posterior.arm import URDF, arm_data, arm_model
 
+from forcegp import scores
 from forcegp.cli.main import main
 from forcegp.data import Dataset, units_for
 from forcegp.model import Model
@@ -153,6 +155,47 @@ def test_a_program_that_calls_main_goes_on_as_it_was(folder, capfd, words):
     capfd.readouterr()
     os.write(1, b"after")
     assert capfd.readouterr().out == "after"
+
+
+def test_being_terminated_ends_with_the_exit_code_of_the_signal(folder, monkeypatch):
+    monkeypatch.setattr("forcegp.check", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(SystemExit) as end:
+        main(["check", "arm.h5", "--json"])
+    assert end.value.code == 128 + signal.SIGTERM
+
+
+def test_what_others_print_is_not_among_the_json(forcegp, folder, monkeypatch):
+    own = scores.learn
+
+    def noisy(*given, **more):
+        os.write(1, b"of a library in C")
+        print("of Python")
+        return own(*given, **more)
+
+    monkeypatch.setattr("forcegp.scores.learn", noisy)
+    done = forcegp("fit", "arm.h5", *QUICK, "--out", "run", "--json", folder=folder)
+    assert json.loads(done.stdout)["run"] == "run"
+    assert "of a library in C" in done.stderr
+    assert "of Python" in done.stderr
+
+
+def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypatch, capfd):
+    for error, code, told in (
+        (KeyboardInterrupt(), 130, "interrupted; no partial output was kept"),
+        (MemoryError("3 GiB"), 2, "out of memory (3 GiB); use fewer points or rows"),
+        (ImportError("libx: cannot open shared object file"), 2, "a library cannot be loaded"),
+        (RuntimeError("two\nlines"), 1, "an error in forcegp itself, RuntimeError: two lines (--debug shows where)"),
+        (OSError(28, "No space left"), 2, "free some space, or write elsewhere"),
+        (PermissionError(13, "denied"), 2, "write to a folder where you may"),
+    ):
+
+        def fails(*_, error=error, **__):
+            raise error
+
+        monkeypatch.setattr("forcegp.check", fails)
+        assert main(["check", "arm.h5"]) == code
+        (line,) = capfd.readouterr().err.splitlines()
+        assert told in line
 
 
 def test_forces_that_are_listed_alone_replace_those_of_the_dataset(folder):

@@ -15,7 +15,7 @@ import forcegp
 import forcegp.scores
 from forcegp import Dataset, load_posterior
 from forcegp.atomic_files import write_digests
-from forcegp.cli.main import main
+from forcegp.cli.main import main, parse_arguments
 
 QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
 IMPORT = "import log.csv --time time --q q_a --u u_a --joints a"
@@ -95,6 +95,26 @@ def test_pipes_and_devices_are_never_replaced(folder, no_work, monkeypatch, capf
         assert stat.S_ISFIFO(Path("pipe").stat().st_mode)
         assert Path("link").is_symlink()
     assert not hidden(folder)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_two_commands_do_not_write_to_one_place(folder, no_work, monkeypatch, capfd, name):
+    monkeypatch.setattr(sys, "argv", [name])
+    Path("link").symlink_to("new")
+    with parse_arguments(filled(name, "link")).alone():
+        assert "another command of forcegp is writing" in refused(filled(name, "new"), capfd)
+        if name != "mapping":  # its other output is the same
+            with parse_arguments(filled(name, "elsewhere")).alone():
+                pass
+    with parse_arguments(filled(name, "new")).alone():
+        pass
+    assert not hidden(folder)
+
+
+def test_locks_of_another_user_are_not_used(folder, no_work, monkeypatch, capfd):
+    mine = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: mine + 1)
+    assert "belongs to another user; set TMPDIR" in refused(filled("fit", "new"), capfd)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

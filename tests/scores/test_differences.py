@@ -139,14 +139,14 @@ def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():
         "net": [cell(k, 0.6 + 0.01 * k, motion=0.3) for k in range(3)],
     }
     found = scores(cells)
-    assert {name: each["model"] for name, each in found.winners.items()} == {
+    assert {name: each.model for name, each in found.winners.items()} == {
         "motion": "ls", "force": "gp", "acceleration": "gp", "density": "gp"
     }  # fmt: skip
     assert found.recommended == "ls", "motions decide before forces and accelerations"
-    assert "No difference" in found.winners["motion"]["why"]
-    assert found.winners["acceleration"]["why"].startswith("**Better**")
+    assert "No difference" in found.winners["motion"].sentence
+    assert found.winners["acceleration"].sentence.startswith("**Better**")
     alone = scores({"net": cells["net"]})
-    assert {each["model"] for each in alone.winners.values()} == {alone.recommended} == {"net"}
+    assert {each.model for each in alone.winners.values()} == {alone.recommended} == {"net"}
     nothing = scores({"net": [cell(0, None)]})
     assert (nothing.winners, nothing.recommended, nothing.rival, nothing.verdicts) == ({}, None, None, [])
     with pytest.raises(FitError, match="no model was fitted: net failed in 1 of 1 runs"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from forcegp.forces import JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 from forcegp.scores import predict_rows, unfinished_search
+from forcegp.scores.doubts import poor_scores, rows_outside
 
 TRUE = "true acceleration"
 QUICK = {"restarts": 1, "options": OptimizerOptions()}
@@ -150,3 +152,62 @@ def test_rows_and_recordings_that_were_trained_on_are_named(posterior, train, te
     tuesday = dataclasses.replace(test_data, metadata={"log": "tuesday"})
     elsewhere = dataclasses.replace(same, episode=np.ones(60, int))
     assert [about(scored(recorded, other).warnings, "same recording") for other in (tuesday, elsewhere)] == [[], []]
+
+
+# ---------------------------------------------------------------- from where on something is said
+
+JOINTS = SimpleNamespace(joint_names=("a", "b"), noise_std=torch.tensor([1.0, 1.0]))
+
+
+def poor(mae, known, inside=(0.95, 0.95), rows=400) -> list[str]:
+    """Subjects of the doubts about a table of two joints, with noise of standard deviation 1."""
+    table = {"acceleration": {"mae": list(mae), "known_physics_mae": list(known), "coverage_95": list(inside)}}
+    return [doubt.about for doubt in poor_scores(JOINTS, range(rows), table)]
+
+
+@pytest.mark.usefixtures("unchecked")  # its model is none
+def test_a_model_is_worse_from_a_percent_on_in_the_mean_and_a_fifth_at_a_joint():
+    assert poor((5.0, 5.0), (5.0, 5.0)) == poor((5.04, 5.04), (5.0, 5.0)) == []
+    assert poor((5.08, 5.08), (5.0, 5.0)) == ["error"]
+    assert poor((5.9, 4.0), (5.0, 5.0)) == []
+    assert poor((6.1, 3.0), (5.0, 5.0)) == ["error"]
+    assert poor((0.19, 4.0), (0.1, 5.0)) == [], "a tenth of the noise is nothing"
+    assert poor((0.21, 4.0), (0.1, 5.0)) == ["error"]
+
+
+@pytest.mark.usefixtures("unchecked")  # its model is none
+def test_intervals_miss_below_nine_tenths_in_the_mean_or_fifteen_hundredths_at_a_joint():
+    assert poor((1.0, 1.0), (5.0, 5.0), (0.91, 0.91)) == []
+    assert poor((1.0, 1.0), (5.0, 5.0), (0.89, 0.89)) == ["coverage"]
+    assert poor((1.0, 1.0), (5.0, 5.0), (0.81, 1.0)) == []
+    assert poor((1.0, 1.0), (5.0, 5.0), (0.79, 1.0)) == ["coverage"]
+    few = {"mae": [1.0, 1.0], "known_physics_mae": [5.0, 5.0], "coverage_95": [0.72, 0.74]}
+    (doubt,) = poor_scores(JOINTS, range(16), {"acceleration": few})  # chance leaves .732 of 16 rows
+    assert "(a 72%)" in doubt.what
+
+
+class Rows:
+    """Positions at rest."""
+
+    def __init__(self, q):
+        self.q, self.v = q, np.zeros_like(q)
+
+    def __len__(self):
+        return len(self.q)
+
+
+@pytest.mark.usefixtures("unchecked")  # its model is none
+@pytest.mark.parametrize(
+    ("q", "beyond"), [(1.6, False), (1.8, True), (-0.6, False), (-0.8, True)], ids=["near", "far", "low", "lower"]
+)
+def test_rows_are_outside_beyond_a_quarter_of_the_range_and_a_tenth_of_the_widest(q, beyond):
+    """Of joints that were trained from 0 to 1 and from 0 to 4: a quarter of 1 and a tenth of 4 is .65."""
+    trained = torch.tensor([[0.0, 0.0], [1.0, 4.0]])
+    posterior = SimpleNamespace(joint_names=("a", "b"), training=SimpleNamespace(q=trained, v=torch.zeros(2, 2)))
+    given = np.zeros((200, 2))
+    given[:3, 0] = q
+    found = list(rows_outside(posterior, Rows(given)))
+    assert len(found) == beyond
+    one = np.zeros((200, 2))
+    one[:1, 0] = q
+    assert list(rows_outside(posterior, Rows(one))) == [], "one row of 200 is a chance"

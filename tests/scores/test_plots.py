@@ -13,34 +13,15 @@ from forcegp.scores.figures.style import new_figure, plain_ticks, short_joint_na
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-@pytest.fixture(scope="module")
-def figures(posterior, test_data):
+def test_a_file_is_a_picture_and_no_global_state_of_pyplot_is_touched(posterior, test_data, tmp_path):
     sys.modules.pop("matplotlib.pyplot", None)  # examples that ran before in this process may have imported it
-    return {
-        "prediction": prediction_figure(posterior, test_data),
-    }
-
-
-@pytest.mark.parametrize(("name", "panels"), [("prediction", 2 * 3)])
-def test_every_panel_is_there_and_the_file_is_a_picture(figures, name, panels, tmp_path):
-    assert len(figures[name].axes) == panels
-    path = tmp_path / f"{name}.png"
-    save_figure(figures[name], path)
+    path = tmp_path / "prediction.png"
+    save_figure(prediction_figure(posterior, test_data), path)
     assert path.read_bytes().startswith(PNG)
     picture = imread(path)
     assert min(picture.shape[:2]) > 300
     assert picture[..., :3].std() > 0.02  # not one colour
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_panels_say_what_they_show_and_in_which_unit(figures):
-    prediction = [axes.get_ylabel() for axes in figures["prediction"].axes]
-    assert prediction[0] == "pan\nrad/s²"
-    assert figures["prediction"].axes[-1].get_xlabel() == "time [s]"
-
-
-def test_no_global_state_of_pyplot_is_touched(figures):
-    assert figures
     assert "matplotlib.pyplot" not in sys.modules
 
 

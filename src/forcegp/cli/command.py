@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import getpass
+import hashlib
 import json
 import os
 import platform
 import re
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -189,7 +192,7 @@ class Command(ABC):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
                     inputs.append(path)
-        outputs = [path for name in OUTPUTS if (path := values.get(name)) is not None]
+        outputs = self.outputs
         for path in (*inputs, *outputs):
             if any("\ud800" <= letter <= "\udfff" for letter in str(path)):  # bytes that Python could not decode
                 raise InvalidInput(f"the name {str(path)!r} is not UTF-8, so it could not be reported; rename it.")
@@ -201,6 +204,33 @@ class Command(ABC):
                     raise InvalidInput(
                         f"{path} would be written over {other}, which this command {does}; choose another name."
                     )
+
+    @property
+    def outputs(self) -> list[Path]:
+        """Files and folders that this command writes."""
+        values = values_of(self)
+        return [path for name in OUTPUTS if (path := values.get(name)) is not None]
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """No other command of this user and machine writes to the same outputs meanwhile. Raises InvalidInput."""
+        from filelock import FileLock, Timeout  # which --help does without
+
+        # not beside the outputs: a lock would stay there, and the folder may not exist yet
+        place = Path(tempfile.gettempdir(), f"forcegp-locks-{getpass.getuser()}")
+        place.mkdir(mode=0o700, exist_ok=True)
+        if hasattr(os, "getuid") and place.lstat().st_uid != os.getuid():
+            raise InvalidInput(f"{place} belongs to another user; set TMPDIR to a folder of your own.")
+        with contextlib.ExitStack() as locks:
+            for path in self.outputs:
+                name = hashlib.sha256(os.path.realpath(path).encode()).hexdigest()
+                try:
+                    locks.enter_context(FileLock(place / name).acquire(blocking=False))
+                except Timeout:
+                    raise InvalidInput(
+                        f"another command of forcegp is writing {path}; wait for it, or choose another name."
+                    ) from None
+            yield
 
     def words(self, *names: str) -> list[str]:
         """The options of these names that are not left at their defaults, as words of a command."""

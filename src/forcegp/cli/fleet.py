@@ -133,7 +133,8 @@ def one(store: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any
             if asked.replaces:  # half of it may be there; what goes on where it was does so
                 asked = replace(asked, overwrite=True)
             asked.check_paths()
-            found = numbers_of(asked.run(terminal))
+            with asked.alone():
+                found = numbers_of(asked.run(terminal))
         except (ForceGPError, OSError, MemoryError) as told:
             error = " ".join(str(told).split())
         except Exception as defect:  # one log must not cost the others theirs

@@ -65,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with Terminal(json=command.json, options=values_of(command)) as terminal, warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
-            terminal.result(command.run(terminal))
+            with command.alone():
+                terminal.result(command.run(terminal))
         sys.stdout.flush()
     except KeyboardInterrupt:
         return _fail(f"interrupted; {(command or Command).interrupted}.", INTERRUPTED, debug)

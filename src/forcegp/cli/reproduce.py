@@ -46,16 +46,16 @@ class Reproduce(Command):
         root = _repository()
         if root not in sys.path:
             sys.path.insert(0, root)
-        from benchmarks.paper.reproduction import PAPER_PAGE, experiments_of, reproduce
+        from benchmarks.paper.reproduction import NAME, PROGRAM, experiments_of, page_of, reproduce
 
-        experiments = experiments_of(self.preset, self.figure, program="forcegp reproduce")
+        experiments = experiments_of(self.preset, self.figure)
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
-        command = f"{PAPER_PAGE.program} {self.figure} --preset {self.preset}"
+        command = f"{PROGRAM} {self.figure} --preset {self.preset}"
         with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
             how: dict[str, Any] = {"command": command, "docs": None, "jobs": checked_jobs(self.jobs)}
             summaries = reproduce(experiments, self.preset, out, **how, progress=report)
-        page = out / PAPER_PAGE.file(experiments)
-        terminal.show(f"{page} reports the results; figures, JSON and CSV are in {out / PAPER_PAGE.name}.")
+        page = out / page_of(experiments)
+        terminal.show(f"{page} reports the results; figures, JSON and CSV are in {out / NAME}.")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
 
 

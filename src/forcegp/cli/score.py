@@ -137,7 +137,8 @@ class Score(Command):
         if not fits and len(runs) == 1:
             self._of_one(terminal, next(iter(models.values())), rows, scores, content)
         else:
-            terminal.show(*comparison(scores, f"{data}: medians over {len(scores.about['seeds'])} seed(s)"))
+            count = len(scores.about["seeds"])
+            terminal.show(*comparison(scores, f"{data}{f': medians over {count} seeds' if count > 1 else ''}"))
         if self.out is not None:
             terminal.note(f"{time.monotonic() - start:.0f} s; the page: {self.out / 'report.md'}")
         return {name: value for name, value in content.items() if name not in ("runs", "identifications")}
@@ -244,9 +245,6 @@ def comparison(scores: forcegp.scores.Scores, title: str) -> list[Any]:
     """Models side by side, which to take by every criterion, and what failed."""
     header, rows = forcegp.scores.overall(scores)
     brief = [[cell.partition(" (")[0] for cell in row] for row in rows]
-    answers = [
-        f"By the {forcegp.scores.CRITERIA[criterion]} take {found['model']}: {found['why'].replace('**', '')}"
-        for criterion, found in scores.winners.items()
-    ]
+    taken = [columns("", *forcegp.scores.winner_table(scores), long_names=True)] if scores.winners else []
     return [columns(title, [name.replace(" [", "\n[") for name in header], brief, long_names=True),
-            *scores.about.get("notes", ()), *scores.failures, *answers]  # fmt: skip
+            *scores.about.get("notes", ()), *scores.failures, *taken]  # fmt: skip

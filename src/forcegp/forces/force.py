@@ -26,7 +26,7 @@ from forcegp.mechanics.gauss_principle import Contact, State
 from forcegp.robots import Robot
 from forcegp.robots.arguments import by_joint
 
-PerJoint = float | Sequence[float] | Mapping[str, float] | Tensor
+PerJoint = float | Sequence[float] | Mapping[str, float] | np.ndarray | Tensor
 Number = PerJoint | Normal | LogNormal | None
 """A number of a law: given (one, one per joint, or by joint name), or estimated under a prior; None: a weak one."""
 AnyForce = TypeVar("AnyForce", bound="Force")
@@ -170,7 +170,7 @@ class Law(Force):
     def _has_prior(self) -> bool:
         return any(isinstance(getattr(self, name), Normal | LogNormal) for name in list(self.coefficients)[:1])
 
-    def with_values(self: AnyLaw, values: Mapping[str, Tensor]) -> AnyLaw:
+    def with_values(self: AnyLaw, values: Mapping[str, Any]) -> AnyLaw:
         """The same law with these coefficients, which are known then."""
         return replace(self, **values)  # type: ignore[type-var]  # laws are dataclasses
 

@@ -19,7 +19,10 @@ from .learning import (
     usual_forces as usual_forces, with_intervals_of_motions as with_intervals_of_motions,
 )
 from .paired import CRITERIA as CRITERIA, PairedDifference as PairedDifference
-from .page import joint_table as joint_table, overall as overall, quantity_table as quantity_table, unit_of as unit_of
+from .page import (
+    joint_table as joint_table, overall as overall, quantity_table as quantity_table, unit_of as unit_of,
+    winner_table as winner_table,
+)
 from .predicted_rows import PredictedRows as PredictedRows, predict_rows as predict_rows
 from .score import score as score
 from .scores import Scores as Scores

@@ -32,7 +32,7 @@ def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
         Path(__file__).with_name("report.md.jinja"),
         **{"source": {}, "preparation": [], "splits": [], "configuration": {}, **scores.about, "notes": notes},
         margin=MARGIN,
-        taken=[[CRITERIA[name], f"**{each['model']}**", each["why"]] for name, each in scores.winners.items()],
+        taken=[[CRITERIA[name], f"**{each.model}**", each.sentence] for name, each in scores.winners.items()],
         rival=scores.rival,
         differences=differences,
         criteria=[f"{words}, {'difference' if name == 'density' else 'ratio'}" for name, words in CRITERIA.items()],
@@ -157,6 +157,17 @@ def _lost(scores: Scores, model: str, quantity: str) -> str:
     return f", {sum(at)} of {sum(each['motions'] for each in moved)} diverged" if sum(at) else ""
 
 
+def winner_table(scores: Scores) -> tuple[list[str], list[list[str]]]:
+    """Header and rows: by criterion the model to take, and the difference that decides, with its interval."""
+    rows = []
+    for criterion, each in scores.winners.items():
+        pair, sign = each.difference, "−" if criterion == "density" else "/"
+        compared = "–" if pair is None else f"{pair.challenger} {sign} {pair.baseline}"
+        outcome = "–" if pair is None else "better, not sure" if "sure" in each.why else pair.outcome
+        rows.append([CRITERIA[criterion], each.model, compared, _difference(pair).replace("**", ""), outcome])
+    return ["by", "take", "compared", "difference (95 % interval)", "shown"], rows
+
+
 def _difference(found: PairedDifference | None) -> str:
     if found is None:
         return "–"
@@ -181,7 +192,7 @@ def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
     report = preparation_report(metadata)
     if not report:
         return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
-    settings = {each.name: report.get(each.name) for each in fields(Preparation)}
+    settings = {each.name: report.get(each.name) for each in fields(Preparation) if each.name != "why"}
     given = ", ".join(f"{name} {value}" for name, value in settings.items() if name == "cutoff" or np.any(value))
     lines = [f"Preparation: {given}."]
     for quantity, reason in dict(report.get("why") or {}).items():

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,20 @@ physics, and Gaussian processes on unknown forces.
 PARAMETRIC, LEARNED = ("given", "identified"), ("force prior", "residual", "black box")
 ORDER = "motion", "force", "acceleration", "density"
 """Criteria that decide, the first one that there is: where a robot goes is what simulators and controllers need."""
+
+
+class Winner(NamedTuple):
+    """The model to take by one criterion, the difference that decides, and what else there is to say."""
+
+    model: str
+    difference: PairedDifference | None
+    why: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it."""
+        numbers = None if self.difference is None else self.difference.sentence
+        return ": ".join(filter(None, (self.why, numbers)))
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -148,8 +162,8 @@ class Scores(Summary):
         return min(found)[-1] if found else None
 
     @cached_property
-    def winners(self) -> dict[str, dict[str, str]]:
-        """By criterion the "model" to take, and "why": the best parametric one, unless another is shown to be better.
+    def winners(self) -> dict[str, Winner]:
+        """By criterion the model to take: the best parametric one, unless another is shown to be better.
 
         The one rule of verdicts. A criterion that no model has is missing.
         """
@@ -160,23 +174,20 @@ class Scores(Summary):
                 if (only := simple or other) is not None:
                     second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
                     found = None if second is None else self.difference(criterion, only, second)
-                    why = "no other model was scored" if found is None else found.sentence
-                    out[criterion] = {"model": only, "why": why}
+                    out[criterion] = Winner(only, found, "" if found else "no other model was scored")
                 continue
             found = self.difference(criterion, other, simple)
             if found is not None and found.favours_challenger:
-                sure = "" if found.outcome == "better" else "a third better or more, on too little time to be sure: "
-                out[criterion] = {"model": other, "why": sure + found.sentence}
+                sure = "" if found.outcome == "better" else "a third better or more, on too little time to be sure"
+                out[criterion] = Winner(other, found, sure)
             else:
-                shown = "no comparison was possible" if found is None else found.sentence
-                why = f"nothing is shown to be better than the best parametric: {shown}"
-                out[criterion] = {"model": simple, "why": why}
+                out[criterion] = Winner(simple, found, "nothing is shown to be better than the best parametric")
         return out
 
     @property
     def recommended(self) -> str | None:
         """The model to take, by motions, else forces, else accelerations; None where no model was scored."""
-        return next((self.winners[name]["model"] for name in ORDER if name in self.winners), None)
+        return next((self.winners[name].model for name in ORDER if name in self.winners), None)
 
     def fitted_on_all_rows(self, model: str | None = None) -> Posterior:
         """The recommended model (or another one by name) from all rows, of which nothing is held out any more.
@@ -276,7 +287,7 @@ class Scores(Summary):
             "units": dict(self.units),
             "models": models,
             "recommended": self.recommended,
-            "winners": self.winners,
+            "winners": {name: {"model": each.model, "why": each.sentence} for name, each in self.winners.items()},
             "rival": self.rival,
             "against_rival": against,
             "warnings": list(self.warnings),

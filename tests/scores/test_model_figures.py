@@ -1,0 +1,154 @@
+"""What the figures of a model draw is what the model says: lines and bands against predictions made by hand."""
+
+import numpy as np
+import pytest
+import torch
+from tests.checks.corruptions import clean, two_links
+
+from forcegp import Dataset, JointFriction, Viscous, check, fit
+from forcegp.errors import InvalidInput
+from forcegp.inference import OptimizerOptions
+from forcegp.posterior import Posterior
+from forcegp.scores import check_figure, contacts_figure, model_pictures
+from forcegp.scores.figures.friction_curves import curve_panels, friction_curves_figure
+from forcegp.scores.figures.model import motion_bands_figure, prediction_figure
+from forcegp.simulation import FreeArmConfig, simulate_free_arm
+
+QUICK = OptimizerOptions(iterations=10)
+
+
+@pytest.fixture(scope="module")
+def swinging() -> Dataset:
+    return simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=4.0, seed=1))
+
+
+@pytest.fixture(scope="module")
+def friction(swinging) -> Posterior:
+    """Friction learned beside a viscous law of 0.1 Nm s/rad."""
+    model = swinging.model
+    model = type(model)(model.robot, (), forces=(*model.forces, Viscous(0.1)))
+    return fit(model.with_forces(JointFriction()), swinging, points=20, restarts=1, options=QUICK)
+
+
+def lines(axes, label: str) -> list:
+    return [line for line in axes.lines if line.get_label() == label]
+
+
+def ends(band) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper edge of a band over its times."""
+    vertices = band.get_paths()[0].vertices
+    times = np.unique(vertices[:, 0])
+    return tuple(np.array([edge(vertices[vertices[:, 0] == t, 1]) for t in times]) for edge in (np.min, np.max))
+
+
+def test_errors_of_motions_and_their_bands(swinging, friction):
+    figure = motion_bands_figure(friction, swinging, seconds=2.0, horizon=0.25)
+    rows = swinging.rows(swinging.time <= 2.0)
+    dt = float(np.diff(rows.time).mean())
+    steps = round(0.25 / dt)
+    starts = np.searchsorted(rows.time, np.arange(0.0, rows.time[-1] - 0.25, 0.25) - 1e-9)
+    q0, v0 = (torch.tensor(x[starts]) for x in (rows.q, rows.v))
+    u = torch.tensor(np.stack([rows.u[k : k + steps] for k in starts]))
+    rollout = friction.rollout(q0, v0, u, dt, integrator="rk4", samples=24)
+    recorded = np.stack([rows.q[k : k + steps + 1] for k in starts])
+    low, high = torch.quantile(rollout.samples.q, torch.tensor([0.025, 0.975]).double(), dim=0).numpy()
+    for joint, axes in enumerate(figure.axes):
+        drawn = [line for line in axes.lines if len(line.get_ydata()) == steps + 1]
+        assert len(drawn) == len(starts) == len(axes.collections)
+        for motion, (line, band) in enumerate(zip(drawn, axes.collections, strict=True)):
+            np.testing.assert_allclose(
+                line.get_xdata(), rows.time[starts[motion] : starts[motion] + steps + 1], atol=1e-9
+            )
+            error = rollout.q[motion, :, joint].numpy() - recorded[motion, :, joint]
+            np.testing.assert_allclose(line.get_ydata(), error, atol=1e-12)
+            half = 0.5 * (high - low)[motion, :, joint]
+            np.testing.assert_allclose(ends(band), (-half, half), rtol=1e-6, atol=1e-9)
+    with pytest.raises(InvalidInput, match="no rows"):
+        motion_bands_figure(friction, swinging, start=99.0)
+
+
+def test_accelerations_with_both_bands(swinging, friction):
+    rows = swinging.rows(swinging.time <= 0.5)
+    figure = prediction_figure(friction, swinging, seconds=0.5)
+    found = friction.predict(rows.q, rows.v, rows.u)
+    for joint in range(2):
+        left, right = figure.axes[2 * joint : 2 * joint + 2]
+        mean, std = found.mean[:, joint].numpy(), found.std[:, joint].numpy()
+        np.testing.assert_allclose(lines(left, "measured")[0].get_ydata(), rows.a[:, joint])
+        np.testing.assert_allclose(lines(left, "predicted")[0].get_ydata(), mean)
+        np.testing.assert_allclose(ends(left.collections[0]), (mean - 2.0 * std, mean + 2.0 * std), rtol=1e-9)
+        if "a" in rows.truth:
+            np.testing.assert_allclose(lines(left, "true")[0].get_ydata(), rows.truth["a"][:, joint])
+            assert any(np.allclose(line.get_ydata(), mean - rows.truth["a"][:, joint]) for line in right.lines)
+        outer = np.hypot(std, max(float(friction.noise_std[joint]), rows.noise_std.max()))
+        np.testing.assert_allclose(ends(right.collections[0]), (-2.0 * outer, 2.0 * outer), rtol=1e-6)
+        np.testing.assert_allclose(ends(right.collections[1]), (-2.0 * std, 2.0 * std), rtol=1e-9)
+        assert any(np.allclose(line.get_ydata(), mean - rows.a[:, joint]) for line in right.lines)
+
+
+def test_curves_are_laws_and_what_was_learned_beside_them(swinging, friction):
+    figure = friction_curves_figure(friction, swinging)
+    for panel, axes in zip(curve_panels(friction), figure.axes, strict=True):
+        (whole,) = lines(axes, "laws and learned part")
+        at, drawn = whole.get_xdata(), whole.get_ydata()
+        curve = friction.curve(panel.latent, at[:, None])
+        np.testing.assert_allclose(drawn, 0.1 * at + curve.mean.numpy(), atol=1e-12)
+        np.testing.assert_allclose(
+            lines(axes, "laws alone")[0].get_ydata(), 0.1 * lines(axes, "laws alone")[0].get_xdata()
+        )
+        visited = friction.training.v[:, panel.joint].numpy()
+        assert (at.min() >= visited.min(), at.max() <= visited.max()) == (True, True)
+        beyond = lines(axes, "beyond the training data")[0].get_xdata()
+        assert beyond.min() < visited.min() < visited.max() < beyond.max()
+        assert axes.get_xlabel() == "velocity [rad/s]"
+        assert axes.get_ylabel() == "torque [Nm]"
+    assert figure.get_suptitle() == "Friction learned from 20 points"
+
+
+def test_every_picture_of_a_model_is_drawn_or_named(swinging, friction):
+    told = []
+    pictures, missing = model_pictures(friction, swinging, lambda *words: told.append(words))
+    assert [each.name for each in pictures] == ["forces", "motions_ahead", "prediction"]
+    assert told == [(k, 3, each.name) for k, each in enumerate(pictures)]
+    assert missing == []
+    uneven = swinging.rows(np.flatnonzero(np.arange(len(swinging)) % 7))
+    pictures, missing = model_pictures(friction, uneven)
+    assert [each.name for each in pictures] == ["forces", "prediction"]
+    assert len(missing) == 1
+    assert missing[0].startswith("motions ahead: not drawn, because ")
+
+
+def test_a_check_draws_torques_beside_inverse_dynamics():
+    log = clean(two_links(), 0, seconds=5.0)
+    report = check(log)
+    figure = check_figure(report)
+    compared, robot = report.inputs.compared, log.model.robot
+    needed = robot.inverse_dynamics(*(torch.tensor(getattr(compared, x)) for x in "qva")).numpy()
+    for joint, axes in enumerate(figure.axes[:2]):
+        left = report.comparison.fit.unexplained[joint]
+        assert axes.get_title(loc="left").endswith(f": {100 * left:.2g} % unexplained")
+        (line,) = lines(axes, "inverse dynamics")
+        rows = np.searchsorted(compared.time, line.get_xdata() - 1e-9)
+        np.testing.assert_allclose(line.get_ydata(), needed[rows, joint], atol=1e-9)
+        np.testing.assert_allclose(lines(axes, "measured, filtered")[0].get_ydata(), compared.u[rows, joint])
+        fitted = lines(axes, "with factor, armature, friction")[0].get_ydata()
+        residual = compared.u[rows, joint] - fitted
+        assert residual.std() < 0.05 * compared.u[rows, joint].std()
+    spectra = figure.axes[2]
+    cutoff = report.inputs.cutoff
+    assert spectra.get_title(loc="left").endswith("no filter" if cutoff is None else f"cut-off at {cutoff:.3g} Hz")
+
+
+def test_pushes_stand_over_their_distances():
+    time = np.arange(5.0)
+    distance, torque = np.array([1.0, 2.0, 90.0, 3.0, 1e-9]), np.arange(10.0).reshape(5, 2)
+    figure = contacts_figure(time, distance, 20.0, torque, [(2.0, 3.0)], ["a_1", "a_2"], "title")
+    above, below = figure.axes
+    np.testing.assert_array_equal(lines(above, "distance from free motion")[0].get_ydata(), [1, 2, 90, 3, 1e-3])
+    np.testing.assert_array_equal(lines(above, "threshold")[0].get_ydata(), [20.0] * 5)
+    for joint in range(2):
+        np.testing.assert_array_equal(lines(below, f"joint {joint + 1}")[0].get_ydata(), torque[:, joint])
+    for axes in (above, below):
+        (span,) = axes.patches
+        assert (span.get_x(), span.get_x() + span.get_width()) == (2.0, 3.0)
+    assert above.get_yscale() == "log"

@@ -1,0 +1,126 @@
+"""Tables of scores against numbers that were put into them by hand."""
+
+import pytest
+
+from forcegp.scores import Scores, joint_table, overall, quantity_table, winner_table
+from forcegp.scores.page import columns_of, page, preparation_lines
+from forcegp.scores.tables import formatted, number
+
+UNITS = {"q": "rad", "v": "rad/s", "u": ("Nm", "N"), "a": "rad/s^2"}
+
+
+def run(seed: int, factor: float, diverged: int = 0, error: str | None = None) -> dict:
+    """Of two joints, whose errors are as large as the factor says."""
+    found = {"split": "s", "seed": seed, "error": error, "warnings": [f"warning {seed}"], "cpu_seconds": 1.0}
+    if error is not None:
+        return found
+    of_joints = {"mae": [0.1, 0.3], "rmse": [0.2, 0.4], "nrmse": [0.02, 0.04], "known_physics_mae": [1.0, 2.0]}
+    acceleration = {name: [factor * x for x in each] for name, each in of_joints.items()}
+    acceleration |= {"nlpd": [1.0 * factor, 2.0 * factor], "coverage_95": [0.9, 1.0], "coverage_50": [0.4, 0.7]}
+    table = {
+        "acceleration": acceleration,
+        "all joints": {"nlpd": [5.0 * factor]},
+        "force": {"mae": [3.0, 5.0], "rmse": [3.0 * factor, 4.0 * factor], "rmse_at_rest": [30.0, 0.0]},
+        "contact force": {"mae": [7.0], "rmse": [8.0], "relative_rmse": [0.125], "coverage_95": [None]},
+        "position after 0.5 s": {"rmse": [3e-6 * factor, 4e-6 * factor]},
+    }
+    squared = [[(1e-5 * factor) ** 2, (2e-5 * factor) ** 2]]
+    motions = {"horizons": [0.5], "motions": 2, "diverged": [diverged], "squared": squared}
+    stretches = {name: [factor**2, 1.1 * factor**2] for name in ("force", "acceleration")}
+    stretches["density"] = [5.0 * factor, 6.0 * factor]
+    return found | {"table": table, "motions": motions, "stretches": stretches}
+
+
+@pytest.fixture(scope="module")
+def scores() -> Scores:
+    models = {
+        "urdf": {"kind": "given", "summary": "as given"},
+        "ls": {"kind": "identified", "summary": "identified"},
+        "gp": {"kind": "force prior", "summary": "learned"},
+    }
+    runs = {
+        "urdf": [run(0, 4.0), run(1, 4.0), run(2, 4.0)],
+        "ls": [run(0, 2.0), run(1, 2.2), run(2, 2.4, diverged=1)],
+        "gp": [run(0, 0.5), run(1, 0.0, error="no luck"), run(2, 0.6)],
+    }
+    about = {"rows": 100, "seeds": [0, 1, 2], "mass_matrix": ["M"], "machine": "here", "forcegp": "0"}
+    return Scores(models=models, runs=runs, joint_names=("a", "b"), units=UNITS, about=about)
+
+
+def test_one_model_by_joint(scores):
+    alone = Scores(models={"gp": scores.models["gp"]}, runs={"gp": [run(0, 0.5)]}, joint_names=("a", "b"), units=UNITS)
+    assert joint_table(alone) == (
+        ["joint", "MAE", "noise-free", "RMSE", "NLPD", "in 95 %", "known physics"],
+        [
+            ["a", "0.0500", "–", "0.1000", "0.50", "90.0 %", "0.5000"],
+            ["b", "0.1500", "–", "0.2000", "1.00", "100.0 %", "1.0000"],
+            ["all joints", "0.1000", "–", "0.1500", "2.50", "95.0 %", "0.7500"],
+        ],
+    )
+    header, rows = quantity_table(alone)
+    assert header == ["of all joints", "MAE", "RMSE", "RMSE / size", "in 95 %"]
+    assert rows == [
+        ["force", "4.0000", "1.7678", "–", "–"],  # the root of the mean of squares
+        ["contact force", "7.0000", "8.0000", "0.125", "–"],
+        ["position after 0.5 s", "–", "1.8e-06", "–", "–"],
+    ]
+
+
+def test_models_side_by_side(scores):
+    header, rows = overall(scores, "**")
+    assert header == [
+        "model", "MAE [rad/s²]", "nRMSE", "force error [Nm or N]", "NLPD [nats]", "in 95 %", "in 50 %",
+        "q after 0.5 s [rad]",
+    ]  # fmt: skip
+    urdf, ls, gp = rows
+    assert urdf[:2] == ["urdf", "0.8000 (0.8000–0.8000)"]
+    assert ls[1:3] == ["0.4400 (0.4000–0.4800)", "0.066 (0.060–0.072)"]
+    assert ls[-1].endswith(", 1 of 6 diverged")
+    assert gp[0] == "gp (2 of 3 runs)"
+    assert gp[1] == "**0.1100** (0.1000–0.1200)"
+    assert gp[4] == "**2.75** (2.50–3.00)"
+    assert [row[5] for row in rows] == ["**95.0** (95.0–95.0) %"] * 3, "the nearest to the level is the best"
+
+
+def test_the_model_to_take_stands_with_what_it_was_compared_with(scores):
+    header, rows = winner_table(scores)
+    assert header[1:3] == ["take", "compared"]
+    taken = {row[0].split()[0]: row[1:] for row in rows}
+    assert taken["force-space"][:2] == ["gp", "gp / ls"]
+    assert taken["force-space"][3] == "better"
+    assert taken["negative"][1] == "gp − ls"
+    assert taken["negative"][2].startswith("-9.")
+    few = Scores(models=scores.models, runs={**scores.runs, "ls": [], "urdf": []}, joint_names=("a", "b"), units=UNITS)
+    assert {row[2] for row in winner_table(few)[1]} == {"–"}, "nothing else was scored"
+
+
+def test_the_page_holds_all_of_it(scores):
+    text = page(scores, [("errors", "Errors by joint.")])
+    assert "| ls | 0.4400 (0.4000–0.4800) |" in text
+    assert "errors.png" in text
+    assert "gp failed in 1 of 3 runs (s, seed 1): no luck" in text
+    assert "| gp | **1.650** | **2.200** |" in text
+    assert len(columns_of(scores)) == 7
+
+
+def test_what_was_done_with_a_log_is_told_the_last_step_first():
+    earlier = {"cutoff": 20.0, "every": 1, "earlier": None, "rows": [9, 8], "why": {}}
+    why = {"delay": {"a": "shown", "b": "not shown"}, "every": "x"}
+    last = {"cutoff": None, "every": 4, "delay": [0.0], "rows": [8, 2], "why": why}
+    lines = preparation_lines({"preparation": {**last, "earlier": earlier}})
+    assert lines == [
+        "Preparation: cutoff None, every 4.",
+        "Chosen automatically, delay: a shown; b not shown",
+        "Chosen automatically, every: x",
+        "Preparation: cutoff 20.0, every 1.",
+    ]
+    assert preparation_lines({})[0].startswith("Preparation: none stated")
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(None, 4, "–"), (0.0831, 4, "0.0831"), (5e-5, 4, "5.0e-05"), (6e-4, 4, "0.0006"), (1e4, 3, "1.0e+04"),
+     (9999.0, 3, "9999.000"), (12345.0, 1, "12345.0"), (0.0, 4, "0.0000"), (-2e-5, 4, "-2.0e-05")],
+)  # fmt: skip
+def test_numbers_as_text(value, digits, text):
+    assert number(value, digits) == text == formatted(value, digits)
