@@ -17,7 +17,7 @@ import casadi as untyped
 import numpy as np
 
 from forcegp.robots import Robot
-from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.compiled import UnrolledRobot
 
 ca: Any = untyped
 QUANTITIES = ("mass_bias", "fd")

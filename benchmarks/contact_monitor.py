@@ -96,9 +96,9 @@ def monitors(seed: int, calibration: dict[str, np.ndarray]) -> dict[str, Contact
     given = Model(robot)
     motion = followed(robot, excitation(seed), PDGravity(robot.compile(), **GAINS), 20.0)
     models = {name: fit.predictor() for name, fit in fits(rows_of(motion, given, seed), given, seed).items()}
-    made = {name: (model, None) for name, model in models.items()} | {"true model": (true_system(robot), None)}
-    made["learned, noise alone"] = models["learned"], "noise"
-    found = {name: ContactMonitor(model, dt=1 / RATE, covariance=kind) for name, (model, kind) in made.items()}
+    made = {**models, "true model": true_system(robot)}
+    made["learned, noise alone"] = models["learned"].posterior.predictor(covariance="none")
+    found = {name: ContactMonitor(model, dt=1 / RATE) for name, model in made.items()}
     return {name: each.calibrate([qvu(calibration)], false_alarms_per_hour=0.1) for name, each in found.items()}
 
 

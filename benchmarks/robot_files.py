@@ -204,10 +204,8 @@ def _mujoco_numbers(model: Any, robot: Robot) -> Numbers:
             data.qpos[place], T[dof] = _motion(names[joint], robot, followed)
             continue
         group = next(free)
-        order = [0, 1, 2, 6, 3, 4, 5] if kind == 0 else [3, 0, 1, 2]
-        data.qpos[place : place + len(order)] = x[group.places].numpy()[order]
-        freedom = len(group.motion.velocities)
-        T[dof : dof + freedom, group.rows] = np.eye(freedom)
+        data.qpos[place : place + 7] = x[group.places].numpy()[[0, 1, 2, 6, 3, 4, 5]]
+        T[dof : dof + 6, group.rows] = np.eye(6)
     mujoco.mj_kinematics(model, data)
     for joint in np.flatnonzero(model.jnt_type == 0):
         rows, turning = (model.jnt_dofadr[joint] + np.arange(3) + k for k in (0, 3))

@@ -160,7 +160,7 @@ def likelihood_and_gradients(model, data, device, trips=None):
     ("prior", "integrators"),
     [
         ("gp:load-friction:expected=0.1,gp:joint-friction", ["symplectic-euler"]),
-        ("gp:joint:kernel=matern-3/2", ["rk4", "projected"]),
+        ("gp:joint:kernel=matern-3/2", ["rk4"]),
     ],
 )
 def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path):

@@ -22,7 +22,7 @@ TASKS = "benchmarks.paper.fig4_jobs"
 _name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed
 _truth_name = "fig4/truth/seed{}".format
 BLACK_BOXES = ("gp",)
-WITHOUT_CONSTRAINT = ("none", "projected")  # variants of models without a constraint, and so cannot be stabilised by it
+WITHOUT_CONSTRAINT = ("none",)  # variants of models without a constraint, and so cannot be stabilised by it
 
 
 @dataclass(frozen=True)

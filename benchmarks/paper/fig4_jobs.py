@@ -30,7 +30,6 @@ VARIANTS = {
     "baumgarte": "Baumgarte",
     "off-surface": "Baumgarte, start 1 mm off the surface",
     "none": "not stabilised",
-    "projected": "projected onto the surface",
 }
 
 
@@ -44,7 +43,6 @@ def roll(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, 
         recorded.v[:, 0],
         recorded.u,
         recorded.dt,
-        integrator="projected" if spec["variant"] == "projected" else "symplectic-euler",
         baumgarte=BAUMGARTE if spec["variant"] in ("baumgarte", "off-surface") else None,
         feedback=recorded.feedback() if spec["control"] == "closed-loop" else None,
     )

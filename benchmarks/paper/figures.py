@@ -96,7 +96,6 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
 TITLES = {
     "baumgarte": "with Baumgarte (black boxes: none)",
     "none": "not stabilised",
-    "projected": "projecting integrator",
 }
 MOST_DRAWN = 300  # points of a curve, about: more than the eye sees would make megabytes of vector graphics
 

@@ -6,7 +6,7 @@ from .robots import Robot as Robot
 # what is known about it, and what is not
 from .model import Model as Model
 from .noise import Noise as Noise
-from .mechanics import Contact as Contact, Plane as Plane, Sphere as Sphere, Cylinder as Cylinder
+from .mechanics import Contact as Contact, Plane as Plane, Sphere as Sphere
 
 # laws, and priors on their numbers
 from .forces import (

@@ -17,10 +17,6 @@ class InvalidInput(ForceGPError, ValueError):
     """An argument has a wrong shape, type or value."""
 
 
-class UnknownRow(InvalidInput, IndexError):
-    """A state that is not in a batch; also what ends a loop over one."""
-
-
 class RobotModelError(ForceGPError):
     """The robot description cannot be used; subclasses say why.
 

@@ -19,7 +19,7 @@ from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
 from forcegp.forces.thrusters import FADES, OBSERVED, ObservedWrench
-from forcegp.mechanics import LoopClosure, RollingContact
+from forcegp.mechanics import LoopClosure
 from forcegp.mechanics.constraints import closing, contact_from_dict, contact_to_dict, described
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
 from forcegp.mechanics.surfaces import Held
@@ -43,7 +43,7 @@ class Model(Summary):
     Parameters
     ----------
     robot: its kinematics and inertia.
-    contacts: points that stay on surfaces; also what `fixed_point`, `fixed_frame` and `rolling` give, several each.
+    contacts: points that stay on surfaces; also what `fixed_point` and `fixed_frame` give, several each.
     forces: everything that acts. Laws add up to the known force Q_K, unknown ones to Q_U, whose functions `forcegp.fit`
         learns; it estimates the coefficients that laws leave open, too. None stands for what the robot's file states:
         actuation, rigid bodies, and joint damping, dry friction and springs where it has them. Without `RigidBodies`
@@ -163,7 +163,7 @@ class Model(Summary):
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping, dry friction and springs of
         the file are forces of the model. By default u are joint forces; where motors act at sites of bodies,
-        such as rotors, or turn a ball joint, u are the inputs of all motors, those of bodies that are not free last.
+        such as rotors, u are the inputs of all motors, those of bodies that are not free last.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
         contacts = [contact for loop in found.loops for contact in closing(loop)]
@@ -335,7 +335,7 @@ class Model(Summary):
         A, b, _ = self.constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         for index, contact in enumerate(self.contacts):
-            if isinstance(contact, LoopClosure | RollingContact):  # in a plane some of its rows constrain nothing
+            if isinstance(contact, LoopClosure):  # in a plane some of its rows constrain nothing
                 size[..., index] = 1.0 + 0.0 * size[..., index]
             elif isinstance(contact.surface, Held):  # neither do all directions of a held point
                 alike = [k for k, x in enumerate(self.contacts) if (x.frame, x.point) == (contact.frame, contact.point)]

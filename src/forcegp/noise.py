@@ -30,20 +30,16 @@ class Noise:
     With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions count that their u
     is as noisy, and shrink accelerations that only its noise explains (`shrunk`). Leave it False
     where u is a command, as in model-predictive control.
-
-    `from_data` is set by a fit whose level of noise the dataset stated: rows that state another one are then warned of
-    (`Posterior.update`).
     """
 
     acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None
     learn: bool = False
     measured_torque: bool = False
-    from_data: bool = False
 
     @usable_arguments("Noise")
     def __post_init__(self) -> None:
-        for name in ("learn", "measured_torque", "from_data"):
+        for name in ("learn", "measured_torque"):
             require_type(name, getattr(self, name), bool)
         for name in ("acceleration", "force"):
             if getattr(self, name) is not None:

@@ -72,7 +72,7 @@ def test_a_model_becomes_casadi_functions(forcegp, folder):
         (("run", "--steps", "nan"), "dt is nan; give the time step as a positive number of seconds"),
         (("run", "--steps", -0.1), "dt is -0.1; give the time step as a positive number of seconds"),
         (("run", "--integrator", "rk4"), "--integrator was given without --steps"),
-        (("run", "--steps", 0.1, "--integrator", "projected"), "an exported step is not 'projected'"),
+        (("run", "--steps", 0.1, "--integrator", "leap"), "no integrator 'leap'"),
         (("run", "--steps", 0.1, "--integrator", "rk"), "integrator 'rk'"),
         (("nowhere",), "nowhere does not exist; give the folder that `forcegp fit --out` wrote"),
     ],

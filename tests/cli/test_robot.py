@@ -38,10 +38,12 @@ def test_json_holds_the_same(forcegp, file):
 
 
 def test_joints_that_stand_still_are_shown_as_locked(forcegp, file):
-    hung = '<link name="odom"/><joint name="root" type="planar"><parent link="odom"/><child link="{}"/></joint></robot>'
+    hung = (
+        '<link name="odom"/><joint name="root" type="floating"><parent link="odom"/><child link="{}"/></joint></robot>'
+    )
     root = CHAIN.split('<link name="')[1].split('"')[0]
     file.write_text(CHAIN.replace("</robot>", hung.format(root)))
-    assert "root (planar)" in forcegp("robot", file).stdout
+    assert "root (floating)" in forcegp("robot", file).stdout
     shown = forcegp("robot", file, "--base", "fixed").stdout
     assert "root (locked)" in shown
     assert shown.count("(locked)") == 1
@@ -96,13 +98,6 @@ def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
     ]
 
 
-def test_an_undefined_root_is_named(tmp_path, forcegp):
-    path = tmp_path / "arm.urdf"
-    path.write_text(CHAIN.replace('<link name="rail"/>', ""))
-    assert "--root rail" in forcegp("robot", path).stderr
-    assert forcegp("robot", path, "--root", "rail").returncode == 0
-
-
 def test_mjcf_is_taken_with_its_loops_and_written_by_extension(forcegp, tmp_path):
     (tmp_path / "loop.xml").write_text(FOUR_BAR)
     shown = forcegp("robot", tmp_path / "loop.xml", "--out", tmp_path / "same.mjcf")
@@ -113,8 +108,6 @@ def test_mjcf_is_taken_with_its_loops_and_written_by_extension(forcegp, tmp_path
     assert (again["loops"], again["written"]) == ([["coupler", "rocker"]], str(tmp_path / "same.urdf"))
     assert Robot.from_file(tmp_path / "same.urdf").nv == 3
     log = tmp_path / "log.csv"
-    refused = forcegp("robot", tmp_path / "loop.xml", "--root", "world")
-    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)
     header = ",".join(["t", *(f"{x}{k}" for x in "qvu" for k in "123")])
     log.write_text("\n".join([header, *(f"{0.01 * row}" + ",0" * 9 for row in range(9))]))
     columns = [word for x in "qvu" for word in (f"--{x}", x + "{1..3}")]

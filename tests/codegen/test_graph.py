@@ -8,8 +8,7 @@ import torch
 
 from forcegp.codegen.branch_free_linalg import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower
 from forcegp.codegen.c_writer import Program, write_function, write_program
-from forcegp.codegen.derivatives import gradients, jacobian
-from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Copier, Graph, evaluated
+from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Copier, Graph, evaluated, gradients, jacobian
 from forcegp.codegen.library import (
     NOT_FINITE,
     NOT_POSITIVE,

@@ -8,10 +8,10 @@ import pytest
 import scipy.linalg
 from tests.posterior.arm import URDF, arm_data, arm_model
 
-from forcegp import Contact, Dataset, Model, Plane, Robot, excitation, fit
+from forcegp import Contact, Dataset, Plane, Robot, excitation, fit
 from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
-from forcegp.forces import ContactFriction, JointFriction, UnknownForces
+from forcegp.forces import JointFriction
 from forcegp.inference import OptimizerOptions
 
 FREE = arm_model(0)
@@ -97,17 +97,6 @@ def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior
     assert (chosen.spread[1] < chosen.spread[0]).all()
 
 
-def test_more_motions_looked_at_leave_less_open_and_a_task_decides_where(posterior):
-    how = {**FEW, "limits": {"velocity": 2.0, "acceleration": 10.0}, "rows": 20}
-    task = arm_data(40, 3, FREE)
-    open_after = [np.linalg.norm(excitation(posterior, **how | {"motions": k}, task=task).spread[1]) for k in (1, 25)]
-    assert open_after[1] < 0.95 * open_after[0]
-    said = []
-    again = [excitation(posterior, **how, seed=3, progress=lambda *x: said.append(x)).motion.points for _ in range(2)]
-    assert np.array_equal(*again)
-    assert said[:9] == [(k + 1, 9) for k in range(9)]
-
-
 def test_torques_are_those_of_the_learned_friction(posterior, chosen):
     motion = chosen.motion
     v = motion.v[::20]
@@ -136,12 +125,6 @@ def test_a_point_stays_away_from_surfaces():
         excitation(FREE, **FEW, surfaces=[floor], clearance=2.0)
 
 
-def test_a_model_in_contact_learns_what_moves_freely():
-    for prior in (JointFriction(), UnknownForces([JointFriction(), ContactFriction()])):
-        found = excitation(fitted(prior, arm_model()), **FEW | {"motions": 3}, surfaces=[], rows=10)
-        assert (found.spread[1] < found.spread[0]).all()
-
-
 def test_models_without_learned_forces_move_for_parameters():
     found = excitation(fitted(()), **FEW | {"motions": 3})
     assert found.spread is None
@@ -163,29 +146,17 @@ def test_the_file_has_the_motion(chosen, tmp_path):
 ENDLESS = Robot.from_urdf_text(URDF.replace('type="revolute"', 'type="continuous"').replace('lower="-3" upper="3"', ""))
 
 
-def test_joints_without_ends_move_within_their_velocities():
-    found = excitation(ENDLESS, **FEW)
-    assert 0.1 < np.abs(found.motion.q - START).max() <= 4.5
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"start": [0.0, 3.5, 0.0]}, r"joint lift: no motion from 3.5 .* position limits of -6.2 and -0.8 from there"),
         ({"limits": {"velocity": [1.0, 0.0, 1.0]}}, "joint lift: no motion from 0.8 .* velocity limits of 0 and 0"),
-        ({"limits": {"acceleration": 0.0}}, "joint pan: no motion .* acceleration"),
         ({"limits": {"torque": [50.0, 1.0, 50.0]}}, r"joint lift needs .* times its torque limit at the start"),
         ({"limits": {"jerk": 1.0}}, "jerk"),
         ({"limits": {"velocity": [1.0, 2.0]}}, "velocity"),
-        ({"limits": 3.0}, "limits"),
         ({"seconds": 0.0}, "seconds"),
-        ({"seconds": 1e9}, "at most 120"),
-        ({"margin": 1.5}, "margin"),
         ({"clearance": np.nan}, "clearance"),
         ({"rows": 0}, "rows"),
-        ({"motions": 0}, "motions"),
-        ({"seed": -1}, "seed"),
-        ({"start": [0.0]}, "start"),
         ({"surfaces": [3]}, "contacts"),
         ({"task": 3}, "task"),
     ],
@@ -200,11 +171,3 @@ def test_without_a_start_it_is_inside_of_the_limits(posterior):
     np.testing.assert_allclose(excitation(FREE, **how).start, 0.0, atol=1e-12)  # the limits are -3 and 3
     middle = posterior.training.q.mean(0).numpy()
     np.testing.assert_allclose(excitation(posterior, **how).start, middle.clip(-0.57, 0.57))
-
-
-def test_only_robots_and_models_move():
-    with pytest.raises(InvalidInput, match=r"model is a int"):
-        excitation(3)
-    endless = Model(Robot.from_urdf_text(URDF.replace('velocity="5"', "")))
-    with pytest.raises(InvalidInput, match=r"joint pan: no motion .* velocity limits of -inf and inf"):
-        excitation(endless)

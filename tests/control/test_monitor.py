@@ -144,12 +144,12 @@ def test_learned_friction_sees_what_the_urdf_does_not(posterior):
     push = np.zeros((400, 2))
     push[200:] = 0.25, 0.1
     models = {
-        "learned": (posterior.predictor(), "noise"),
-        "urdf": (URDF_ALONE, None),
-        "both": (posterior.predictor(), None),
+        "learned": posterior.predictor(covariance="none"),
+        "urdf": URDF_ALONE,
+        "both": posterior.predictor(),
     }
-    for name, (model, covariance) in models.items():
-        found = ContactMonitor(model, dt=DT, covariance=covariance).calibrate([free])
+    for name, model in models.items():
+        found = ContactMonitor(model, dt=DT).calibrate([free])
         limits[name] = found.run(*motion(4.0, 7, push)).alarm[250:].double().mean()
     assert limits["learned"] > 0.95
     assert limits["both"] > 0.95
@@ -165,9 +165,6 @@ def test_learned_friction_sees_what_the_urdf_does_not(posterior):
         (lambda: ContactMonitor(TRUE, dt=0.0), "time step"),
         (lambda: ContactMonitor(TRUE, dt=DT, bandwidth=60.0), "bandwidth is 60.0; give Hz above 0 and below 50"),
         (lambda: ContactMonitor(arm_model(), dt=DT), r"posterior\.with_contacts\(\[\]\)"),
-        (lambda: ContactMonitor(TRUE, dt=DT, covariance="noise and posterior"), "with a covariance"),
-        (lambda: ContactMonitor(TRUE, dt=DT, covariance=np.ones(3)), "covariance"),
-        (lambda: ContactMonitor(TRUE, dt=DT, covariance="none"), "Valid covariances: noise, noise and posterior"),
         (lambda: ContactMonitor(TRUE, dt=DT).calibrate([motion(20.0, 1)]), "too short for a threshold"),
         (lambda: ContactMonitor(TRUE, dt=DT).calibrate([]), "too short"),
         (lambda: ContactMonitor(TRUE, dt=DT).calibrate([motion(60.0, 1)], false_alarms_per_hour=0.0), "above 0"),

@@ -103,21 +103,6 @@ def test_threads_do_not_change_a_bit(predictor):
     assert np.abs(one - free).max() > 1e-3
 
 
-def test_drawn_functions_are_those_of_rollouts(predictor):
-    model = model_of()
-    q, v, u = (x[0] for x in states(1))
-    forces = MujocoForces(predictor, model, draw=3, seed=4)
-    found = []
-    for number in range(3):
-        forces.use(number)
-        found.append(accelerations(forces, model, [q], [v], [u])[0])
-    motions = predictor.rollouts(q, v, u[None], 1e-6, functions=3, seed=4)
-    np.testing.assert_allclose(found, motions.a[:, 0], atol=1e-8)
-    assert np.ptp(found, axis=0).min() > 0.0
-    with pytest.raises(InvalidInput, match="function 3 is asked for, of 3"):
-        forces.use(3)
-
-
 def test_a_force_that_is_not_finite_is_an_error(predictor):
     model = model_of()
     data = mujoco.MjData(model)
@@ -128,33 +113,6 @@ def test_a_force_that_is_not_finite_is_an_error(predictor):
     with pytest.raises(NumericalError, match="not finite"):
         forces.__exit__(None, None, None)
     assert mujoco.get_mjcb_passive() is None
-
-
-def test_a_force_that_is_not_finite_is_an_error_also_after_another_was_taken(predictor):
-    model = model_of()
-    data = mujoco.MjData(model)
-    data.qvel[:] = np.nan
-    forces = MujocoForces(predictor, model, draw=2)
-    forces.__enter__()
-    mujoco.mj_forward(model, data)
-    forces.use(1)
-    with pytest.raises(NumericalError, match="not finite"):
-        forces.__exit__(None, None, None)
-
-
-def test_others_that_are_made_meanwhile_change_nothing(predictor):
-    """Drawn functions with the same program, whose tables differ."""
-    model = model_of()
-    q, v, u = states(1)
-    data = mujoco.MjData(model)
-    found = []
-    with MujocoForces(predictor, model, draw=2, seed=1):
-        for seed in (2, 3):
-            data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q[0], v[0], u[0]
-            mujoco.mj_forward(model, data)
-            found.append(data.qacc.copy())
-            MujocoForces(predictor, model, draw=2, seed=seed).use(1)
-    np.testing.assert_array_equal(*found)
 
 
 def test_one_callback_at_a_time(predictor):

@@ -307,7 +307,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "Inducing": _call(forcegp.inference.Inducing, _engine, "tolerance refine", lambda: {"points": 5}),
     "Robot.from_urdf_text": _call(
-        Robot.from_urdf_text, _robot_from, "gravity armature locked inertias base root", lambda: {"text": URDF}
+        Robot.from_urdf_text, _robot_from, "gravity armature locked inertias base", lambda: {"text": URDF}
     ),
     "Robot.from_mjcf_text": _call(
         Robot.from_mjcf_text,
@@ -362,9 +362,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Contact": (_contact, lambda: {"frame": "hand", "point": POINT, "surface": forcegp.Plane(**SURFACES)}),
     "Plane": _call(forcegp.Plane, _surface, given=lambda: dict(SURFACES)),
     "Sphere": _call(forcegp.Sphere, _surface, given=lambda: {"center": POINT, "radius": 0.5}),
-    "Cylinder": _call(
-        forcegp.Cylinder, _surface, given=lambda: {"point": POINT, "axis": (1.0, 0.0, 0.0), "radius": 0.5}
-    ),
     "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
     "viscous": _call(forcegp.Viscous, _forces, given=lambda: {"damping": 0.1}),
     "coulomb": _call(forcegp.Coulomb, _forces, given=lambda: {"level": 0.1, "velocity_scale": 0.01}),
@@ -405,8 +402,8 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "ComputedTorque": _call(
         forcegp.ComputedTorque,
         lambda kind, **k: kind(arm_model(0), **k)(*STATE[:2], *STATE),
-        "forces_at",
-        lambda: dict(TRACKING),
+        "",
+        lambda: {**TRACKING, "on_failure": "raise"},
     ),
     "PDGravity": _call(
         forcegp.control.PDGravity,
@@ -417,7 +414,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "ContactMonitor": _call(
         forcegp.ContactMonitor,
         lambda kind, **k: kind(arm_model(0), **k).run(INPUTS.free.q, INPUTS.free.v, INPUTS.free.u),
-        "bandwidth covariance",
+        "bandwidth",
         lambda: {"dt": 0.01},
     ),
     "MPPI": _call(

@@ -43,10 +43,8 @@ FREE = (
     .replace('<mimic joint="left"', "<mimic")
     .replace('<mimic\nmultiplier="-1.5" offset="0.1"/>', "")
 )
-ROBOTS = {"arm": URDF, "mimic": MIMIC, "free": FREE, "plane": FREE.replace("floating", "planar")} | {
-    f"mjcf {name}": text for name, text in ALL.items()
-}
-BASES = (None, "fixed", "floating", "planar", "spherical", "", "Floating", 5, ("floating",), ["planar"], {}, b"planar")
+ROBOTS = {"arm": URDF, "mimic": MIMIC, "free": FREE} | {f"mjcf {name}": text for name, text in ALL.items()}
+BASES = (None, "fixed", "floating", "planar", "", "Floating", 5, ("floating",), ["planar"], {}, b"planar")
 BESIDE = ("{}", "[]", "5", '{"pan": 0.1}', '{"pan": -1}', '{"pan": NaN}', '{"pan": "x"}', '{"pan": null}', '{"x": 1}')
 BESIDE += ('{"pan": 1e400}', '{"pan": [1]}', '{"pan": true}', '{"": 0}', "[" * 100_000, '{"pan": ' + "9" * 5000 + "}")
 BESIDE += ('{"left": 0.1}', '{"right": 0.1}', '{"left.x": 1}', "\x00", "")

@@ -6,8 +6,7 @@ from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from tests.inference.problems import normal, problem
 
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
-from forcegp.codegen.derivatives import jacobian
-from forcegp.codegen.graph import Graph
+from forcegp.codegen.graph import Graph, jacobian
 from forcegp.codegen.library import RowFunction, aligned, compile_library
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.prepared_kernels import kernel_groups, kernel_sums

@@ -1,11 +1,7 @@
 """Motions with known answers: the small arm of `tests.posterior.arm` on all surfaces, and damped oscillators."""
 
-import torch
-from tests.posterior.arm import arm_model, unknown_force
-
 from forcegp.forces import Actuation, RigidBodies, Stribeck
-from forcegp.integration import ConstraintManifold
-from forcegp.mechanics import Contact, Cylinder, Plane, Sphere
+from forcegp.mechanics import Contact, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -15,30 +11,7 @@ CONTACTS = {
     "plane": (PLANE,),
     "plane twice": (PLANE, PLANE),
     "sphere": (Contact("hand", TOOL, Sphere((0.0, 0.1, 0.4), 0.45)),),
-    "cylinder": (Contact("hand", TOOL, Cylinder((0.3, 0.0, 0.3), (0.0, 1.0, 0.2), 0.2)),),
 }
-
-
-def free_system(contacts: str) -> Model:
-    """The arm with these contacts and no stabilisation."""
-    return arm_model(baumgarte=None).with_contacts(CONTACTS[contacts])
-
-
-def start(model: Model, speed: float = 0.6) -> tuple[torch.Tensor, torch.Tensor]:
-    """Two states that meet the constraint."""
-    q = torch.tensor([[0.3, 0.7, 0.8], [-0.5, 0.9, 0.6]], dtype=torch.float64)
-    v = speed * torch.tensor([[0.8, -0.5, 0.9], [0.7, 0.6, -0.4]], dtype=torch.float64)
-    return ConstraintManifold(model).project(q, v)
-
-
-def physics(model: Model):
-    """a(q, v, u) of the arm with a little friction and with gravity compensated, so that u = 0 keeps it in reach."""
-
-    def acceleration(q, v, u):
-        dynamics = model.dynamics(q, v, u)
-        return dynamics.acceleration(0.03 * unknown_force(v) + model.robot.gravity_forces(q))
-
-    return acceleration
 
 
 LIGHT_LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="0.1"/>

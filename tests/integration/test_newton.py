@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forcegp.errors import InvalidInput
-from forcegp.integration.integrators import find_roots, rows_jacobian
+from forcegp.integration.integrators import find_roots
 
 
 def implicit_step(friction, joints: int, states: int):
@@ -55,17 +55,6 @@ def test_the_root_is_differentiable_once():
     assert torch.autograd.gradcheck(root, p)
     with pytest.raises(InvalidInput, match="differentiable once; leave out create_graph"):
         torch.autograd.grad(root(p).sum(), p, create_graph=True)
-
-
-def test_the_jacobian_of_rows_is_that_of_torch():
-    x = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-
-    def function(x):
-        return torch.stack([x.prod(-1), x.sin().sum(-1)], dim=-1)
-
-    value, J = rows_jacobian(function, x)
-    torch.testing.assert_close(value, function(x))
-    torch.testing.assert_close(J, torch.func.vmap(torch.func.jacrev(function))(x))
 
 
 def test_a_root_is_found_where_no_eigenvalues_are(monkeypatch):

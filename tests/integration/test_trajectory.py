@@ -2,14 +2,11 @@
 
 import pytest
 import torch
-from tests.integration.motions import free_system, physics, start
 
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.integration import (
     SPEED_LIMIT,
-    ConstraintManifold,
     ImplicitMidpoint,
-    Projected,
     RungeKutta4,
     SymplecticEuler,
     integrate,
@@ -43,25 +40,6 @@ def test_a_diverging_motion_is_nan_from_where_it_says_and_the_others_go_on(integ
     # vector instructions round a batch of three otherwise than one of two, at each of 100 steps
     torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=1e-11, atol=1e-11)
     torch.testing.assert_close(motion.a[:, 1:], alone.a, rtol=1e-11, atol=1e-11)
-
-
-def test_a_motion_that_leaves_its_constraint_ends_alone():
-    model = free_system("sphere")
-    q0, v0 = start(model)
-
-    def thrown(q, v, u):
-        return torch.cat([torch.full_like(q[:1], 2e5), physics(model)(q, v, u)[1:]])
-
-    def calm(q, v, u):
-        return physics(model)(q, v, u)
-
-    force = torch.zeros(20, 2, 3, dtype=torch.float64)
-    method = Projected(ConstraintManifold(model))
-    with pytest.warns(NumericalWarning, match="1 of 2 motions diverged, the first at step 1"):
-        motion = integrate(method, thrown, q0, v0, force, 1 / 240)
-    assert motion.diverged_at.tolist() == [1, -1]
-    alone = integrate(method, calm, q0[1:], v0[1:], force[:, 1:], 1 / 240)
-    torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=0, atol=1e-12)
 
 
 def test_a_motion_whose_implicit_step_has_no_solution_ends_with_that_reason():

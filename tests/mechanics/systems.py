@@ -6,7 +6,7 @@ import torch
 from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.forces import Actuation, RigidBodies
-from forcegp.mechanics import Contact, Cylinder, ImplicitSurface, Plane, Sphere
+from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -23,21 +23,21 @@ def surfaces() -> dict[str, object]:
     return {
         "plane": Plane((0.2, -0.1, 1.0), 0.055),
         "sphere": Sphere((0.1, 0.3, -0.2), 0.4),
-        "cylinder": Cylinder((0.0, 0.5, 0.1), (1.0, 0.2, -0.3), 0.2),
+        "ball": Sphere((0.0, 0.5, 0.1), 0.2),
         "waves": ImplicitSurface(lambda p: 2.0 * p[2] - 0.1 * torch.sin(3.0 * p[0]) * p[1]),
     }
 
 
 def contacts(kind: str, frame: str) -> tuple[Contact, ...]:
     """By name: none, one, three independent, the same twice, four corners of a plate on a plane (rank 3)."""
-    plane, sphere, cylinder, _ = surfaces().values()
+    plane, sphere, ball, _ = surfaces().values()
     return {
         "none": (),
         "one": (Contact(frame, POINT, plane),),
         "three": (
             Contact(frame, POINT, plane),
             Contact(frame, (0.0, 0.1, 0.0), sphere),
-            Contact(frame, (-0.1, 0.0, 0.05), cylinder),
+            Contact(frame, (-0.1, 0.0, 0.05), ball),
         ),
         "same twice": (Contact(frame, POINT, sphere), Contact(frame, POINT, sphere)),
         "four corners": tuple(Contact(frame, corner, plane) for corner in CORNERS),

@@ -20,7 +20,7 @@ from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.errors import NumericalError
 from forcegp.evidence import standard_parameters
-from forcegp.mechanics import Baumgarte, Contact, Plane, Sphere
+from forcegp.mechanics import Baumgarte, Contact, Sphere
 from forcegp.model import Model
 
 TOLERANCE = 1e-10
@@ -133,32 +133,6 @@ def test_redundant_contacts_share_the_force_equally():
     single, shared = once.dynamics(*q_v_u), twice.dynamics(*q_v_u)
     assert_close(shared.acceleration(Q_U), single.acceleration(Q_U), TOLERANCE)
     assert_close(shared.multiplier(Q_U), single.multiplier(Q_U).expand(5, 2) / 2.0, TOLERANCE)
-
-
-def test_without_contacts_it_is_forward_dynamics():
-    built = model_with("tree", "none")
-    q, v, u = states(built.robot.nv, 6)
-    Q_U = normal(6, built.robot.nv)
-    dynamics = built.dynamics(q, v, u)
-    assert_close(dynamics.acceleration(Q_U), built.robot.forward_dynamics(q, v, u + Q_U), 1e-12)
-    assert_close(dynamics.H, torch.linalg.inv(dynamics.M), TOLERANCE)
-    assert dynamics.A.shape == (6, 0, built.robot.nv)
-    assert dynamics.b.shape == dynamics.multiplier(Q_U).shape == (6, 0)
-    assert not dynamics.constrained_offset.any()
-
-
-def test_as_many_constraints_as_joints_leave_nothing_to_move():
-    """H = 0: the acceleration is what the constraints say, whatever the forces."""
-    built = model_with("chain", "three")
-    frame = FRAMES["chain"]
-    fixed = tuple(
-        Contact(frame, point, Plane(axis, 0.1))
-        for point, axis in (((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), ((0.1, 0.1, 0.0), (0.0, 0.0, 1.0)))
-    )
-    built = built.with_contacts((*built.contacts, *fixed)[: built.robot.nv])
-    dynamics = built.dynamics(*states(built.robot.nv, 4))
-    assert float(dynamics.H.abs().max()) < 1e-8 * float(torch.linalg.inv(dynamics.M).abs().max())
-    assert_close(dynamics.acceleration(normal(4, built.robot.nv)), torch.linalg.solve(dynamics.A, dynamics.b), 1e-8)
 
 
 # ---------------------------------------------------------------- batches

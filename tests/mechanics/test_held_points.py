@@ -38,17 +38,6 @@ def test_inputs_are_actuators_then_switches(walker):
     assert walker.sizes == (10, 9, 5)
 
 
-def test_a_point_in_a_plane_is_held_in_two_directions(robot):
-    body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
-    flat = Robot.from_urdf_text(f'<robot name="r"><link name="base">{body}</link></robot>', base="planar")
-    model = Model(flat, fixed_point("base", (0.1, 0.0, 0.0)))
-    q, v, u = states(flat, 0)
-    model.check_states(q, v, u)
-    along = Model(flat, (fixed_point("base")[2],))
-    with pytest.raises(ContactError, match="no direction at row 0"):
-        along.check_states(q, v, u)
-
-
 def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walker, robot):
     """The saddle-point system of each row with only the contacts that act there, by a dense solve."""
     q, v, u = states(robot, 5)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tests.mechanics.surface_conformance import SurfaceConformance
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
-from forcegp.mechanics import Cylinder, ImplicitSurface, Plane, Sphere, Surface
+from forcegp.mechanics import ImplicitSurface, Plane, Sphere, Surface
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict
 
 
@@ -20,10 +20,6 @@ class TestSkewPlane(SurfaceConformance):
 
 class TestSphere(SurfaceConformance):
     surface = Sphere((0.3, -0.2, 0.5), 0.7)
-
-
-class TestCylinder(SurfaceConformance):
-    surface = Cylinder((0.1, 0.2, -0.3), (0.5, 1.0, -2.0), 0.25)
 
 
 class TestWavyFloor(SurfaceConformance):
@@ -61,7 +57,6 @@ def test_signs_and_distances():
     for surface, expected in (
         (Plane((0, 0, 2), 2), [2.0, -0.5]),
         (Sphere((0, 0, 0), 1), [2.0, -0.5]),
-        (Cylinder((5, 0, 0), (-1, 0, 0), 1), [2.0, -0.5]),
     ):
         torch.testing.assert_close(surface.value(p), torch.tensor(expected, dtype=torch.float64))
         torch.testing.assert_close(surface.gradient(p), torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64))
@@ -73,7 +68,6 @@ def test_curvatures():
     for surface, curvatures in (
         (Plane((0, 0, 1), 0), [0.0, 0.0, 0.0]),
         (Sphere((0, 0, 0), 1), [0.5, 0.5, 0.0]),
-        (Cylinder((0, 0, 0), (1, 0, 0), 1), [0.0, 0.5, 0.0]),
     ):
         torch.testing.assert_close(surface.hessian(p), torch.diag(torch.tensor(curvatures, dtype=torch.float64)))
 
@@ -81,7 +75,6 @@ def test_curvatures():
 def test_directions_need_not_be_unit_vectors():
     assert Plane((0, 0, 4), 2) == Plane((0, 0, 1), 0.5)
     assert Plane((0, 0, -1), 0.5) != Plane((0, 0, 1), -0.5)  # the other side is positive
-    assert Cylinder((0, 0, 0), (0, 3, 4), 1).axis == (0.0, 0.6, 0.8)
 
 
 finite = st.floats(-1e3, 1e3)
@@ -104,9 +97,6 @@ finite = st.floats(-1e3, 1e3)
         (lambda: Sphere((0, 0, 0), 0.0), "Sphere radius is 0.0; it must be positive"),
         (lambda: Sphere((0, 0, 0), -1.0), "Sphere radius is -1.0"),
         (lambda: Sphere(3.0, 1.0), "Sphere center is 3.0; give 3 finite numbers"),
-        (lambda: Cylinder((0, 0, 0), (0, 0, 0), 1), "Cylinder axis"),
-        (lambda: Cylinder((0, 0, 0, 0), (0, 0, 1), 1), "Cylinder point"),
-        (lambda: Cylinder((0, 0, 0), (0, 0, 1), math.nan), "Cylinder radius is nan"),
         (lambda: ImplicitSurface(3.0), "ImplicitSurface function is 3.0"),
     ],
 )

@@ -9,7 +9,7 @@ from tests.robots.robot_models import FRAMES, TREE, loaded
 
 from forcegp.errors import ContactError, InvalidInput, NumericalError, UnknownFrame
 from forcegp.forces import Actuation, Coulomb, RigidBodies, Rotor, Viscous
-from forcegp.mechanics import Baumgarte, Contact, Cylinder, ImplicitSurface, Plane, Sphere
+from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -26,7 +26,7 @@ def complete() -> Model:
         (
             Contact("right_hand", (0.1, -0.2, 0.3), Plane((0.3, 0.1, 1.0), 0.123)),
             Contact("camera", (0.0, 0.0, 0.1), Sphere((0.1, 0.2, 0.3), 0.7)),
-            Contact("left_arm", (0.3, 0.0, 0.0), Cylinder((0.0, 0.1, 0.0), (1.0, 1.0, 0.1), 0.4)),
+            Contact("left_arm", (0.3, 0.0, 0.0), Sphere((0.0, 0.1, 0.0), 0.4)),
         ),
         (
             Actuation(),

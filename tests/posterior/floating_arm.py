@@ -67,7 +67,7 @@ def turned(dataset: Dataset) -> Dataset:
     turn = torch.tensor([0.5, -0.3, 0.4, 0.7], dtype=torch.float64)
     turn = turn / torch.linalg.vector_norm(turn)
     q = torch.tensor(dataset.q)
-    rotation, _ = pose("spherical", turn)
+    rotation, _ = pose(torch.cat([torch.zeros(3).double(), turn]))
     position = q[:, :3] @ rotation.mT + torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     q = torch.cat([position, -quaternion_product(turn.expand(len(q), -1), q[:, 3:7]), q[:, 7:]], 1)
     return replace(dataset, q=q.numpy())

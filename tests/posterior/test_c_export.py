@@ -14,12 +14,11 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.noise import Noise
-from forcegp.posterior import Posterior, c_export, casadi_function
+from forcegp.posterior import Posterior, c_export
 from forcegp.posterior.c_export import identifier, rounding
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
@@ -279,15 +278,6 @@ def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(pos
     assert (tmp_path / "arm" / "arm.c").exists()
 
 
-def test_a_model_without_unknown_forces(tmp_path, states):
-    none = fitted()
-    export_c(none, tmp_path / "arm", jacobian=True)
-    _, (a,) = call(compiled(tmp_path / "arm", "arm.c").arm_mean, [3], *(x[0] for x in states))
-    np.testing.assert_allclose(a, none.predict(*states).mean[0], rtol=1e-11)
-    with pytest.raises(InvalidInput, match="has no covariance that could be exported"):
-        export_c(none, tmp_path / "other", covariance=True)
-
-
 @dataclass(frozen=True)
 class Deciding(JointFriction):
     """With a branch on values, in one of the ways in which Python can take one."""
@@ -297,28 +287,6 @@ class Deciding(JointFriction):
     def features(self, dynamics):
         ways = {"if": lambda z: bool(z[0, 0] > 0.0), "numpy": lambda z: z.detach().numpy().min() > 0.0}
         return tuple(z if ways[self.how](z) else -z for z in super().features(dynamics))
-
-
-@pytest.mark.parametrize("how", ["if", "numpy"])
-def test_a_branch_on_values_is_an_error_everywhere(how, tmp_path, states):
-    model = fitted(JointForces(), Deciding(how=how))
-    branch = "compiled code cannot hold a branch on the values of a tensor"
-    with pytest.raises(InvalidInput, match=rf"^{branch}, or .*give compile=False, whose results are the same.$"):
-        model.predictor(covariance="none")
-    with pytest.raises(InvalidInput, match=branch):
-        export_c(model, tmp_path / "arm")
-    pytest.importorskip("casadi")
-    with pytest.raises(InvalidInput, match=branch):
-        casadi_function(model)
-    assert list(tmp_path.iterdir()) == []
-    found = model.predictor(covariance="none", compile=False).mean(*states)
-    torch.testing.assert_close(found, model.predict(*states).mean)
-
-
-def test_measured_torques_are_refused(tmp_path):
-    measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
-    with pytest.raises(InvalidInput, match="a program is for commanded torques"):
-        export_c(measured, tmp_path / "arm")
 
 
 @pytest.mark.parametrize(

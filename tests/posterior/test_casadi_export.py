@@ -75,7 +75,7 @@ def test_steps_are_those_of_a_predictor(posterior, states, integrator):
         found = function(*(x[k].numpy() for x in states))
         for ours, theirs in zip(found, expected, strict=True):
             np.testing.assert_allclose(np.array(ours).ravel(), theirs[k], rtol=1e-9, atol=1e-9)
-    for wrong, message in (({"steps": 0.0}, "dt is 0.0"), ({"steps": 0.1, "integrator": "projected"}, "'projected'")):
+    for wrong, message in (({"steps": 0.0}, "dt is 0.0"), ({"steps": 0.1, "integrator": "leap"}, "'leap'")):
         with pytest.raises(InvalidInput, match=message):
             casadi_function(posterior, **wrong)
 

@@ -217,25 +217,6 @@ def slid(model, friction, rows, seed, speed):
     return data, force
 
 
-def test_friction_learned_on_one_plane_predicts_motions_on_another_and_on_a_ball():
-    def friction(speed):
-        return 3.0 * torch.tanh(speed / 0.1) + 2.0 * speed
-
-    model = arm_model()
-    train, _ = slid(model, friction, 30, 1, speed=0.7)
-    posterior = fit(model.with_forces(ContactFriction()), train, restarts=1, options=OptimizerOptions(iterations=40))
-    for surface in (Plane((-0.3, 0.1, 1.0), 0.55), Sphere((0.0, 0.0, -2.0), 2.4)):
-        moved = model.with_contacts([Contact("hand", TIP, surface)])
-        test, force = slid(moved, friction, 20, 2, speed=0.25)
-        transferred = posterior.with_contacts(moved.contacts)
-        error = np.abs(transferred.predict(test.q, test.v, test.u).mean.numpy() - test.a)
-        states = (torch.tensor(x) for x in (test.q, test.v, test.u))
-        unknown = np.abs(moved.dynamics(*states).acceleration_map().offset.numpy() - test.a)
-        assert error.mean() < 1e-3 * unknown.mean()
-        part = transferred.components(test.q, test.v, test.u)["contact-friction"]
-        assert float((part.point_force.mean - force).abs().max()) < 1e-3
-
-
 def test_what_cannot_move_is_refused(posterior, train):
     heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))

@@ -14,7 +14,7 @@ from forcegp.codegen import library
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointForces, JointFriction
-from forcegp.posterior import load_posterior, programs, save_posterior, update
+from forcegp.posterior import load_posterior, programs, save_posterior
 
 FIRST, HORIZON = 14, 20.0
 
@@ -98,13 +98,6 @@ def test_it_is_the_posterior_of_kernels_with_a_factor_in_time(posterior, data, h
     predicted = found.predict(test.q, test.v, test.u)
     torch.testing.assert_close(predicted.mean, mean, rtol=0.0, atol=1e-8)
     torch.testing.assert_close(predicted.covariance, covariance, rtol=0.0, atol=1e-8)
-
-
-def test_points_at_all_states_leave_nothing_out_and_nothing_is_forgotten_without_end(posterior, data, monkeypatch):
-    monkeypatch.setattr(update, "ENOUGH", 0.0)
-    again = data.rows(slice(FIRST, FIRST + 6))
-    found = posterior.update(again, horizon=math.inf)
-    assert_same(found, posterior.update(again), data, tolerance=1e-6)
 
 
 def test_each_term_is_forgotten_within_its_own_time(model, data):

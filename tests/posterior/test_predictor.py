@@ -141,15 +141,6 @@ def test_the_rank_keeps_the_tolerance_and_no_more(posterior):
     assert 1.0 - 1e-6 < float(ratio.min()) <= float(ratio.max()) < 1.02
 
 
-def test_functions_of_one_input_are_compressed_at_all_training_rows(monkeypatch):
-    posterior = fitted(arm_model().with_forces(JointFriction()), rows=60)
-    monkeypatch.setattr("forcegp.posterior.preparation.SAMPLES", 30)
-    predictor = posterior.predictor(compile=False)  # without a warning; of ten rows it is 97 times too large at others
-    rows = posterior.training
-    ratio = predictor(rows.q, rows.v, rows.u)[1].diagonal(dim1=1, dim2=2)
-    assert float((ratio / posterior.predict(rows.q, rows.v, rows.u).variance).sqrt().max()) < 1.05
-
-
 def test_a_copy_in_another_process_is_the_same(compressed, states):
     copied = pickle.loads(pickle.dumps(compressed))
     for found, expected in zip(copied(*states), compressed(*states), strict=True):

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from forcegp import Contact, Dataset, JointFriction, Model, Noise, Plane, Robot, export_c, fit
-from forcegp.codegen.branch_free_linalg import pseudo_inverse
 from forcegp.errors import InvalidInput
 from forcegp.forces import Actuation, JointForces, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_frame, fixed_point
@@ -62,7 +61,7 @@ def fitted(model, prior, seed=0):
 
 @pytest.fixture(
     scope="module",
-    params=["floating", *(pytest.param(base, marks=pytest.mark.nightly) for base in ("planar", "spherical"))],
+    params=["floating"],
 )
 def case(request):
     return fitted(hopper(request.param), JointFriction())
@@ -134,15 +133,6 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     close(v_next, found.v[:, 1], 1e-9)
 
 
-def test_motions_under_drawn_functions(case):
-    posterior, q, v, u = case
-    u = u[:2, None].expand(-1, 6, -1).clone()
-    found = posterior.predictor(covariance="none").rollouts(q[:2], v[:2], u, 0.004, functions=3, seed=4)
-    expected = posterior.rollout(q[:2], v[:2], u, 0.004, samples=3, seed=4).samples
-    for name in "qva":
-        close(getattr(found, name), getattr(expected, name), 1e-7)  # drawn functions are tables
-
-
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
 def test_a_linear_step_is_that_of_differences(case, integrator):
     posterior, *states = case
@@ -193,17 +183,6 @@ def test_the_program_in_c(floating, tmp_path):
     given = [x.contiguous().numpy() for x in (q[0], step)]
     assert library.hopper_integrate(*(ctypes.c_void_p(x.ctypes.data) for x in (*given, made))) == 0
     close(torch.as_tensor(made), posterior.model.robot.integrate(q[0], step), 1e-13)
-
-
-@pytest.mark.nightly
-def test_derivatives_in_c(floating, tmp_path):
-    posterior = floating[0]
-    written = export_c(posterior, tmp_path / "c", jacobian=True)
-    assert written.differences["hopper_linearize"] < 1e-9
-    with pytest.raises(InvalidInput, match="derivatives of exported steps need a base that is fixed"):
-        export_c(posterior, tmp_path / "d", jacobian=True, steps=0.01)
-    with pytest.raises(InvalidInput, match="not 'implicit-midpoint'; give one of 'symplectic-euler', 'rk4'"):
-        export_c(posterior, tmp_path / "d", steps=0.01, integrator="implicit-midpoint")
 
 
 def test_functions_of_casadi(case, tmp_path):
@@ -280,28 +259,3 @@ def test_redundant_contacts_have_right_derivatives():
     expected = posterior.predictor(covariance="none", compile=False).linearize(q, v, u)
     for found, other in zip(predictor.linearize(q, v, u), expected, strict=True):
         close(found, other, 1e-9)
-
-
-@pytest.mark.parametrize(("rows", "columns", "rank"), [(7, 9, 7), (12, 18, 12), (9, 18, 6), (12, 18, 4)])
-def test_a_pseudo_inverse_of_many_rows(rows, columns, rank):
-    """Against torch's, with rows that are switched off, and in directions that keep the rank."""
-    generator = torch.Generator().manual_seed(rows + rank)
-
-    def random(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    A, M, N, weights = (
-        random(rows, rank) @ random(rank, columns),
-        random(rows),
-        random(columns, columns),
-        random(columns, rows),
-    )
-    A[-3:-1] = 0.0
-    found = []
-    for inverse in (pseudo_inverse, lambda matrix, tolerance: torch.linalg.pinv(matrix, rtol=tolerance)):
-        size = torch.zeros((), dtype=torch.float64, requires_grad=True)
-        moved = (1.0 + size * M)[:, None] * A @ (torch.eye(columns).double() + size * N)
-        value = inverse(moved, 1e-9)
-        found.append((value.detach(), *torch.autograd.grad((weights * value).sum(), size)))
-    for mine, expected in zip(*found, strict=True):
-        close(mine, expected, 1e-9)

@@ -12,7 +12,7 @@ from tests.posterior.arm import arm_data
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.fit.search import Search
-from forcegp.forces import JointForces, JointFriction, Unknown, kernel_of
+from forcegp.forces import JointForces, Unknown, kernel_of
 from forcegp.inference import OptimizerOptions
 from forcegp.posterior import save_posterior
 
@@ -105,14 +105,3 @@ def test_what_a_prior_gives_is_checked_before_the_search(data, monkeypatch, meth
 
 def test_a_complete_prior_passes(data):
     fit(data.model.with_forces(AirDrag("hand")), data, **QUICK)
-
-
-@pytest.mark.parametrize(
-    ("given", "meant"),
-    [("rbf", "squared-exponential"), ("RBF", "squared-exponential"), ("matern52", "matern-5/2"), ("rq", "rational-qu")],
-)
-def test_names_of_other_libraries_suggest_ours(given, meant):
-    with pytest.raises(InvalidInput, match=f"no kernel '{given}'.* did you mean '{meant}"):
-        JointFriction(kernel=given)
-    with pytest.raises(InvalidInput, match=f"did you mean '{meant}"):
-        JointFriction(kernel=f"linear + {given}")

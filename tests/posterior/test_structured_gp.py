@@ -11,7 +11,6 @@ from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane
-from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.robots import Robot
 
@@ -103,16 +102,6 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
     assert torch.allclose(prediction.covariance, posterior.widening**2 * covariance, atol=1e-8)
 
 
-def test_zero_mean_carries_the_known_forces_in_the_processes(train, test):
-    zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=QUICK)
-    states = tuple(map(torch.tensor, (test.q, test.v, test.u)))
-    dynamics = test.model.dynamics(*states)
-    prediction = zero.predict(*states)
-    total = prediction.unknown_force.mean
-    assert torch.allclose(dynamics.acceleration(total - dynamics.Q_K), prediction.mean, atol=1e-9)
-    assert float(((dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b).abs().max()) < 1e-9
-
-
 def test_the_noise_is_learned(train):
     fitted = fit(
         train.model.with_forces(JointForces(), noise=Noise(0.2, learn=True)),
@@ -136,20 +125,6 @@ def test_force_level_noise_widens_along_H(train, test):
     assert torch.allclose(prediction.noise_covariance, expected, atol=1e-12)
 
 
-def test_restarts_are_seeded_by_index_and_the_best_is_kept(train):
-    options = OptimizerOptions(iterations=2)
-    model = train.model.with_forces(JointForces())
-    three = fit(model, train, points=8, restarts=3, seed=7, options=options)
-    again = fit(model, train, points=8, restarts=3, seed=7, jobs=2, options=options)
-    values = three.settings["restart_objective"]
-    assert len(set(values)) == 3
-    assert three.result.value == min(values)
-    assert np.allclose(again.settings["restart_objective"], values, rtol=1e-9)
-    other = fit(model, train, points=8, restarts=2, seed=8, options=options)
-    assert other.settings["restart_objective"][0] == pytest.approx(values[0])
-    assert other.settings["restart_objective"][1] != pytest.approx(values[1])
-
-
 def test_the_objective_is_the_likelihood_times_the_priors(train):
     found = fit(train.model.with_forces(JointForces()), train, points=20, restarts=1, options=OptimizerOptions(10))
     priors = found.kernels.log_prior(found.hyperparameters) + found.likelihood.noise.log_prior(found.hyperparameters)
@@ -157,25 +132,10 @@ def test_the_objective_is_the_likelihood_times_the_priors(train):
     assert found.result.value == pytest.approx(found.negative_log_likelihood - float(priors.detach()), abs=1e-6)
 
 
-def test_nothing_of_the_caller_changes(train):
-    before = {name: getattr(train, name).copy() for name in ("q", "v", "u", "a")}
-    state = torch.get_default_dtype(), torch.get_num_threads()
-    fit(train.model.with_forces(JointForces()), train, points=10, options=OptimizerOptions(iterations=2))
-    assert all(np.array_equal(getattr(train, name), value) for name, value in before.items())
-    assert state == (torch.get_default_dtype(), torch.get_num_threads())
-
-
 def test_a_dataset_of_another_robot_is_refused(train):
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
     with pytest.raises(InvalidInput, match="dataset are pan, lift, bend, those of the robot yaw, lift, bend"):
         fit(train.model.with_robot(renamed).with_forces(JointForces()), train)
-
-
-def test_contradictory_contacts_are_refused(train):
-    contradiction = Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.9))
-    model = Model(train.model.robot, (*train.model.contacts, contradiction), baumgarte=train.model.baumgarte)
-    with pytest.raises(ContactError, match="contradict"):
-        fit(model.with_forces(JointForces()), train)
 
 
 def test_a_surface_that_no_row_touches_is_refused(train):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data
 
-from forcegp.errors import ContactError, DataWarning, InvalidInput, NotEnoughMemory
+from forcegp.errors import ContactError, InvalidInput, NotEnoughMemory
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions, likelihood
@@ -120,20 +120,6 @@ def test_a_budget_is_kept_and_the_result_is_that_of_the_rows_kept(budget):
     assert_same(grown, at_once(posterior, data.rows(rows)), test)
 
 
-def test_everything_else_works_after_an_update(tmp_path):
-    data = arm_data(20, seed=13)
-    posterior = learned(data, model=data.model.with_forces(JointFriction()))
-    grown = posterior.update(data.rows(slice(12, 20)), budget=16)
-    moved = grown.with_contacts([])
-    assert_same(moved, at_once(posterior, _rows_of(grown, data)).with_contacts([]), data)
-    name = grown.latent_names[0]
-    torch.testing.assert_close(
-        grown.curve(name, [0.1, 0.2]).mean, at_once(posterior, _rows_of(grown, data)).curve(name, [0.1, 0.2]).mean
-    )
-    motion = grown.rollout(data.q[0], data.v[0], np.zeros((3, 3)), 0.001, samples=2)
-    assert bool(torch.isfinite(motion.q).all())
-
-
 def _rows_of(posterior, data):
     rows = [int(np.argmin(np.abs(data.q - q).sum(1))) for q in posterior.training.q.numpy()]
     return data.rows(rows)
@@ -189,28 +175,6 @@ def test_noise_of_every_row_must_be_stated_for_all_or_none(posterior):
 
 def stating(data, noise_std):
     return dataclasses.replace(data, noise_std=noise_std)
-
-
-def test_rows_that_state_another_noise_than_the_fit_are_warned_of(posterior, tmp_path):
-    rows = arm_data(3, seed=17)
-    other = stating(rows, rows.noise_std * [1.0, 1.0, 2.0])
-    say = r"0.05 \(0.05\), 0.05 \(0.05\), 0.1 \(0.05\).*level of the fit is used.*noise_std of shape \(rows, nv\)"
-    with pytest.warns(DataWarning, match=say):
-        grown = posterior.update(other)
-    assert_same(grown, posterior.update(rows), rows)
-    assert_same(grown, posterior.update(stating(rows, rows.noise_std * 1.09)), rows)  # warnings are errors here
-    save_posterior(posterior, tmp_path / "run")
-    with pytest.warns(DataWarning, match="another noise"):
-        load_posterior(tmp_path / "run").update(other)
-
-
-def test_rows_that_state_their_own_noise_are_as_noisy_as_they_say():
-    data = arm_data(16, seed=18)
-    uneven = stating(data, np.tile(data.noise_std, (16, 1)))
-    posterior = learned(uneven)
-    rows = stating(uneven.rows(slice(12, 16)), 10.0 * data.noise_std)
-    noise = posterior.update(rows).likelihood.terms(posterior.hyperparameters).noise
-    torch.testing.assert_close(noise[12:].sqrt(), torch.full((4, 3), 10.0) * torch.tensor(data.noise_std))
 
 
 def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(posterior, monkeypatch):

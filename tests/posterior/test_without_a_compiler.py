@@ -1,7 +1,5 @@
 """Predictors where nothing can be compiled: torch computes the same, and one warning says so."""
 
-import pickle
-import shutil
 import warnings
 
 import pytest
@@ -55,35 +53,3 @@ def test_everything_is_the_same_after_one_warning(posterior, states, monkeypatch
             motions = [of.rollouts(*states[:2], u, 0.01, functions=functions) for of in (predictor, eager)]
             torch.testing.assert_close(motions[0], motions[1])
     torch.testing.assert_close(predictor.mean(*states), posterior.predict(*states).mean)
-
-
-@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
-def test_what_was_compiled_stays_and_what_cannot_be_is_done_by_torch(posterior, states, monkeypatch, tmp_path):
-    predictor = posterior.predictor(covariance="none")
-    expected = predictor.mean(*states)
-    hangs = tmp_path / "hangs"
-    hangs.write_text("#!/bin/sh\necho >> $0.called\nexec sleep 60\n")
-    hangs.chmod(0o700)
-    monkeypatch.setenv("CC", str(hangs))
-    monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.5)
-    with pytest.warns(NumericalWarning, match=SLOWER + ".*did not end within"):
-        linear = predictor.linearize(*states)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        predictor.rollouts(*states[:2], states[2][:, None], 0.01)
-        assert torch.equal(predictor.mean(*states), expected)
-        q = states[0].clone().requires_grad_()
-        predictor.mean(q, *states[1:]).sum().backward()
-    torch.testing.assert_close(q.grad, linear.da_dq.sum(1))
-    assert (tmp_path / "hangs.called").read_text().count("\n") == 1  # it is not waited for again
-    torch.testing.assert_close(linear, posterior.predictor(covariance="none", compile=False).linearize(*states))
-
-
-def test_a_predictor_sent_to_a_process_without_compiler_works_there(posterior, states, monkeypatch):
-    monkeypatch.setenv("CC", "no-such-compiler")
-    predictor = posterior.predictor(covariance="none", compile=False)
-    with pytest.warns(NumericalWarning, match=SLOWER):
-        sent = pickle.loads(pickle.dumps(posterior.predictor(covariance="none")))
-    with pytest.warns(NumericalWarning, match=SLOWER):
-        found = sent.mean(*states)
-    torch.testing.assert_close(found, predictor.mean(*states))

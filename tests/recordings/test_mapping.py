@@ -205,10 +205,3 @@ def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
         signal_plan(ColumnMapping(), source, Model(Robot.from_urdf_text(ARM)))
     held = Model(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
     assert signal_plan(ColumnMapping(), source, held).guessed[1] == "u = eff_shoulder"  # as ROS abbreviates effort
-
-
-def test_the_order_of_columns_of_a_base_is_stated(tmp_path):
-    columns = {name: np.zeros(3) for name in ("time", "x", "y", "yaw", "q_shoulder", "q_finger")}
-    source = open_source(write_text(tmp_path / "log.csv", columns))
-    with pytest.raises(InvalidInput, match=r"in the order base.x, base.y, base.yaw, shoulder, finger"):
-        signal_plan(ColumnMapping(orientation="angles"), source, Model(Robot.from_urdf_text(ARM, base="planar")))

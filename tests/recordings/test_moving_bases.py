@@ -12,7 +12,6 @@ from tests.recordings.log_files import write_text
 from forcegp import Model, Robot
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.mechanics import rolling
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 from forcegp.simulation import QuadrotorConfig, QuadrupedConfig, simulate_quadrotor, simulate_quadruped
 
@@ -176,31 +175,6 @@ BODY = """<robot name="box"><link name="body"><inertial><mass value="1"/>
 <inertia ixx="0.01" iyy="0.01" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
 
 
-@pytest.mark.parametrize(
-    ("base", "q", "stated"),
-    [
-        ("planar", lambda t: np.stack([t, t**2, 0.4 * t], axis=1), {"orientation": "angles"}),
-        ("planar", lambda t: np.stack([t, t**2, np.cos(0.4 * t), np.sin(0.4 * t)], axis=1), {}),
-        ("spherical", lambda t: Rotation.from_rotvec(np.outer(0.4 * t, [0, 0, 1])).as_quat(), {}),
-        ("spherical", lambda t: np.outer(0.4 * t, [0, 0, 1]), {"orientation": "angles"}),
-    ],
-)
-@pytest.mark.parametrize("ned", [False, True])
-def test_other_bases(tmp_path, base, q, stated, ned):
-    time = np.arange(100) / 100
-    table = {"time": time} | {f"q{k}": column for k, column in enumerate(q(time).T)}
-    path = write_text(tmp_path / "log.csv", table)
-    mapping = ColumnMapping(time="time", q=(f"q{{0..{len(table) - 2}}}",), ned=ned, **stated)
-    model = Model(Robot.from_urdf_text(BODY, base=base))
-    found = import_recordings([path], mapping, model=model)
-    side = -1.0 if ned else 1.0
-    np.testing.assert_allclose(found.v[:, -1], 0.4 * side, rtol=1e-9)
-    if base == "planar":
-        velocity = np.stack([np.ones(100), side * 2 * time], axis=1)
-        own = Rotation.from_rotvec(np.outer(-0.4 * side * time, [0, 0, 1])).apply(np.c_[velocity, np.zeros(100)])
-        np.testing.assert_allclose(found.v[2:-2, :2], own[2:-2, :2], rtol=0, atol=1e-4)
-
-
 def test_lengths_are_mended_or_refused(tmp_path, flight):
     rounded = np.round(flight.q, 4)
     found = imported(tmp_path, flight, {"q": rounded})
@@ -296,27 +270,3 @@ def test_flags_that_a_log_lacks_are_open(tmp_path):
     u = found.u
     np.testing.assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
     assert (u[:, 12:] == 0.0).all()
-
-
-def test_a_wheel_may_turn_often(tmp_path):
-    """A joint that no wheel stands for, and that turns as often, may be in degrees."""
-    part = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-    part += "</inertial></link>"
-    text = f'<robot name="cart">{part.format("base")}{part.format("wheel")}<joint name="axle" type="continuous">'
-    text += '<parent link="base"/><child link="wheel"/><axis xyz="0 1 0"/></joint></robot>'
-    cart = Model(Robot.from_urdf_text(text, base="planar"))
-    turn = np.linspace(0.0, 60.0, 200)
-    table = {
-        "time": 0.01 * np.arange(200),
-        "x": 0.1 * turn,
-        "y": 0 * turn,
-        "c": 1 + 0 * turn,
-        "s": 0 * turn,
-        "axle": turn,
-    }
-    path = write_text(tmp_path / "log.csv", table)
-    mapping = ColumnMapping(time="time", q=("x", "y", "c", "s", "axle"), u=("0",))
-    found = import_recordings([path], mapping, model=cart.with_contacts(rolling("wheel", 0.1)))
-    np.testing.assert_allclose(found.q[:, -1], turn)
-    with pytest.raises(DatasetError, match="more than two turns"):
-        import_recordings([path], mapping, model=cart)

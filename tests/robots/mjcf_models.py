@@ -46,9 +46,9 @@ QUADROTOR = """<mujoco model="quad"><worldbody><body name="frame"><freejoint nam
 <motor name="3" site="r3" gear="0 0 1 0 0 -.02"/><motor name="4" site="r4" gear="0 0 1 0 0 .02"/></actuator></mujoco>"""
 
 CHAIN = """<mujoco model="chain"><worldbody><body name="post"><geom size=".1"/>
-<body name="first" pos="0 .1 0" euler="0 0 20"><joint name="ball" type="ball" pos="0 0 .05" armature=".01"
- damping=".1"/> <geom type="capsule" fromto="0 0 0 .1 0 -.3" size=".03"/>
- <body name="second" pos=".1 0 -.3"><joint type="ball"/><geom type="box" size=".02 .03 .1" pos="0 .02 -.1"/>
+<body name="first" pos="0 .1 0" euler="0 0 20"><joint name="roll" axis="1 0 0" pos="0 0 .05" armature=".01"
+ damping=".1"/><joint name="pitch" axis="0 1 0" pos="0 0 .05"/><geom type="capsule" fromto="0 0 0 .1 0 -.3" size=".03"/>
+ <body name="second" pos=".1 0 -.3"><joint axis="0 0 1"/><geom type="box" size=".02 .03 .1" pos="0 .02 -.1"/>
   <body name="third" pos="0 0 -.2"><joint axis="1 1 0"/><geom type="box" size=".02 .03 .1" pos="0 0 -.1"/></body>
  </body></body></body></worldbody></mujoco>"""
 

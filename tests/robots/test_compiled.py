@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import re
 import stat
 import subprocess
 import sys
@@ -15,8 +14,7 @@ from forcegp.codegen.c_writer import write_program
 from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput
 from forcegp.robots import Robot
-from forcegp.robots.compiled import trace_dynamics
-from forcegp.robots.unrolled import UnrolledRobot
+from forcegp.robots.compiled import UnrolledRobot, trace_dynamics
 
 # a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
 TEXT = """<robot name="small">
@@ -82,13 +80,6 @@ def test_values_equal_those_of_the_robot(robot, compiled, method):
     torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 8, 9])
-def test_every_number_of_states(robot, compiled, count):
-    """Some fill the vector registers, some do not."""
-    states = random(3, count, 3)
-    torch.testing.assert_close(compiled.forward_dynamics(*states), robot.forward_dynamics(*states))
-
-
 @pytest.mark.parametrize(("lanes", "statements"), [(1, 500), (2, 500), (8, 500), (4, 40), (4, 10**6)])
 def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
     """What is written for other processors runs here, too, only slower; parts of any length do the same."""
@@ -98,14 +89,6 @@ def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, stat
     library = compile_library(source, options, tmp_path / "one.so", "evaluate")
     assert RowFunction(library, 3, [3]).rows(13, inputs, outputs) == 0
     torch.testing.assert_close(outputs[0], robot.forward_dynamics(*inputs))
-
-
-def test_batches_broadcast_as_those_of_the_robot(robot, compiled):
-    q, v, tau = random(3), random(4, 1, 3), random(2, 3)
-    ours, theirs = compiled.forward_dynamics(q, v, tau), robot.forward_dynamics(q, v, tau)
-    assert ours.shape == (4, 2, 3)
-    torch.testing.assert_close(ours, theirs)
-    assert compiled.mass_matrix(q).shape == (3, 3)
 
 
 def test_large_batches_by_several_threads(robot, compiled):
@@ -141,15 +124,6 @@ def test_default_folder(robot, monkeypatch, tmp_path):
     assert robot.compile().folder == tmp_path / "forcegp" / "compiled"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert robot.compile().folder == Path.home() / ".cache" / "forcegp" / "compiled"
-
-
-def test_the_page_on_compiled_dynamics_runs(repository, tmp_path, monkeypatch, capsys):
-    page = (repository / "docs" / "explanation" / "compiled-dynamics.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    exec(example, {})
-    assert capsys.readouterr().out.splitlines() == re.findall(r"# (tensor.*|torch\.Size.*)\n", example)
-    assert any((tmp_path / "forcegp" / "compiled").iterdir())
 
 
 # ---------------------------------------------------------------------- what cannot be

@@ -9,7 +9,6 @@ from tests.robots.test_urdf_errors import SMALL
 
 from forcegp import errors
 from forcegp.robots import Robot
-from forcegp.robots.inertia import standard_of_pseudo_inertia
 
 # below its master, above it, on another branch, and a mimic of a mimic; of another kind; with damping
 TREE_MIMICS = {
@@ -114,17 +113,6 @@ def test_frames_move_with_the_coordinates(case):
     close(at.frame_pose(frame), pin.updateFramePlacement(oracle.model, oracle.data, index).homogeneous)
     bias = pin.getFrameClassicalAcceleration(oracle.model, oracle.data, index, world).vector
     close(at.frame_bias_acceleration(frame), bias)
-
-
-def test_the_regressor_times_the_parameters_is_inverse_dynamics():
-    robot = Robot.from_urdf_text(with_mimics(TREE, TREE_MIMICS))
-    q, v, a = torch.tensor(np.random.default_rng(6).normal(size=(3, COUNT, robot.nv)))
-    at = robot.kinematics(q, v)
-    frames = torch.linalg.inv(torch.as_tensor(robot.layout.child_frames))
-    parameters = standard_of_pseudo_inertia(frames @ robot.tree.inertias[..., 0] @ frames.mT)
-    Y = at.torque_regressor(a)
-    assert Y.shape == (COUNT, robot.nv, len(robot.layout.bodies), 10)
-    close(torch.einsum("nibp,bp->ni", Y, parameters), at.inverse_dynamics(a))
 
 
 def test_a_gear_reflects_inertia_damping_and_friction():

@@ -1,13 +1,11 @@
-"""Floating, planar and spherical joints against Pinocchio, and the manifold of their positions."""
-
-from contextlib import nullcontext
+"""Floating joints against Pinocchio, and the manifold of their positions."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
 
-from forcegp.errors import InvalidInput, RobotFileWarning
+from forcegp.errors import InvalidInput
 from forcegp.robots import Robot
 
 LIMBS = """<robot name="crab">
@@ -68,8 +66,6 @@ CARRIER = """<robot name="carrier">
 </robot>"""
 ROOTS = {
     "floating": pin.JointModelFreeFlyer,
-    "planar": pin.JointModelPlanar,
-    "spherical": pin.JointModelSpherical,
     "fixed": None,
 }
 ROWS = 4
@@ -89,12 +85,10 @@ class Pair:
         self.v, self.a, self.tau = (
             torch.randn(ROWS, self.robot.nv, dtype=torch.float64, generator=generator) for _ in range(3)
         )
-        positions = {"planar": ["x", "y", "cos", "sin"], "spherical": ["qx", "qy", "qz", "qw"]}
-        velocities = {"planar": ["x", "y", "rz"], "spherical": ["rx", "ry", "rz"]}
         free = ["x", "y", "z", "qx", "qy", "qz", "qw"], ["x", "y", "z", "rx", "ry", "rz"]
         # places in Pinocchio's q and v of our entries
-        self.to_q = self._places(self.robot.position_names, positions.get(base, free[0]), "idx_q")
-        self.to_v = self._places(self.robot.joint_names, velocities.get(base, free[1]), "idx_v")
+        self.to_q = self._places(self.robot.position_names, free[0], "idx_q")
+        self.to_v = self._places(self.robot.joint_names, free[1], "idx_v")
 
     def _places(self, names, parts, first):
         split = [name.partition(".") for name in names]
@@ -133,7 +127,7 @@ def close(found, expected, scale=1.0):
 
 @pytest.mark.parametrize("how", ["by torch", "compiled"])
 def test_mass_matrix_bias_and_both_dynamics(pair, compiled, how):
-    of = pair.robot if how == "by torch" or pair.robot.base in ("fixed", "planar") else compiled
+    of = pair.robot if how == "by torch" or pair.robot.base == "fixed" else compiled
     M, bias = of.mass_matrix_and_bias(pair.q, pair.v)
     tau = of.inverse_dynamics(pair.q, pair.v, pair.a)
     a = of.forward_dynamics(pair.q, pair.v, pair.tau)
@@ -203,26 +197,3 @@ def test_turns_of_other_length_are_refused():
     with pytest.raises(InvalidInput, match=r"base\.qx, base\.qy.*length 0\.7.*normalized"):
         robot.mass_matrix(q)
     robot.mass_matrix(robot.normalized(q))
-
-
-@pytest.mark.parametrize("axis", ["0 0 1", "1 0 0", "0.6 0 -0.8", None])
-def test_a_planar_joint_of_a_file_moves_in_the_plane_across_its_axis(axis):
-    element = "" if axis is None else f'<axis xyz="{axis}"/>'
-    text = LIMBS.replace(
-        "</robot>",
-        f'<link name="ground"/><joint name="glide" type="planar"><parent link="ground"/><child link="trunk"/>{element}'
-        "</joint></robot>",
-    )
-    with nullcontext() if axis else pytest.warns(RobotFileWarning, match="moves along x and y"):
-        robot = Robot.from_urdf_text(text)
-    normal = np.array([float(x) for x in (axis or "0 0 1").split()])
-    jacobian = robot.frame_jacobian(robot.neutral(), "trunk")[:, :3]
-    close(jacobian[:3, :2] @ jacobian[:3, :2].mT, np.eye(3) - np.outer(normal, normal))
-    close(jacobian[3:, 2], normal)
-    if axis in (None, "0 0 1"):  # Pinocchio takes no other axis
-        model = pin.buildModelFromXML(text)
-        x, q = robot.neutral(), pin.neutral(model)
-        x[:4] = torch.tensor([0.3, -0.2, 0.6, 0.8])
-        q[:4] = x[:4].numpy()
-        M = pin.crba(model, model.createData(), q)
-        close(robot.mass_matrix(x)[:3, :3], np.triu(M[:3, :3]) + np.triu(M[:3, :3], 1).T)

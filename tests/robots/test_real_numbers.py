@@ -11,7 +11,6 @@ from tests.posterior.arm import arm_data
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import JointForces
-from forcegp.model import Model
 
 TEXT = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow="revolute")
 
@@ -72,30 +71,6 @@ def test_a_prediction_that_is_not_finite_is_an_error(posterior, state):
         posterior.predict(np.stack([q, q]), np.stack([v, 1e308 * np.ones(3)]), np.stack([u, u]))
     with pytest.raises(ForceGPError):
         posterior.predict(q + 1e308, v, u)
-
-
-@pytest.mark.parametrize(
-    ("argument", "given"),
-    [
-        ("points", "10"),
-        ("points", 10.0),
-        ("points", 13),
-        ("points", True),
-        ("restarts", 1.5),
-        ("restarts", np.nan),
-        ("restarts", np.inf),
-        ("restarts", 0),
-        ("restarts", 10**9),
-        ("seed", None),
-        ("seed", np.nan),
-        ("seed", -1),
-        ("seed", 10**30),
-    ],
-)
-@pytest.mark.parametrize("kind", [lambda model: model.with_forces(JointForces()), Model.black_box])
-def test_numbers_of_a_fit_are_integers_in_their_range(data, kind, argument, given):
-    with pytest.raises(InvalidInput, match=rf"`{argument}=.*` must be an integer"):
-        fit(kind(data.model), data, **{argument: given})
 
 
 def test_inside_vmap_the_remedy_is_stated(posterior, data):

@@ -3,21 +3,18 @@
 import re
 import warnings
 
-import pinocchio as pin
 import pytest
 import torch
 from tests.robots.test_base import LOOSE
 from tests.robots.test_urdf_errors import SMALL, changed
 
 from forcegp.errors import (
-    MissingInertia,
     NonPhysicalInertia,
     RobotFileWarning,
     RobotModelError,
 )
 from forcegp.robots import Robot
-from forcegp.robots.problems import LISTED, Problems
-from forcegp.robots.urdf import without_comments
+from forcegp.robots.arguments import LISTED, Problems
 
 FLAT = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="3"/>'
 FRAME = '<link name="frame"/><joint name="slip" type="prismatic"><parent link="FL_foot"/><child link="frame"/></joint>'
@@ -29,11 +26,11 @@ def test_all_problems_are_in_one_report_with_one_remedy():
     with pytest.raises(RobotModelError) as caught:
         Robot.from_urdf_text(MANY, source="dog.urdf")
     message, error = str(caught.value), caught.value
-    assert message.startswith("dog.urdf: 5 problems: ")
-    assert all(part in message for part in ("'trunk'", "'FL_foot'", "'FR_foot'", "'slip'", "not bolted"))
+    assert message.startswith("dog.urdf: 4 problems: ")
+    assert all(part in message for part in ("'FL_foot'", "'FR_foot'", "'slip'", "not bolted"))
     assert message.count("Correct its <inertial>") == 1  # what to do is said once
     assert message.count("dog.urdf") == 1
-    assert len(error.problems) == 5  # of the trunk, too, since it moves
+    assert len(error.problems) == 4
     assert error.remedy == {"inertias": "nearest", "locked": {"slip": 0.0}, "base": "floating"}
     assert "Robot.from_urdf(path, inertias='nearest', locked={'slip': 0.0}, base='floating')" in message
     assert message.endswith("or --inertias nearest --lock slip=0 --base floating.")
@@ -54,7 +51,7 @@ def test_the_remedy_keeps_what_was_given():
 
 
 def test_what_must_be_corrected_in_the_file_leaves_no_remedy():
-    with pytest.raises(RobotModelError, match=r"5 problems: .*two.*The remedy for the others, when the file") as caught:
+    with pytest.raises(RobotModelError, match=r"4 problems: .*two.*The remedy for the others, when the file") as caught:
         Robot.from_urdf_text(MANY.replace('mass value="1.0"', 'mass value="two"', 1))
     assert caught.value.remedy == {}
     assert "inertias='nearest'" in str(caught.value)
@@ -94,19 +91,6 @@ def test_what_can_be_ignored_is_a_warning(what):
     robot.with_armature([0.1])  # nothing is said twice
 
 
-def test_an_undefined_parent_is_offered_as_the_root():
-    text = changed('<link name="base"/>', "")
-    with pytest.raises(RobotModelError, match="the link 'base' is a parent, and the file does not define it") as caught:
-        Robot.from_urdf_text(text)
-    assert caught.value.remedy == {"root": "base"}
-    robot = Robot.from_urdf_text(text, **caught.value.remedy)
-    q = torch.ones(1).double()
-    assert torch.equal(robot.mass_matrix(q), Robot.from_urdf_text(SMALL).mass_matrix(q))
-    assert Robot.from_urdf_text(robot.to_urdf()).link_names == robot.link_names  # the text says so now
-    with pytest.raises(RobotModelError, match="two links are called 'base'"):
-        Robot.from_urdf_text(SMALL, root="base")
-
-
 def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
     text = re.sub("<inertia .*/>", "", SMALL)
     with pytest.raises(NonPhysicalInertia, match="add it, or take the mass as a point") as caught:
@@ -115,50 +99,6 @@ def test_a_mass_without_inertia_is_a_point_where_that_is_asked_for():
         robot = Robot.from_urdf_text(text, **caught.value.remedy)
     assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(2 * 0.1**2, rel=1e-12)
     assert robot.tree.equals(Robot.from_urdf_text(robot.to_urdf()).tree)
-
-
-def test_the_only_joint_is_not_offered_to_be_locked():
-    link = '<link name="b"/><joint name="free" type="floating"><parent link="a"/><child link="b"/></joint>'
-    with pytest.raises(MissingInertia) as caught:
-        Robot.from_urdf_text(f'<robot name="r"><link name="a"/>{link}</robot>')
-    assert caught.value.remedy == {}
-    with pytest.raises(NonPhysicalInertia, match="has no rotational inertia about some axis") as caught:
-        Robot.from_urdf_text(
-            '<robot name="r"><link name="ball"><inertial><mass value="1"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" '
-            'iyz="0" izz="0"/></inertial></link></robot>',
-            base="floating",
-        )
-    assert caught.value.remedy == {}  # bolted, nothing would move
-
-
-NOT_XML = {
-    "dashes in a comment": changed("<link", "<!-- a -- b ---><link"),
-    "no space": changed('"hinge" type', '"hinge"type'),
-}
-
-
-@pytest.mark.parametrize("what", NOT_XML)
-def test_what_other_readers_take_though_it_is_no_xml(what):
-    text = NOT_XML[what].replace('izz="0.1"', 'izz="0.9"')
-    with pytest.raises(NonPhysicalInertia) as caught:
-        Robot.from_urdf_text(text)
-    with warnings.catch_warnings(action="ignore"):
-        robot = Robot.from_urdf_text(text, **caught.value.remedy)
-    assert robot.joint_names == ("hinge",)
-    assert Robot.from_urdf_text(robot.to_urdf()).tree.equals(robot.tree)
-    assert pin.buildModelFromXML(text).nv == 1
-
-
-def test_comments_are_cut_in_linear_time_and_keep_their_lines():
-    assert without_comments("a<!-- 1\n2 -->b<!--") == "a\nb<!--"
-    assert without_comments("<!--->-->") == ""
-    assert len(without_comments("<!--" * 200_000)) == 800_000  # each start was searched to the end of the text before
-
-
-def test_comments_need_not_have_the_encoding_of_the_file(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_bytes(changed("<link", "<!-- \N{DEGREE SIGN} --><link").encode("latin-1"))
-    assert Robot.from_urdf(path).joint_names == ("hinge",)
 
 
 def test_a_joint_without_direction_is_offered_to_be_locked():

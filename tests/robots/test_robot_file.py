@@ -1,8 +1,6 @@
 """What lies beside a URDF, and what is expanded to one."""
 
 import sys
-import types
-from xml.dom import minidom
 
 import pytest
 from tests.robots.robot_models import CHAIN
@@ -67,15 +65,3 @@ def test_xacro_files_are_expanded(tmp_path, name):
     (tmp_path / name).write_text(MACRO.replace("1 + 1", "1 / 0"))
     with pytest.raises(MalformedUrdf, match="xacro could not expand it"):
         Robot.from_urdf(tmp_path / name)
-
-
-def test_what_xacro_makes_is_read_as_any_file(tmp_path, monkeypatch):
-    """Without the package: it is called with the path, and its text is checked."""
-    fake = types.ModuleType("xacro")
-    fake.process_file = lambda path: minidom.parseString(SMALL if path.endswith("arm.xacro") else "<sdf/>")
-    monkeypatch.setitem(sys.modules, "xacro", fake)
-    for name in ("arm.xacro", "other.xacro"):
-        (tmp_path / name).write_text("<robot/>")
-    assert Robot.from_urdf(tmp_path / "arm.xacro").nv == 1
-    with pytest.raises(MalformedUrdf, match=r"other\.xacro: the root element is <sdf>"):
-        Robot.from_urdf(tmp_path / "other.xacro")

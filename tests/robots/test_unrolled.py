@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import MODELS, TREE
 
 from forcegp.codegen.graph import Graph, evaluated, node_of
 from forcegp.robots import Robot
-from forcegp.robots.unrolled import UnrolledKinematics, UnrolledRobot, factorize, solve_factorized
+from forcegp.robots.compiled import UnrolledKinematics, UnrolledRobot, factorize, solve_factorized
 
 COUNT = 6
 
@@ -42,21 +41,6 @@ def case(request):
     robot = Robot.from_urdf_text(text, **options)
     states = torch.tensor(np.random.default_rng(7).normal(scale=1.5, size=(3, COUNT, robot.nv)))
     return robot, text, *states
-
-
-def test_dynamics_equal_those_of_the_robot_and_of_pinocchio(case):
-    robot, text, q, v, a = case
-    scalars = Scalars(q, v, a)
-    at = UnrolledKinematics(UnrolledRobot(robot), *scalars.given[:2])
-    M, bias = scalars.numbers(at.mass_matrix()), scalars.numbers(at.bias_forces())
-    tau = scalars.numbers(at.inverse_dynamics(np.array(scalars.given[2], dtype=object)))
-    close(M, robot.mass_matrix(q))
-    close(bias, robot.bias_forces(q, v))
-    close(scalars.numbers(at.gravity_forces()), robot.gravity_forces(q))
-    close(tau, robot.inverse_dynamics(q, v, a))
-    oracle, every = Oracle(text, robot), list(zip(q.numpy(), v.numpy(), a.numpy(), strict=True))
-    close(M, np.stack([oracle.mass_matrix(x) for x, _, _ in every]))
-    close(tau, np.stack([oracle.inverse_dynamics(*x) for x in every]))
 
 
 def test_structure_stays_structure():

@@ -17,7 +17,7 @@ from forcegp.data.views import consecutive, whole_windows
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import ContactError
 from forcegp.model import Model
-from forcegp.robots.manifold import Group, difference, pose
+from forcegp.robots.manifold import TURN, Group, difference, pose
 
 CLEARLY = 0.3
 """Another reading is right where its error is below this share of the error as recorded, and
@@ -81,14 +81,14 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         return
     for group in model.robot.layout.groups:
         own = np.arange(dataset.nv)[group.rows]
-        windows = _Windows.of(dataset, own[[k for k, free in enumerate(group.motion.free) if free > 2]])
+        windows = _Windows.of(dataset, own[3:])
         q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
         at, v, a = q[:, group.places], v[:, group.rows], a[:, group.rows]
         yield from _of_velocity(windows, group, at, v, *_stated(dataset))
         each = v.unflatten(0, windows.rows.shape)
         change = (each[:, -1] - each[:, 0]) / windows.step
         error, size = _rms(change - windows.mean(a)), _rms(change)
-        measured = in_base(group, at, a, ("imu", "body"), v, model.robot.gravity)
+        measured = in_base(at, a, ("imu", "body"), v, model.robot.gravity)
         specific = _rms(change - windows.mean(measured))
         if error <= 2.0 * size:  # noise of the velocities alone makes both large
             continue
@@ -115,7 +115,7 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     """A base that no foot, thruster or known force of the model carries, although it does not fall."""
     robot, groups = model.robot, model.robot.layout.groups
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
-    if not groups or groups[0].kind != "floating" or not weight:
+    if not groups or not weight:
         return
     complete, feet = dataset.u.shape[1] == len(model.inputs), {contact.switch for contact in model.touching}
     if None in feet or (feet and not complete):
@@ -160,7 +160,7 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         still, slower, at = u.clone(), u.clone(), q[:, group.places].cpu()
         still[:, thrusters], slower[:, thrusters] = 0.0, RPM * u[:, thrusters]
         needed, upright = missing(still), torch.eye(3, dtype=at.dtype)
-        turned = pose(group.kind, _reordered(group, at))[0].mT @ pose(group.kind, at)[0]
+        turned = pose(_reordered(at))[0].mT @ pose(at)[0]
         order, unit = {"orientation": {"q": ("wxyz",)}}, {"unit": {"u": ("rpm",)}}
         kind, remedy = look, "Check the unit of u, the mass, coefficients of thrust and the axes of a."
         for what, rotation, speeds, stated in (
@@ -191,24 +191,22 @@ def _stated(dataset: Dataset) -> tuple[tuple[str, str], str]:
 def _of_velocity(
     windows: _Windows, group: Group, q: Tensor, v: Tensor, stated: tuple[str, str], order: str
 ) -> Iterator[Doubt]:
-    whole = list(range(v.shape[1]))
-    angular = [free > 2 for free in group.motion.free]
-    parts = {"linear ": [k for k in whole if not angular[k]], "angular ": [k for k in whole if angular[k]]}
+    parts, angular = {"linear ": [0, 1, 2], "angular ": [3, 4, 5]}, [False] * 3 + [True] * 3
 
     def mistaken(recorded: float, other: float, speed: float) -> bool:
         return recorded > CLEARLY * speed and other < CLEARLY * min(recorded, speed)
 
-    turned = _in_world(group, q, v)
+    turned = _in_world(q, v)
     raw = torch.where(torch.tensor([stated[part] == "world" for part in angular]), turned, v)
 
     def best_axes(at: Tensor) -> tuple[dict[str, str], float, float]:
         """Parts of v that fit in other axes than stated, the error that is left with them, and that as stated."""
         first, last = (at.unflatten(0, windows.rows.shape)[:, k] for k in (0, -1))
-        moved = _in_world(group, first, difference(group.kind, first, last))
+        moved = _in_world(first, difference(first, last))
         linear = parts["linear "]  # a difference of poses has those of a screw
-        moved[:, linear] = (pose(group.kind, last)[1] - pose(group.kind, first)[1])[:, : len(linear)]
+        moved[:, linear] = pose(last)[1] - pose(first)[1]
         moved = moved / windows.step
-        read = {"world": windows.mean(raw), "body": windows.mean(_in_world(group, at, raw))}
+        read = {"world": windows.mean(raw), "body": windows.mean(_in_world(at, raw))}
         found, best, own = dict[str, str](), moved.clone(), moved.clone()
         for (name, part), axes in zip(parts.items(), stated, strict=True):
             other = "body" if axes == "world" else "world"
@@ -219,13 +217,12 @@ def _of_velocity(
 
     found, other, recorded = best_axes(q)
     speed, meant, correction = _rms(windows.mean(raw)), list[str](), dict[str, dict[str, tuple[str, ...]]]()
-    if group.kind != "planar":
-        axes, reordered, _ = best_axes(_reordered(group, q, order))
-        # of a robot that hardly turns, rates are a small part of the speed, and other axes may hide a wrong order
-        hidden = recorded > LEAST * speed and reordered < CLEARLY * other
-        if hidden or (mistaken(recorded, reordered, speed) and reordered < other):
-            found, other, actual = axes, reordered, "xyzw" if order == "wxyz" else "wxyz"
-            meant, correction["orientation"] = [f"a quaternion {', '.join(actual)}"], {"q": (actual,)}
+    axes, reordered, _ = best_axes(_reordered(q, order))
+    # of a robot that hardly turns, rates are a small part of the speed, and other axes may hide a wrong order
+    hidden = recorded > LEAST * speed and reordered < CLEARLY * other
+    if hidden or (mistaken(recorded, reordered, speed) and reordered < other):
+        found, other, actual = axes, reordered, "xyzw" if order == "wxyz" else "wxyz"
+        meant, correction["orientation"] = [f"a quaternion {', '.join(actual)}"], {"q": (actual,)}
     if found:
         alike = len(found) == 2 and len(set(found.values())) == 1
         named = {"": next(iter(found.values()))} if alike else found
@@ -254,17 +251,15 @@ def _of_velocity(
         yield ok(about="base", what=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
 
 
-def _in_world(group: Group, q: Tensor, v: Tensor) -> Tensor:
+def _in_world(q: Tensor, v: Tensor) -> Tensor:
     """Velocities in the axes of the base, at its positions, in those of the world."""
-    free = torch.tensor(group.motion.free)
-    six = v.new_zeros(len(v), 6).index_copy(1, free, v).unflatten(-1, (2, 3))
-    return (pose(group.kind, q)[0][:, None] @ six[..., None]).flatten(1)[:, free]
+    return (pose(q)[0][:, None] @ v.unflatten(-1, (2, 3))[..., None]).flatten(1)
 
 
-def _reordered(group: Group, q: Tensor, order: str = "xyzw") -> Tensor:
+def _reordered(q: Tensor, order: str = "xyzw") -> Tensor:
     """Positions of a log whose quaternions begin with w; or end with it, where they were read in the order wxyz."""
     turned = q.clone()
-    turned[:, group.motion.turn] = q[:, group.motion.turn].roll(1 if order == "wxyz" else -1, -1)
+    turned[:, TURN] = q[:, TURN].roll(1 if order == "wxyz" else -1, -1)
     return turned
 
 

@@ -87,7 +87,7 @@ class Fit(Command):
     """A second log, of the same robot without the payloads that are estimated."""
     contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME.
-    SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius or cylinder:px,py,pz,ax,ay,az,radius.
+    SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius.
     none is no contact at all."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned

@@ -13,7 +13,7 @@ import forcegp
 import forcegp.data
 import forcegp.recordings
 from forcegp.cli.command import MAPPING, NUMBERS, listed, numbers_of, unless_given
-from forcegp.cli.robot_options import FEET, WHEELS, RobotOptions, parse_feet, parse_wheels
+from forcegp.cli.robot_options import FEET, RobotOptions, parse_feet
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 
@@ -86,9 +86,7 @@ class ColumnOptions:
     feet: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(FEET, "none")] = ()
     """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
     actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
-    FRAME:flat is a foot that does not turn while it stands, FRAME:ball=RADIUS (m) a ball that rolls on level ground."""
-    wheels: Annotated[tuple[str, ...], listed(), unless_given(WHEELS, "none")] = ()
-    """Wheels that roll about the y axes of these frames without slipping, on level ground; radius in m."""
+    FRAME:flat is a foot that does not turn while it stands."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
         None
     )
@@ -154,16 +152,15 @@ class ColumnOptions:
         return forcegp.recordings.ImportOptions(stance="auto", **given)
 
     def model(self, robot: RobotOptions) -> forcegp.Model | None:
-        """The robot, with the known forces and contacts of --identified, or with feet and wheels."""
-        touching = [*parse_feet(self.feet), *parse_wheels(self.wheels)]
+        """The robot, with the known forces and contacts of --identified, or with feet."""
+        touching = parse_feet(self.feet)
         model = robot.chosen()
         if not touching:
             return model
-        option = "--feet" if self.feet else "--wheels"
         if robot.identified is not None:
-            raise InvalidInput(f"--identified brings its contacts along; leave {option} out.")
+            raise InvalidInput("--identified brings its contacts along; leave --feet out.")
         if model is None:
-            raise InvalidInput(f"{option} needs --robot ROBOT.urdf.")
+            raise InvalidInput("--feet needs --robot ROBOT.urdf.")
         return model.with_contacts((*touching, *model.loops))
 
     def mapped(

@@ -20,7 +20,7 @@ from forcegp.errors import FileFormatError, InvalidInput
 SYSTEM_FILE = "system.json"
 """Where a folder that `forcegp fit` wrote holds robot and known forces."""
 
-BASES = unless_given("fixed|floating|planar|spherical", "fixed; asked where a file looks otherwise")
+BASES = unless_given("fixed|floating", "fixed; asked where a file looks otherwise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +30,8 @@ class RobotFileOptions:
     inertias: Literal["strict", "nearest"] = "strict"
     """What to do about a physically impossible inertia. strict: refuse the URDF. nearest: use the nearest possible
     one, and warn how far it is."""
-    base: Annotated[Literal["fixed", "floating", "planar", "spherical"] | None, BASES] = None
-    """How the base is held. fixed: bolted to the world, also where the robot has legs, wheels or rotors.
-    floating: free. planar: free in the plane z = 0. spherical: free to turn."""
-    root: Annotated[str | None, unless_given("LINK", "that of the file", str)] = None
-    """A link that the URDF does not define, such as world, which the base hangs on."""
+    base: Annotated[Literal["fixed", "floating"] | None, BASES] = None
+    """How the base is held. fixed: bolted to the world, also where the robot has legs or rotors. floating: free."""
     lock: Annotated[tuple[str, ...], listed(), unless_given("JOINT=RAD,...", "as recorded")] = ()
     """Hold joints of the URDF at these positions (rad or m), for instance a finger that was not recorded."""
     armature: Annotated[tuple[str, ...], listed(), unless_given("JOINT=VALUE,...", "as recorded, or 0")] = ()
@@ -44,7 +41,7 @@ class RobotFileOptions:
 
     def changes(self) -> dict[str, Any]:
         """Arguments of `Robot.from_file` by name."""
-        changes: dict[str, Any] = {name: value for name in ("base", "root") if (value := getattr(self, name))}
+        changes: dict[str, Any] = {"base": self.base} if self.base else {}
         if self.gravity:
             if len(self.gravity) != 3:
                 raise InvalidInput(f"--gravity holds {len(self.gravity)} numbers; write --gravity 0,0,-9.81.")
@@ -224,13 +221,12 @@ class SearchOptions:
 
 # ---------------------------------------------------------------------- what the robot touches
 
-SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius", "cylinder": "px,py,pz,ax,ay,az,radius"}
-"""Numbers of each surface in m: plane n . p = offset; a cylinder by a point on its axis, the axis and its radius."""
+SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}
+"""Numbers of each surface in m: plane n . p = offset."""
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
-FEET, WHEELS = "FRAME@x,y,z,...", "FRAME=RADIUS,..."
-FLAT, BALL = ":flat", ":ball="
-"""Behind the frame of a foot that does not turn while it stands; of a ball that rolls, with its radius in m."""
+FEET, FLAT = "FRAME@x,y,z,...", ":flat"
+"""FLAT stands behind the frame of a foot that does not turn while it stands."""
 STANDS = "{}_stands"
 """The input that switches the contact of a foot."""
 
@@ -260,49 +256,30 @@ def parse_contact(text: str) -> forcegp.Contact:
         values.append(numbers_of(given, needs))
         if len(values[-1]) != count:
             raise InvalidInput(needs)
-    (*given, size), (x, y, z) = values
-    vectors = (tuple(given[start : start + 3]) for start in range(0, len(given), 3))
-    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere, "cylinder": forcegp.Cylinder}[kind]
-    return forcegp.Contact(frame, (x, y, z), surface(*vectors, size))
+    (*vector, size), (x, y, z) = values
+    surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere}[kind]
+    return forcegp.Contact(frame, (x, y, z), surface(tuple(vector), size))
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """Points `FRAME@x,y,z`, rolling balls `FRAME@x,y,z:ball=RADIUS` or flat feet `FRAME:flat`, each with a switch.
+    """Points `FRAME@x,y,z` or flat feet `FRAME:flat`, each with a switch.
 
     Raises InvalidInput.
     """
     feet: dict[str, tuple[forcegp.Contact, ...]] = {}
     for text in texts:
         flat = text.endswith(FLAT)
-        named, ball, radius = text.removesuffix(FLAT).partition(BALL)
+        named = text.removesuffix(FLAT)
         frame, _, point = named.rpartition("@") if "@" in named else (named, "", "0,0,0")
-        complaint = (
-            f"--feet {text!r} is not FRAME, FRAME@x,y,z (m), FRAME{BALL}RADIUS (m) or FRAME{FLAT}; for example "
-            "FL_foot@0,0,-0.02"
-        )
+        complaint = f"--feet {text!r} is not FRAME, FRAME@x,y,z (m) or FRAME{FLAT}; for example FL_foot@0,0,-0.02"
         place = numbers_of(point, complaint)
-        if not frame or len(place) != 3 or (flat and (ball or "@" in named)):
+        if not frame or len(place) != 3 or (flat and "@" in named):
             raise InvalidInput(complaint)
         if frame in feet:
             raise InvalidInput(f"--feet names {frame} twice; a frame has one foot.")
         switch, (x, y, z) = STANDS.format(frame), place
         if flat:
             feet[frame] = forcegp.mechanics.fixed_frame(frame, switch)
-        elif ball:
-            size = numbers_of(radius, complaint, one=True)[0]
-            feet[frame] = forcegp.mechanics.rolling(frame, size, None, (x, y, z), switch=switch)
         else:
             feet[frame] = forcegp.mechanics.fixed_point(frame, (x, y, z), switch)
     return tuple(contact for points in feet.values() for contact in points)
-
-
-def parse_wheels(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """Wheels `FRAME=RADIUS` that turn about the y axis of their frame on level ground. Raises InvalidInput."""
-    wheels: list[forcegp.Contact] = []
-    for text in texts:
-        frame, _, radius = text.rpartition("=")
-        complaint = f"--wheels {text!r} is not FRAME=RADIUS (m); for example left_wheel=0.1"
-        if not frame:
-            raise InvalidInput(complaint)
-        wheels += forcegp.mechanics.rolling(frame, numbers_of(radius, complaint, one=True)[0])
-    return tuple(wheels)

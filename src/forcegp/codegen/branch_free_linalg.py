@@ -55,10 +55,8 @@ def solve_lower(lower: Tensor, right: Tensor) -> Tensor:
 def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
     """The pseudo-inverse (..., n, m) of a matrix (..., m, n) with m <= n, singular values below tolerance dropped.
 
-    One-sided Jacobi rotations (Demmel & Veselic, SIAM J. Matrix Anal. Appl. 13, 1992): columns of A^T V become
-    orthogonal, their lengths are the singular values, to high relative accuracy. What is left of their products is
-    zero but for its derivatives, and counted to first order. Of more than six rows an orthonormal basis Q is a fifth of
-    the work: A = L Q with L = A Q^T, L^T = R U, A^+ = Q^T R^-T U.
+    One-sided Jacobi rotations (Demmel & Veselic, SIAM J. Matrix Anal. Appl. 13, 1992). Of more than six rows an
+    orthonormal basis Q is a fifth of the work: A = L Q with L = A Q^T, L^T = R U, A^+ = Q^T R^-T U.
     """
     count = matrix.shape[-2]
     if count not in SWEEPS:
@@ -92,9 +90,8 @@ def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
 def _basis(matrix: Tensor, tolerance: float) -> Tensor:
     """Orthonormal rows (..., m, n) that span those of the matrix; zeros in the place of what is within the tolerance.
 
-    The longest remainder comes first (pivoting: Golub & Van Loan, "Matrix Computations", 5.4). In the order of the
-    rows, one that nearly depends on those before gives a direction that is mostly rounding, and redundant rows after it
-    seem to be independent: of nine rows of a flat foot, some do wherever it stands nearly along the axes of the world.
+    The longest remainder comes first (Golub & Van Loan, 5.4): else redundant rows of a flat foot seem to be
+    independent.
     """
     rest, basis, largest = matrix, matrix[..., :0, :], None
     for k in range(matrix.shape[-2]):
@@ -116,10 +113,7 @@ def _basis(matrix: Tensor, tolerance: float) -> Tensor:
 
 
 def _lower_and_orthonormal(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """L (..., m, m) and Q (..., m, n) with L Q the matrix, its rows made orthogonal to those before, twice each.
-
-    Rows are independent, or zero, of which those of Q are zero.
-    """
+    """L (..., m, m) and Q (..., m, n), L Q the matrix of independent or zero rows, made orthogonal twice."""
     count, lower, basis = matrix.shape[-2], [], matrix[..., :0, :]
     for k, row in enumerate(matrix.unbind(-2)):
         along = torch.zeros_like(matrix[..., :k, 0])

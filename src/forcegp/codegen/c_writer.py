@@ -1,12 +1,7 @@
 """Graphs as C: the same text for one state (`real` is a double, C99) and for several in the lanes of vector registers.
 
-GCC and Clang understand vector types on every processor (`__attribute__((vector_size))`). A long program is cut into
-parts, functions of their own: in one function, twice as much takes a compiler far more than twice as long. Values that
-later parts use wait in an array, whose places are used again.
-
-Functions of lanes are within three units of the last place. exp, sine, cosine: Cody & Waite, "Software Manual for the
-Elementary Functions" (1980); log: the series of atanh (Muller, "Elementary Functions", 2016, ch. 5). tanh and asinh
-from expm1 and log1p, so that nothing cancels near 0. What is rare takes libm, lane by lane.
+A long program is cut into functions, which compilers need; what later ones use waits in an array. Functions of lanes
+(Cody & Waite 1980; Muller, "Elementary Functions", 2016, ch. 5) are within three units of the last place.
 """
 
 import math
@@ -53,13 +48,6 @@ _COS = _horner([(-1.0) ** n / factorial(2 * n) for n in range(8, -1, -1)], "z")
 _ATANH = _horner([2.0 / (2 * n + 1) for n in range(11, 0, -1)], "z")
 
 
-def lane_functions(lanes: int) -> str:
-    """The type `real` of that many doubles, and functions on it."""
-    words = {"LANES": lanes, "EXPM1": _EXPM1, "SIN": _SIN, "COS": _COS, "ATANH": _ATANH}
-    by_lane = (f"INLINE real r_{name}(real x) {{ return by_lane({name}, x); }}\n" for name in LANE_BY_LANE)
-    return filled(c_text(__name__, "lanes.h"), words) + "".join(by_lane)
-
-
 STATEMENTS = 500  # per part
 LONG_PART = 2500  # of dynamics, whose values are used again soon: 10-20 % faster, compiled as fast
 
@@ -73,10 +61,7 @@ COMPARED = {"less": "<", "at_most": "<=", "equal": "=="}
 
 @dataclass(frozen=True)
 class Program:
-    """Named vectors of nodes that are computed from named vectors of inputs; all `positive` must be > 0.
-
-    `inputs` follow each other as those of the graph do.
-    """
+    """Named vectors of nodes from named vectors of inputs, in the order of the graph's; all `positive` must be > 0."""
 
     graph: Graph
     inputs: dict[str, int]
@@ -102,10 +87,9 @@ def write_function(
     tables: Sequence[str] = (),
     statements: int = STATEMENTS,
 ) -> str:
-    """`static void NAME(const double *const *t, long live, const real *x, real *y)`: y from x.
+    """`static void NAME(const double *const *t, long live, const real *x, real *y)`: y from x in `live` lanes.
 
-    `t` are the tables of the C functions that the graph calls, in the order of their names in `tables`; `live` is the
-    number of states in the lanes.
+    `t` are the tables of the C functions that the graph calls, in the order of their names in `tables`.
     """
     order = _order(graph, outputs)
     parts = [order[k : k + statements] for k in range(0, len(order), statements)] or [[]]
@@ -175,15 +159,16 @@ def head(lanes: int) -> str:
     """What stands before all functions: the type `real`, and functions on it."""
     if lanes == 1:
         return "#include <math.h>\n" + c_text(__name__, "scalar.h")
-    return lane_functions(lanes)
+    words = {"LANES": lanes, "EXPM1": _EXPM1, "SIN": _SIN, "COS": _COS, "ATANH": _ATANH}
+    by_lane = (f"INLINE real r_{name}(real x) {{ return by_lane({name}, x); }}\n" for name in LANE_BY_LANE)
+    return filled(c_text(__name__, "lanes.h"), words) + "".join(by_lane)
 
 
 def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str, int]] | None = None) -> str:
-    """`evaluate(first, last, t, a0, s0, ..., o0, r0, ...)`: all states, rows of arrays.
+    """`evaluate(first, last, t, a0, s0, ..., o0, r0, ...)`: all states; strides `s`, `r`, 0 for one row.
 
-    A stride `s` or `r` is that from one state to the next; 0 serves all states with one row.
-    `finish` names outputs that a C function (t, y, out) makes of the vector y of that name, and their lengths. Returns
-    bits: 1 for inputs that are not finite, 2 for what should be positive, 4 for results that are not finite.
+    `finish` names outputs that a C function (t, y, out) makes, and their lengths. Returns bits: 1 for inputs that are
+    not finite, 2 for what should be positive, 4 for results that are not finite.
     """
     finish = finish or {}
     arguments = [f"const double *a{k}, long s{k}" for k in range(len(program.inputs))]

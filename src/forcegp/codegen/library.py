@@ -1,9 +1,4 @@
-"""Programs made at run time: C text compiled, kept in a folder, loaded by later processes, called with tensors.
-
-A file of the folder is named by a hash of everything that decides what is in it. Loading it runs its code with the
-rights of the process, so it must be out of reach of others (`own_file`). What is trusted, and why
-this is C of our own and not `torch.compile`: docs/explanation/compiled-dynamics.md.
-"""
+"""Programs made at run time: C text compiled, kept in a folder that only the user may write to, loaded, called."""
 
 import ctypes
 import hashlib
@@ -63,10 +58,9 @@ def compiler() -> list[str]:
 
 
 def compile_library(source: str, options: Iterable[str], library: Path, function: str) -> ctypes.CDLL:
-    """Compile a C text to the shared library ``library``, and load it, which shows that it has ``function``.
+    """Compile a C text to the shared library ``library``, and load it.
 
-    Raises :class:`~forcegp.errors.CompilerError` where there is no compiler, where it fails or does not end, and where
-    nothing may be run from the folder.
+    CompilerError where ``function`` is not there.
     """
     command = compiler()
     whole = [*command, *options, "-x", "c", "-", "-o", str(library), "-lm"]
@@ -95,11 +89,7 @@ def compile_library(source: str, options: Iterable[str], library: Path, function
 
 
 def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
-    """Raise :class:`~forcegp.errors.InvalidInput` under transforms of torch.func and in forward-mode differentiation.
-
-    Machine code reads the numbers of a tensor. What these two carry along with the numbers would be lost without a
-    word; backward passes are recorded around the code instead.
-    """
+    """Raise InvalidInput under transforms of torch.func and in forward mode, which machine code would drop."""
     transformed = torch._C._are_functorch_transforms_active()
     dual = forward_ad._current_level >= 0 and any(forward_ad.unpack_dual(x).tangent is not None for x in tensors)
     if transformed or dual:
@@ -130,12 +120,10 @@ def load_library(
     options: Sequence[str] = (),
     folder: Path | None = None,
 ) -> ctypes.CDLL:
-    """The library with the function `evaluate` that `write` gives the C text of, for so many lanes.
+    """The library with the function `evaluate` of the C text that `write` gives for so many lanes, found or compiled.
 
-    From ``folder`` (`default_folder`) if a file of that name and key is there, else compiled into it. ``key`` must hold
-    everything that decides the text beside the code of this package; ``options`` are more of the compiler's.
-    Raises :class:`~forcegp.errors.CompilerError` where there is no C compiler, where it fails, where the folder cannot
-    be written to, and where others than the user can write to it or to a folder above it.
+    ``key`` must hold all that decides the text beside the code of this package; ``options`` are more of the compiler's.
+    Raises CompilerError where there is no compiler, it fails, or the folder is not the user's own.
     """
     lanes, of_unit = vector_unit()
     parts = (key, *options, repr((lanes, of_unit)), repr(OPTIONS), platform.machine(), sys.platform, code_digest())
@@ -191,10 +179,7 @@ def own_folder(folder: Path | None = None) -> Path:
 
 
 def own_file(path: Path, *, parent: bool = False) -> None:
-    """Nobody but the user and root may exchange the file or what is in the folder.
-
-    In a parent folder with the sticky bit, such as /tmp, everybody may make files, but exchange only their own.
-    """
+    """Nobody but the user and root may exchange it; in parents with the sticky bit, such as /tmp, only owners can."""
     if not hasattr(os, "getuid"):
         return
     status, danger = path.stat(), "and code from it would run with your rights"
@@ -213,10 +198,7 @@ NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
 
 
 class RowFunction:
-    """`evaluate` of a library: rows of numbers from rows of numbers; `tables` are flat arrays for it.
-
-    It takes so many `inputs`; `outputs` are the lengths of its results at one state.
-    """
+    """`evaluate` of a library, on flat `tables`: rows of numbers of length `outputs` from rows of so many `inputs`."""
 
     def __init__(
         self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Sequence[Tensor] = ()
@@ -245,13 +227,14 @@ class RowFunction:
         threads: int | None = None,
         least: int = STATES_PER_THREAD,
     ) -> int:
-        """Fill `outputs` for `count` states; what is to be reported.
+        """Fill contiguous `outputs` (count, size); what is to be reported. An input (1, size) serves all states.
 
-        Inputs and outputs are contiguous tensors (count, size); an input may be (1, size), for all states. Batches of
-        `least` states for each take as many threads as torch has, or `threads`.
+        Batches of `least` states for each take as many threads as torch has, or `threads`.
         """
         parts = max(1, min(torch.get_num_threads() if threads is None else threads, count // least))
-        given = [x for each in (*inputs, *outputs) for x in (each.data_ptr(), _stride(count, each))]
+        given = [
+            x for each in (*inputs, *outputs) for x in (each.data_ptr(), each.shape[1] if len(each) == count else 0)
+        ]
         bounds = [MOST_LANES * (count * k // parts // MOST_LANES) for k in range(parts)] + [count]
 
         def part(k: int) -> int:
@@ -261,11 +244,6 @@ class RowFunction:
             return part(0)
         others = [_pool(parts - 1, os.getpid()).submit(part, k) for k in range(1, parts)]
         return reduce(or_, (other.result() for other in others), part(0))
-
-
-def _stride(count: int, rows: Tensor) -> int:
-    """Numbers from one state to the next."""
-    return rows.shape[1] if rows.shape[0] == count else 0
 
 
 @cache

@@ -1,8 +1,6 @@
 """From a function written in torch to a graph: the tensor operations of one call, taken apart into scalars.
 
-The function runs once on an example, and every operation of it is noted; loops and branches of Python leave no trace.
-Operations that only move numbers (slices, stacks, ...) run on tensors of node numbers instead of values. So surfaces,
-known forces and priors of anybody are in the graph as they stand, without a second implementation.
+Loops and branches of Python leave no trace. Operations that only move numbers run on tensors of node numbers.
 """
 
 import math
@@ -51,8 +49,7 @@ def trace(
 ) -> tuple[Graph, list[Tensor]]:
     """The graph of function(*examples) -> tensors, and the nodes of its outputs in their shapes.
 
-    Inputs are flattened in order; with `graph` they are its `inputs`. Raises InvalidInput, naming the operation, where
-    the function does what a graph cannot hold.
+    Inputs are flattened in order; with `graph` they are its `inputs`. InvalidInput names what a graph cannot hold.
     """
     examples = [x.detach().clone() for x in examples]
     graph = Graph(sum(x.numel() for x in examples)) if graph is None else graph

@@ -24,17 +24,15 @@ class RobotVectorEnv(VectorEnv):
     """`num_envs` robots at once under the learned forces, by `predictor.rollouts`; the task is the caller's.
 
     Observations are [q, v] (num_envs, 2 nv), actions torques u (num_envs, nv) in Nm (N), held for `dt` seconds. An
-    episode that ended begins anew with the next step (`AutoresetMode.NEXT_STEP`).
+    episode that ended, or whose motion diverges (`terminated`, `info["diverged"]`), begins anew with the next step.
 
-    * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean of the learned forces, k draws
-      k functions from the posterior with `function_seed`, and every episode takes one of them: domain randomisation in
-      those directions that the data leave open.
-    * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,) and start(generator, n) -> q, v take and return
-      arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode.
-    * torque_limits: as in `ComputedTorque`; they have to be finite.
+    * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean, k draws k functions from the
+      posterior with `function_seed`, of which every episode takes one: domain randomisation.
+    * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,), start(generator, n) -> q, v take and return
+      arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode. torque_limits have to
+      be finite.
 
-    A motion that diverges ends its episode (`terminated`, and `info["diverged"]`) at its last state; no observation is
-    NaN. Raises InvalidInput for settings that do not fit.
+    Raises InvalidInput for settings that do not fit.
     """
 
     def __init__(
@@ -136,10 +134,7 @@ class RobotVectorEnv(VectorEnv):
 
 
 class RobotEnv(gymnasium.Env):
-    """One robot of `RobotVectorEnv`, with its settings: gymnasium.make("forcegp/Robot-v0", model=..., draw=...).
-
-    reward, terminated and start take and return arrays of one row.
-    """
+    """One robot of `RobotVectorEnv`, with its settings and arrays of one row: make("forcegp/Robot-v0", model=...)."""
 
     def __init__(self, **settings: Any) -> None:
         self.robots = RobotVectorEnv(1, **settings)

@@ -1,11 +1,9 @@
 """Motions that teach most, from rest to rest within limits: how sure a model will be after one is known before it.
 
-The covariance of a Gaussian process depends on where its data are, not on what is measured there (Rasmussen & Williams
-2006, eq. 2.26). Without learned forces, the determinant of the information on base parameters takes its place
-(D-optimality; Swevers et al. 1997, "Optimal robot excitation and identification").
-Motions are cubic B-splines (de Boor 1978, "A practical guide to splines"): q lies in the hull of the control points, of
-which the first and last three are the start. Samples bound the rest, and between them an eighth of the second
-difference, the error of linear interpolation: exactly for v and a, whose knots are among the samples.
+The covariance of a Gaussian process depends on where its data are alone (Rasmussen & Williams 2006, eq. 2.26). Without
+learned forces the information on base parameters takes its place (D-optimality; Swevers et al. 1997). Motions are cubic
+B-splines (de Boor 1978) in the hull of their control points, the first and last three at the start; between samples an
+eighth of the second difference is added, exactly for v and a.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -125,10 +123,8 @@ class Excitation(Summary):
     """A motion of `seconds` that `excitation` chose, from rest at `start` (nv,) and back.
 
     `limits` are the ends (2, nv) of position (from the start), velocity, acceleration and torque. `model` is the
-    posterior that was given, `expected` the same after the motion: its mean unchanged, its intervals exact at the
-    hyper-parameters at hand. `spread` (2, nv) is the standard deviation of the acceleration that learned forces leave
-    open, before and after, in rad/s^2 (m/s^2). Without learned forces these are None, and `condition` is that of the
-    regressor of base parameters and friction.
+    posterior that was given, `expected` the same after the motion, `spread` (2, nv) the std of the acceleration before
+    and after, in rad/s^2 (m/s^2). Without learned forces these are None, and `condition` is that of the regressor.
     """
 
     robot: Robot
@@ -239,10 +235,7 @@ def _between(samples: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
 
 
 def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], margin: float) -> dict[str, np.ndarray]:
-    """The `limits` of an `Excitation`: those given, and `margin` times those of the URDF, whichever are smaller.
-
-    Raises InvalidInput, naming joint and limit, where no motion from this start can keep them.
-    """
+    """The `limits`: those given, and `margin` times the URDF's. InvalidInput names a joint that cannot keep them."""
     for name in given:
         require_known("limit", name, "excitation", QUANTITIES)
     joints = [(x.lower, x.upper, margin * x.velocity_limit, np.inf, margin * x.effort_limit) for x in robot.joints]

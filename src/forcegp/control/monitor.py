@@ -1,9 +1,9 @@
 """Contacts that nobody modelled, from motion and torque alone: `ContactMonitor`."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,16 +11,14 @@ from jaxtyping import Bool, Float
 from scipy.signal import lfilter
 from scipy.stats import chi2, gumbel_r
 from torch import Tensor
-from typing_extensions import override
 
 from forcegp.control.tracking import Moving, joint_forces, model_of
-from forcegp.errors import DatasetError, InvalidInput, require_known
+from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.integration.integrators import check_time_step
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_array
-from forcegp.summary import Summary
 
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
@@ -36,8 +34,8 @@ EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less exp
 class ContactState:
     """What a monitor found at rows (...): `torque` (..., nv) in Nm (N) of what touches the robot, low-pass filtered.
 
-    `distance` (...) is its Mahalanobis distance from free motion, squared; `alarm` where that is over the threshold.
-    `probability` is the share of stretches of 2 s of free motion in which the distance stays below this one.
+    `distance` (...) is its squared Mahalanobis distance from free motion; `alarm` where that is over the threshold;
+    `probability` the share of stretches of 2 s of free motion that stay below it.
     """
 
     torque: Float[Tensor, "*rows nv"]
@@ -48,10 +46,7 @@ class ContactState:
 
 @dataclass(frozen=True)
 class ContactPlace:
-    """A contact that explains a torque: a force (3,) in N in the axes of the world at a point (3,) of the link, in m.
-
-    `force_std` (3,) is what noise leaves open; `also` are links that explain the torque as well.
-    """
+    """A force (3,) in N, world axes, with its std, at a point (3,) in m of the link; `also` are other links."""
 
     link: str
     point: tuple[float, float, float]
@@ -60,31 +55,17 @@ class ContactPlace:
     also: tuple[str, ...]
 
 
-class ContactMonitor(Summary):
+class ContactMonitor:
     """A momentum observer around a model of the forces: what moves the robot beyond it is a contact.
 
-    Over a step of `dt` s, tau = M a - Q_K - Q_U with a the difference of velocities, all in the middle of the step;
-    filtered to first order with `bandwidth` Hz that is the residual of De Luca and Mattone (2005), "Sensorless robot
-    collision detection and hybrid force/motion control". Its covariance is S = M D_a M + D_f with noise of the
-    accelerations and of the forces as in free motion (`calibrate`), and an alarm is raised where tau^T S^-1 tau exceeds
-    a threshold that free motion reaches as often as stated.
-
-    * model: `posterior.predictor()`, or a `Model` without anything learned.
-    * covariance: "noise" is S; "noise and posterior" adds the spread of the learned forces there, which
-      spares false alarms where the model has not been. None is the latter where the model has a covariance.
-
-    Raises InvalidInput for arguments that do not fit and a monitor that was not calibrated, DatasetError for free
-    motion that is too short.
+    tau = M a - Q_K - Q_U in the middle of a step of `dt` s, filtered to first order with `bandwidth` Hz (De Luca &
+    Mattone 2005), with the covariance S = M D_a M + D_f of free motion (`calibrate`), to which the spread of learned
+    forces adds where `model`, `posterior.predictor()` or a `Model`, has one. An alarm is raised where tau^T S^-1 tau
+    exceeds a threshold that free motion reaches as often as stated. Raises InvalidInput for arguments that do not fit
+    and a monitor that was not calibrated, DatasetError for free motion that is too short.
     """
 
-    def __init__(
-        self,
-        model: Moving,
-        *,
-        dt: float,
-        bandwidth: float = 5.0,
-        covariance: Literal["noise", "noise and posterior"] | None = None,
-    ) -> None:
+    def __init__(self, model: Moving, *, dt: float, bandwidth: float = 5.0) -> None:
         self.model, plain = model, model_of(model)
         plain.robot.require_vectors("monitors of contacts")
         if plain.contacts:
@@ -92,12 +73,7 @@ class ContactMonitor(Summary):
                 "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
                 "motion, or give posterior.with_contacts([])."
             )
-        known = not (isinstance(model, Predictor) and model.kind != "none")
-        covariance = ("noise" if known else "noise and posterior") if covariance is None else covariance
-        require_known("covariance", covariance, "ContactMonitor", ("noise", "noise and posterior"))
-        self.open = covariance != "noise"
-        if self.open and known:
-            raise InvalidInput(f"covariance={covariance!r} needs posterior.predictor() with a covariance.")
+        self.open = isinstance(model, Predictor) and model.kind != "none"
         check_time_step(dt)
         if not (isinstance(bandwidth, int | float) and 0.0 < bandwidth < 0.5 / dt):
             raise InvalidInput(f"bandwidth is {bandwidth!r}; give Hz above 0 and below {0.5 / dt:g}, half the rate.")
@@ -109,12 +85,6 @@ class ContactMonitor(Summary):
         self._maxima = (0.0, 1.0)
         self.restart()
 
-    @override
-    def facts(self) -> Mapping[str, object]:
-        """Whether and how it is calibrated."""
-        threshold = "not calibrated" if self.noise is None else f"{self.threshold:.3g}"
-        return {"robot": self.robot.name, "bandwidth": f"{self.bandwidth:g} Hz", "threshold": threshold}
-
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
         self._torque = torch.zeros(self.robot.nv, dtype=torch.float64)
@@ -124,8 +94,7 @@ class ContactMonitor(Summary):
         """Learn the noise and the threshold from recordings (T, nv) of free motion; returns the monitor.
 
         The largest distances of stretches of 2 s follow a Gumbel distribution (Fisher, Tippett 1928), whose quantile is
-        the threshold: so minutes of free motion serve for a rate of one in hours, as far as its tail is the same. Take
-        another motion than the model learned from, as varied as those to come.
+        the threshold. Take another motion than the model learned from, as varied as those to come.
         """
         rate = false_alarms_per_hour
         if not (isinstance(rate, int | float) and 0.0 < rate < 3600.0 / BLOCK):
@@ -167,8 +136,8 @@ class ContactMonitor(Summary):
     def place(self, q: Any, torque: Any) -> ContactPlace:
         """The contact at q (nv,) that explains an external torque (nv,) by a force without a moment.
 
-        Least squares in the metric of the noise, at points along every link; of those that explain it alike the one
-        with the least force. Few joints before a contact leave its place and parts of its force open: see `also`.
+        Least squares in the metric of the noise, at points along every link; of those alike the one with the least
+        force.
         """
         q, tau = (torch.as_tensor(finite_vector(n, x, self.robot.nv)) for n, x in (("q", q), ("torque", torque)))
         white = torch.linalg.inv(torch.linalg.cholesky(self._covariance(self.robot.mass_matrix(q), None)))
@@ -235,10 +204,7 @@ class ContactMonitor(Summary):
 
 
 def contact_points(robot: Robot) -> list[tuple[str, Float[Tensor, "3"]]]:
-    """Points of every moving link, from its joint to the next joint, what is fastened to it or its centre of mass.
-
-    Of these ends the farthest, in m in the frame of the link.
-    """
+    """Points (m) along every moving link from its joint to its farthest end."""
     layout, points = robot.layout, []
     for body, joint in enumerate(layout.bodies):
         ends = [origin[:3, 3] for origin, parent in zip(layout.origins, layout.parents, strict=True) if parent == body]

@@ -2,7 +2,6 @@
 
 import ctypes
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -10,48 +9,39 @@ from typing import Any
 import mujoco as untyped
 import numpy as np
 import torch
-from typing_extensions import override
 
 from forcegp.codegen.c_writer import c_text, filled
 from forcegp.codegen.library import load_library
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
-from forcegp.robots.arguments import whole_number
-from forcegp.summary import Summary
 
 mujoco: Any = untyped
 STATES = 5  # random ones, at which robots are compared
 ALIKE = 1e-6  # relative difference of mass matrices and bias forces: MuJoCo diagonalises the inertias of a URDF
 
 
-class MujocoForces(Summary):
+class MujocoForces:
     """What was learned of a robot's forces, as MuJoCo's passive force: `with MujocoForces(predictor, model): ...`.
 
     Within the context every `mj_step`, `mj_forward` and `mujoco.rollout` of this process adds them, on any number of
-    threads; there is one such force at a time. With it `qacc` is what `posterior.predict` returns.
+    threads; one at a time. `qacc` then is what `posterior.predict` returns.
 
-    * predictor: `posterior.predictor()` without contacts, since those are MuJoCo's; its forces may depend on q and v.
-    * model: an `MjModel` with the joints of the robot, by their names, and its inertias and gravity. Damping and
-      friction that the URDF states are in it, too, and would act twice: InvalidInput names the joint.
-    * draw: 0 is the mean of the forces; k draws k functions with `seed`, the same as `predictor.rollouts(functions=k)`,
-      and `use(number)` chooses one, for example at the beginning of an episode.
+    * predictor: without contacts, since those are MuJoCo's; its forces may depend on q and v.
+    * model: an `MjModel` with the joints of the robot, its inertias and gravity, and no damping or friction of its own.
 
-    Raises InvalidInput for models that do not fit, CompilerError without a C compiler; leaving the context raises
+    Raises InvalidInput for models that do not fit, CompilerError without a C compiler; leaving the context
     NumericalError where a force was not finite meanwhile.
     """
 
-    def __init__(self, predictor: Predictor, model: Any, *, draw: int = 0, seed: int = 0) -> None:
+    def __init__(self, predictor: Predictor, model: Any) -> None:
         require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         require_type("model", model, mujoco.MjModel)
         predictor.posterior.model.robot.require_vectors("forces in MuJoCo")
         require_actuated(predictor.posterior)
-        self.predictor, self.draw = predictor, whole_number("draw", draw, 0)
-        own = predictor.posterior.model
+        self.predictor, own = predictor, predictor.posterior.model
         if own.contacts:
             raise InvalidInput("MuJoCo has contacts of its own, and this model has one; posterior.with_contacts([]).")
-        if draw and not len(predictor.latent.features):
-            raise InvalidInput(f"draw={draw} functions are asked for, and this model has none; give draw=0.")
         if predictor.code is None:
             raise InvalidInput("the predictor was made with compile=False; MuJoCo needs the C program.")
         places = _joints(model, own.robot.joint_names)
@@ -62,37 +52,19 @@ class MujocoForces(Summary):
             raise InvalidInput(
                 "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
             )
-        codes = code.drawn(draw, whole_number("seed", seed, 0))
-        if codes is None:
-            raise InvalidInput("the drawn functions of this prior have no form in C; give draw=0.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
         words = {"JOINTS": nv, "POSITIONS": positions, "VELOCITIES": velocities}
-        source = codes[0].c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
+        source = code.c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
         include = f"-I{Path(mujoco.__file__).parent / 'include'}"
         key = json.dumps([source, mujoco.mj_versionString()])
         self._library = load_library("mujoco", key, lambda _: source, (include,))
-        self._held = [each.tables() for each in codes]
-        self._tables = [(ctypes.c_void_p * max(1, len(held)))(*(x.data_ptr() for x in held)) for held in self._held]
-        self._chosen, self._active, self._failed = self._tables[0], False, False
-
-    @override
-    def facts(self) -> Mapping[str, object]:
-        """The robot, and how many functions there are."""
-        return {"robot": self.predictor.posterior.model.robot.name, "functions": self.draw or "the mean"}
-
-    def use(self, number: int) -> None:
-        """Take this of the drawn functions from now on; call it between two steps."""
-        if not whole_number("number", number, 0) < len(self._tables):
-            raise InvalidInput(f"function {number} is asked for, of {len(self._tables)}; make more by draw.")
-        self._chosen = self._tables[number]
-        if self._active:  # one library serves all with equal programs: it takes the tables of whom it acts for
-            self._failed |= bool(self._library.evaluate(self._chosen))
+        self._held = code.tables()
+        self._tables = (ctypes.c_void_p * max(1, len(self._held)))(*(x.data_ptr() for x in self._held))
 
     def __enter__(self) -> "MujocoForces":
         if mujoco.get_mjcb_passive() is not None:
             raise InvalidInput("MuJoCo has a passive callback already; leave its context, or set_mjcb_passive(None).")
-        self._library.evaluate(self._chosen)
-        self._active, self._failed = True, False
+        self._library.evaluate(self._tables)
         mujoco.set_mjcb_passive(
             ctypes.cast(self._library.passive, ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p))
         )
@@ -102,8 +74,7 @@ class MujocoForces(Summary):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         mujoco.set_mjcb_passive(None)
-        self._active = False
-        if (self._library.evaluate(self._chosen) or self._failed) and kind is None:
+        if self._library.evaluate(self._tables) and kind is None:
             raise NumericalError("a learned force was not finite: a state left what its tables hold, or diverged.")
 
 

@@ -1,10 +1,9 @@
-"""Tracking of a reference in joint space, with and without a model of the forces, and along a surface.
+"""Controllers: tracking of a reference, with and without a model of the forces, along a surface, and MPPI."""
 
-All controllers keep torques within limits, and none gives one that is not finite.
-"""
-
+import math
+import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -12,24 +11,23 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, require_known, require_type
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
 from forcegp.posterior.prediction import JointForces, require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
-from forcegp.robots.arguments import finite_vector, real_tensor
+from forcegp.robots.arguments import finite_vector, real_tensor, whole_number
 from forcegp.robots.compiled import CompiledRobot
-from forcegp.summary import Summary
 
 OnFailure = Literal["raise", "hold"]
 
 
-class Controller(Summary):
+class Controller:
     """Limits the torques of a call, and raises or holds the last ones where it cannot compute any.
 
-    `saturated` (nv,) are the joints whose torque was limited in the last call, `held` counts the calls that repeated
-    the torque `last` (nv,) of the call before, which is zero at first.
+    `saturated` (nv,) are the joints limited in the last call, `held` counts the calls that repeated `last` (nv,), 0 at
+    first.
     """
 
     def __init__(self, robot: Robot, torque_limits: Any, on_failure: OnFailure) -> None:
@@ -51,16 +49,8 @@ class Controller(Summary):
         self.saturated = torch.zeros(self.robot.nv, dtype=torch.bool)
         self.held = 0
 
-    @override
-    def facts(self) -> Mapping[str, object]:
-        """The robot, and how often it had to hold."""
-        return {"robot": self.robot.name, "on failure": self.on_failure, "held": self.held}
-
     def vectors(self, **given: Any) -> list[Tensor]:
-        """The vectors (nv,) as tensors, called within `limited`.
-
-        Raises InvalidInput for what is none, NumericalError for one that is not finite where that is to be held.
-        """
+        """Vectors (nv,), within `limited`. InvalidInput for others, NumericalError for not finite ones to hold."""
         try:
             return [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()]
         except InvalidInput as error:
@@ -70,10 +60,7 @@ class Controller(Summary):
             raise
 
     def limited(self, compute: Callable[[], Tensor]) -> Float[Tensor, " nv"]:
-        """The torques (nv,) that `compute` returns, within the limits.
-
-        Raises NumericalError where there are none or one is not finite, unless the last ones are to be held.
-        """
+        """The torques (nv,) of `compute` within limits. NumericalError where one is not finite, unless held."""
         try:
             asked = compute()
             if not bool(asked.isfinite().all()):
@@ -111,14 +98,13 @@ NO_TORQUES = (
 class TrackingController(Controller):
     """Feedback on a reference q_d, v_d, a_d (nv,), as an acceleration: a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum.
 
-    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically, 2 sqrt(Kp).
-      integral Ki in 1/s^3 needs the time `dt` between calls; a joint at its limit does not add to it.
+    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically. integral Ki in 1/s^3
+      needs the time `dt` between calls; a joint at its limit does not add to it.
     * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
-    * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite; the
-      integral then stays as it was.
+    * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite.
 
-    Raises InvalidInput for arguments that do not fit and a reference outside of the joints' range, NumericalError where
-    no torque is found.
+    Raises InvalidInput for arguments that do not fit and references out of range, NumericalError where no torque is
+    found.
     """
 
     def __init__(
@@ -179,10 +165,7 @@ class TrackingController(Controller):
 
 
 class PDGravity(TrackingController):
-    """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): no model but masses, the baseline of the others.
-
-    `robot` may be `robot.compile()`. Gains as `TrackingController` has them.
-    """
+    """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): masses alone; `robot` may be `robot.compile()`."""
 
     def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
         self._dynamics = robot
@@ -198,32 +181,23 @@ class ComputedTorque(TrackingController):
 
     * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
-    * forces_at: "desired" evaluates bias forces and friction at (q, v_d), "measured" at (q, v). At the measured
-      velocity dry friction follows the noise of v and every overshoot, one sample late (docs/how-to/control.md).
+    Forces are those at (q, v_d): at the measured velocity dry friction would follow noise and overshoot.
     """
 
-    def __init__(
-        self,
-        model: Moving,
-        *,
-        forces_at: Literal["desired", "measured"] = "desired",
-        **settings: Any,
-    ) -> None:
+    def __init__(self, model: Moving, **settings: Any) -> None:
         known = model_of(model)
         if known.contacts:
             raise InvalidInput(
                 "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
                 "posterior.with_contacts([])."
             )
-        require_known("forces_at", forces_at, "ComputedTorque", ("desired", "measured"))
-        self.model, self.forces_at = model, forces_at
+        self.model = model
         super().__init__(known.robot, **settings)
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at_v = v_d if self.forces_at == "desired" else v
-        at = joint_forces(self.model, q, at_v, self.last)
-        u = torques_for(self.model, q, at_v, at.M @ (a_d + self.feedback(e, e_v)), self.last, at)
+        at = joint_forces(self.model, q, v_d, self.last)  # at v dry friction would follow noise and overshoot
+        u = torques_for(self.model, q, v_d, at.M @ (a_d + self.feedback(e, e_v)), self.last, at)
         if u is None:
             raise NumericalError(NO_TORQUES)
         return u
@@ -249,10 +223,7 @@ def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
 def torques_for(
     model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
 ) -> Float[Tensor, " nv"] | None:
-    """The u (nv,) under which known and learned forces at q, v are those `needed`, by Newton's method; None if none is.
-
-    It begins at u, where they are `at`: friction may depend on u. Raises NumericalError for forces that are not finite.
-    """
+    """The u (nv,) that gives the forces `needed` at q, v, by Newton's method from u, where they are `at`, or None."""
     if not bool(needed.isfinite().all()):
         raise NumericalError(NO_TORQUES)
     for _ in range(ROUNDS):
@@ -270,13 +241,10 @@ def torques_for(
 class HybridForce(TrackingController):
     """u = M a + h - A^T lambda_d - Q_U(lambda_d): a reference along the contacts, and wanted forces against them.
 
-    a is the acceleration of the feedback, freed from what the contacts would resist: of all that satisfy A a = b the
-    one nearest to it in the kinetic metric (Gauss' principle). lambda_d presses the robot onto the surface; friction
-    under load, learned or known, is that of lambda_d. So the force is right where the model is: no sensor is read.
+    a is the acceleration of the feedback nearest, in the kinetic metric, that satisfies A a = b (Gauss' principle);
+    lambda_d presses the robot onto the surface. No sensor is read: the force is right where the model is.
 
-    * predictor: `posterior.predictor()` of a model with contacts and analytical mean. Gains as `TrackingController`
-      has them. Forces are evaluated at (q, v_d), as in `ComputedTorque`. Newton's method goes on from the torques of
-      the last call, for friction under load depends on them.
+    * predictor: `posterior.predictor()` of a model with contacts and analytical mean; forces are those at (q, v_d).
     """
 
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
@@ -292,10 +260,7 @@ class HybridForce(TrackingController):
 
     @override
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
-        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) in N, one per contact.
-
-        A normal force is positive where the surface pushes the robot off; a surface only pushes.
-        """
+        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) >= 0 in N on the robot."""
         count = len(self.model.contacts)
         wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
         if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):
@@ -315,3 +280,119 @@ class HybridForce(TrackingController):
         u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at)
         # where that finds none with shorter steps, or its error
         return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean if u is None else u
+
+
+Cost = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Costs (...) of whole motions q, v (..., T+1, nv) in rad, rad/s (m, m/s) under torques u (..., T, nv) in Nm (N)."""
+
+SHARE_OF_MEDIAN = 0.02
+"""The temperature over the distance from the least to the median cost, where none is given."""
+SMALLEST_SCALE = 0.05
+"""Of the noise: sequences far from the plan find another way, those near to it refine the one that it has."""
+
+
+class MPPI(Controller):
+    """Torques that lower the expected cost of the next `steps` steps of `dt` seconds, found by random shooting.
+
+    A call draws `samples` sequences around the plan, rolls them out and moves the plan to their mean with the weights
+    exp(-cost / temperature) (Williams, Aldrich, Theodorou 2017); the best one takes part in the next call (Pinneri et
+    al. 2020). Call it once in `dt` seconds, after some rounds of `improved`.
+
+    * predictor: `posterior.predictor()`. functions: 0 plans with the mean of the learned forces, k with the mean cost
+      under k functions drawn from the posterior.
+    * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
+    * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
+    * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
+      to sequence. correlation: of two successive torques, in [0, 1). temperature: None takes 2 % of the distance from
+      the least to the median cost. on_failure: "raise", or "hold" for the last torque.
+
+    Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        cost: Cost,
+        *,
+        dt: float,
+        steps: int,
+        torque_limits: Any = None,
+        samples: int = 128,
+        noise: Any = None,
+        correlation: float = 0.95,
+        temperature: float | None = None,
+        functions: int = 0,
+        integrator: str = "implicit-midpoint",
+        seed: int = 0,
+        threads: int | None = 1,
+        on_failure: OnFailure = "raise",
+    ) -> None:
+        require_type("predictor", predictor, Predictor)
+        if not callable(cost):
+            raise InvalidInput(f"cost is {cost!r}; give a function of motions q, v (..., T+1, nv) and u (..., T, nv).")
+        self.predictor, self.cost, nv = predictor, cost, predictor.nv
+        check_time_step(dt)
+        self.dt, self.steps = float(dt), whole_number("steps", steps, 1)
+        self.samples, self.functions = whole_number("samples", samples, 2), whole_number("functions", functions, 0)
+        self._seed = whole_number("seed", seed, 0)
+        super().__init__(predictor.posterior.model.robot, torque_limits, on_failure)
+        self.noise = per_joint("noise", 0.5 * self.torque_limits if noise is None else noise, nv)
+        if not bool(self.noise.isfinite().all()):
+            raise InvalidInput("noise is infinite where torque_limits are; give noise in Nm or N, or finite limits.")
+        self.temperature = temperature
+        if temperature is not None and not (isinstance(temperature, int | float) and 0.0 < temperature < math.inf):
+            raise InvalidInput(f"temperature is {temperature!r}; give a positive number in units of the cost, or None.")
+        if not (isinstance(correlation, int | float) and 0.0 <= correlation < 1.0):
+            raise InvalidInput(f"correlation is {correlation!r}; give a number of at least 0 and below 1.")
+        apart = torch.arange(self.steps, dtype=torch.float64)
+        self._colour = torch.linalg.cholesky(correlation ** (apart[:, None] - apart).abs())
+        self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
+        self._how: dict[str, Any] = {"integrator": integrator, "functions": functions, "seed": seed, "threads": threads}
+
+    @override
+    def restart(self) -> None:
+        """Forget the plan: no torque at all, and the random numbers of the seed again."""
+        super().restart()
+        self.plan = self._best = torch.zeros(self.steps, self.robot.nv, dtype=torch.float64)
+        self._generator = torch.Generator().manual_seed(self._seed)
+
+    def __call__(self, q: Any, v: Any) -> Float[Tensor, " nv"]:
+        """The torques (nv,) in Nm (N) for the next `dt` seconds from the state q, v (nv,) in rad, rad/s (m, m/s)."""
+
+        def first() -> Tensor:
+            plan = self.improved(self.plan, *self.vectors(q=q, v=v))
+            self.plan, self._best = (torch.cat([x[1:], x[-1:]]) for x in (plan, self._best))
+            return plan[0]
+
+        return self.limited(first)
+
+    def improved(self, plan: Tensor, q: Tensor, v: Tensor) -> Float[Tensor, "steps nv"]:
+        """The plan (steps, nv) after one round of random sequences from the state q, v (nv,)."""
+        normal = torch.randn(self.samples, *plan.shape, generator=self._generator, dtype=plan.dtype)
+        noise = self._colour @ normal * self._scales[:, None, None] * self.noise
+        noise[0] = 0.0  # the plan itself takes part, and the best sequence of the last call
+        noise[1] = self._best - plan
+        torques = plan + noise
+        torques = torch.minimum(torch.maximum(torques, -self.torque_limits), self.torque_limits)
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", NumericalWarning)  # of sequences that diverge: they cost infinitely much
+            motions = self.predictor.rollouts(q, v, torques, self.dt, **self._how)
+            costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
+        if costs.shape != motions.diverged_at.shape:
+            raise InvalidInput(
+                f"cost returned shape {tuple(costs.shape)} for motions {tuple(motions.q.shape)}; return one number per "
+                f"motion, {tuple(motions.diverged_at.shape)}."
+            )
+        costs = costs.double().masked_fill((motions.diverged_at >= 0) | costs.isnan(), math.inf)
+        costs = costs.mean(0) if self.functions else costs
+        best = float(costs.min())
+        if not math.isfinite(best):
+            raise NumericalError(
+                f"none of {self.samples} sequences of torques has a finite cost from here; check cost(q, v, u), give a "
+                "smaller dt, less noise or fewer steps, or on_failure='hold'."
+            )
+        self._best = torques[costs.argmin()]
+        temperature = self.temperature
+        if temperature is None:
+            temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)
+        return torch.einsum("s,stj->tj", torch.softmax((best - costs) / temperature, dim=0), torques)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError
-from forcegp.robots.manifold import ConfigurationSpace, Group, pose
+from forcegp.robots.manifold import TURN, ConfigurationSpace, pose
 
 LEAST_LENGTH = 0.7  # of a filtered quaternion: below it the turn is faster than what the filter passes
 LARGEST_TURN = 0.5 * np.pi  # between two rows: beyond it the log does not show which way a body has turned
@@ -32,8 +32,8 @@ def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
     Raises DatasetError where a body turns by more than a quarter of a turn between two rows.
     """
     for group in space.groups:
-        turn = slice(group.place + group.motion.turn.start, group.place + group.motion.turn.stop)
-        followed, jumped = following(group, q[:, turn], q[0, turn])
+        turn = slice(group.place + TURN.start, group.place + TURN.stop)
+        followed, jumped = following(q[:, turn], q[0, turn])
         if jumped.any():
             raise DatasetError(
                 f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row "
@@ -45,14 +45,12 @@ def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
 
 
 def following(
-    group: Group, turn: Float[np.ndarray, "rows parts"], before: Float[np.ndarray, " parts"]
+    turn: Float[np.ndarray, "rows parts"], before: Float[np.ndarray, " parts"]
 ) -> tuple[Float[np.ndarray, "rows parts"], Bool[np.ndarray, " rows"]]:
     """Turns whose quaternions have the sign that is nearer to the row before, and rows that turn too far from it."""
-    half = group.kind != "planar"  # quaternions turn by half the angle, and have two signs
     cosine = (turn * np.vstack([before, turn[:-1]])).sum(axis=1)
-    if half:
-        turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
-    return turn, (np.abs(cosine) if half else cosine) < np.cos(LARGEST_TURN / (2 if half else 1))
+    turn = turn * np.cumprod(np.where(cosine < 0.0, -1.0, 1.0))[:, None]
+    return turn, np.abs(cosine) < np.cos(LARGEST_TURN / 2)  # quaternions turn by half the angle
 
 
 def through(
@@ -66,7 +64,7 @@ def through(
         return change(q)
     changed = change(continuous(space, q))
     for group in space.groups:
-        length = np.linalg.norm(changed[:, group.places][:, group.motion.turn], axis=1)
+        length = np.linalg.norm(changed[:, group.places][:, TURN], axis=1)
         if float(np.median(length)) < LEAST_LENGTH:
             raise DatasetError(f"{group.name!r} turns faster than the filter passes; use a higher cut-off.")
     return space.normalized(torch.from_numpy(np.ascontiguousarray(changed))).numpy()
@@ -109,7 +107,6 @@ def chart_acceleration(
 
 
 def in_base(
-    group: Group,
     q: Float[Tensor, "rows positions"],
     values: Float[Tensor, "rows velocities"],
     axes: tuple[str, str],
@@ -123,21 +120,16 @@ def in_base(
     which measures f = R^T (p'' - g), gives v' = f + R^T g - w x R^T p' (Titterton & Weston, "Strapdown inertial
     navigation technology", 2004, section 3.5). Angular parts are alike: (R w)' = R (w' + w x w) = R w'.
     """
-    free = list(group.motion.free)
-
-    def six(own: Tensor) -> Tensor:
-        return own.new_zeros(len(own), 6).index_copy(1, torch.tensor(free), own).unflatten(-1, (2, 3))
-
-    inverse = pose(group.kind, q)[0].mT
-    turned, found = (inverse[:, None] @ six(values)[..., None])[..., 0], six(values)
+    inverse, found = pose(q)[0].mT, values.unflatten(-1, (2, 3)).clone()
+    turned = (inverse[:, None] @ found[..., None])[..., 0]
     for part, name in enumerate(axes):
         if name == "world":
             found[:, part] = turned[:, part]
     if v is not None and gravity is not None and axes[0] != "body":
-        found[:, 0] -= torch.linalg.cross(six(v)[:, 1], six(v)[:, 0])
+        found[:, 0] -= torch.linalg.cross(v[:, 3:], v[:, :3])
         if axes[0] == "imu":
             found[:, 0] += inverse @ gravity
-    return found.flatten(1)[:, free]
+    return found.flatten(1)
 
 
 def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:

@@ -18,7 +18,7 @@ from forcegp.data.filters import Lag, episodes_in_order
 from forcegp.data.views import in_blocks
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.columns import law_columns, usual_columns
-from forcegp.robots.manifold import Group
+from forcegp.robots.manifold import TURN, Group
 
 LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s
 STEPS = 100  # shifts that are tried to either side
@@ -303,7 +303,7 @@ def _causes(
     late = Lag(seconds)(part.u[:, columns], part.time)
     thrust = np.where(powers == 2, late * np.abs(late), late)
     v, w = part.v[:, group.rows][:, :3], part.v[:, group.rows][:, 3:]
-    axes = Rotation.from_quat(part.q[:, group.places][:, group.motion.turn]).as_matrix().reshape(-1, 9)
+    axes = Rotation.from_quat(part.q[:, group.places][:, TURN]).as_matrix().reshape(-1, 9)
     fast = np.linalg.norm(v, axis=1, keepdims=True)
     spinning = np.where(powers == 2, late, np.sqrt(np.abs(late)))[..., None] * v[:, None]
     turning = [np.cross(w, v), w[:, [1, 2, 0]] * w[:, [2, 0, 1]]]

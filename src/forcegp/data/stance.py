@@ -135,9 +135,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
     robot, whole, weight = model.robot, np.sum(asked, axis=0), 0.0
-    gravity = {"floating": robot.gravity, "planar": robot.gravity[:2]}.get(robot.base)
-    if gravity is not None and all(contact.switch for contact in model.contacts):  # which alone hold the robot up
-        weight = float(gravity.norm()) * robot.mass
+    if robot.base == "floating" and all(contact.switch for contact in model.contacts):  # which alone hold the robot up
+        weight = float(robot.gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
         falls = np.linalg.norm(Mean(width)(whole[rows]), axis=1) < FALLS * weight

@@ -16,6 +16,7 @@ import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.data.filters import episodes_in_order, sums_before
 from forcegp.data.views import in_blocks
+from forcegp.robots.manifold import TURN
 
 SECONDS = 0.3  # s: rows that lie this far apart count 1/e for each other's wind
 MOST_ROWS, FEWEST_ROWS = 3000, 400
@@ -171,7 +172,7 @@ class _Forces:
 
         wrench, delivered = in_blocks(dataset, found, robot.device)
         places = dataset.q[:, group.places]
-        rotation = Rotation.from_quat(places[:, group.motion.turn]).as_matrix()
+        rotation = Rotation.from_quat(places[:, TURN]).as_matrix()
         return cls(wrench, dataset.v[:, group.rows], delivered, rotation, places[:, 2:3])
 
     def causes(self, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

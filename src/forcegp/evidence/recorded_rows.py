@@ -9,7 +9,7 @@ where M_0 is the inertia of what is listed and not estimated. Differentiating M 
 
     dr/dpi = M^-1 Y(q, v, a^),    dr/dx = M^-1 dt/dx (v, a^).
 
-Feet that stand, closed loops and wheels add A^T lambda to Q, with A a = b and unknown lambda. Accelerations are then
+Feet that stand and closed loops add A^T lambda to Q, with A a = b and unknown lambda. Accelerations are then
 those of Gauss' principle, and H stands in the place of M^-1. Of the torques only the part that is orthogonal to the
 rows of A, row by row of the recording, is an equation without lambda.
 
@@ -47,7 +47,7 @@ from forcegp.evidence.least_squares import BEND, NoiseLevels, orthonormal_column
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.forces import Law, RigidBodies
 from forcegp.forces.thrusters import OBSERVED
-from forcegp.mechanics import Contact, Held, LoopClosure, RollingContact, State
+from forcegp.mechanics import Contact, Held, LoopClosure, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
 from forcegp.model import Model
 
@@ -57,7 +57,7 @@ def motion_residuals(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    What A^T lambda can explain, the forces of feet that stand, of loops and of wheels, is left out of the force
+    What A^T lambda can explain, the forces of feet that stand and of loops, is left out of the force
     residual; under contacts that slide it holds the contact forces as well. Under friction that grows with |u| it is
     what the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u|
     shrinks the residual of any model.
@@ -305,8 +305,8 @@ def kept_laws(space: ParameterSpace, any_contact: bool = False) -> tuple[Law, ..
 
 
 def slides(contact: Contact) -> bool:
-    """Whether friction can act along the contact: on a surface, other than at held points, loops and wheels."""
-    return not isinstance(contact, LoopClosure | RollingContact) and not isinstance(contact.surface, Held)
+    """Whether friction can act along the contact: on a surface, other than at held points and loops."""
+    return not isinstance(contact, LoopClosure) and not isinstance(contact.surface, Held)
 
 
 def independent_rows(

@@ -279,7 +279,7 @@ def doubts_of_base(
         wrong = f"by this log the robot weighs {masses[1]:.3g} kg, by its file {masses[0]:.3g} kg"
     elif missing * OTHER_ROBOT > np.linalg.norm(robot.gravity.cpu().numpy()) > 0.0:
         wrong = f"accelerations of the base are wrong by {missing:.3g} m/s^2 on average"
-    linear = {"floating": 3, "planar": 2}.get(robot.base, 0)
+    linear = 3 if robot.base == "floating" else 0
     missed, v = residual[:, :linear], rows.v[:, :linear]
     braked = -float((missed * v).sum()) / max(float(np.linalg.norm(missed) * np.linalg.norm(v)), 1e-300)
     if wrong:

@@ -11,7 +11,7 @@ from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.least_squares import Chained, Jacobian, NoiseLevels, Regressor, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
-from forcegp.posterior.estimates import STRETCHES
+from forcegp.posterior.fitted import STRETCHES
 from forcegp.robots import Robot
 
 CLEARLY = 10.0

@@ -56,7 +56,7 @@ from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOption
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
-from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
 from forcegp.robots.arguments import whole_number
 

@@ -32,7 +32,7 @@ from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.likelihood import deflated_covariance, whiten
 from forcegp.inference.linear_functionals import Functionals
 from forcegp.posterior import Posterior
-from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.fitted import Estimates
 
 MOST_ROUNDS = 10
 """Searches, each about the numbers of the last one."""

@@ -14,7 +14,7 @@ from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.training_data import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
 from forcegp.posterior import Posterior
-from forcegp.posterior.motion_intervals import DEVIATIONS, HORIZONS, MotionIntervals
+from forcegp.posterior.fitted import DEVIATIONS, HORIZONS, MotionIntervals
 from forcegp.posterior.observed_wrench import in_own_air, observing, require_unobserved
 from forcegp.posterior.rollout import Rollout
 

@@ -39,7 +39,7 @@ from forcegp.inference.engines import InducingWeights
 from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
 from forcegp.model import Model
 from forcegp.posterior import Posterior
-from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.observed_wrench import in_own_air, require_unobserved, unobserved
 from forcegp.robots.manifold import ConfigurationSpace
 

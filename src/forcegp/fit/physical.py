@@ -26,7 +26,7 @@ from forcegp.fit.equations import Equations, most_likely, possible_links
 from forcegp.forces import Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
-from forcegp.posterior.estimates import STRETCHES, Estimates
+from forcegp.posterior.fitted import STRETCHES, Estimates
 from forcegp.robots import Robot
 
 ROWS = 5_000

@@ -62,7 +62,7 @@ def resolved_noise(noise: Noise | None, rows: Dataset | WindowedRows) -> Noise:
     level = rows.noise_level
     noise = noise or Noise()
     if level is not None:
-        return replace(noise, acceleration=tuple(float(std) for std in level), from_data=not noise.learn)
+        return replace(noise, acceleration=tuple(float(std) for std in level))
     if not noise.learn:
         warnings.warn(
             "the dataset does not state the noise of its accelerations, so it is learned with the other parameters; "

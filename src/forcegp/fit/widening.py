@@ -27,7 +27,7 @@ from forcegp.inference import LatentPosterior
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import FactorizedPosterior
 from forcegp.posterior import Posterior
-from forcegp.posterior.motion_intervals import DEVIATIONS
+from forcegp.posterior.fitted import DEVIATIONS
 
 CONTENT, CONFIDENCE = 0.9, 0.995
 """Share of the states that lie inside their 95 % intervals, in this share of the functions that the data leave open."""

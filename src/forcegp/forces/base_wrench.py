@@ -16,6 +16,7 @@ from forcegp.forces.tool_forces import ToolPoint, finite_numbers, require_moving
 from forcegp.forces.unknown import ExpressedKernels, Scaling
 from forcegp.mechanics import ConstrainedDynamics, Contact, State
 from forcegp.robots import Robot
+from forcegp.robots.manifold import VELOCITIES
 
 AXES = "xyz"
 BASE_INPUTS = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation", "height", "attitude")
@@ -121,7 +122,7 @@ class BaseWrench(ExpressedKernels):
 
     def _labels(self, robot: Robot) -> dict[str, Sequence[str]]:
         link, groups = self.link(robot), robot.layout.groups
-        parts = groups[0].motion.velocities if groups else robot.joint_names
+        parts = VELOCITIES if groups else robot.joint_names
         pushes = [f"actuation along {part} [{'N' if part in AXES else 'Nm'}]" for part in parts]
         return {
             "velocity": [f"velocity of {link} along its {axis} [m/s]" for axis in AXES],

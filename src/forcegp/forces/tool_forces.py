@@ -13,7 +13,7 @@ from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.forces.joint_forces import chosen_inputs, driven, state_labels
 from forcegp.forces.kernels import check_kernel
 from forcegp.forces.unknown import ExpressedKernels, Scaling
-from forcegp.mechanics import ConstrainedDynamics, Contact, LoopClosure, RollingContact, surface_axes
+from forcegp.mechanics import ConstrainedDynamics, Contact, LoopClosure, surface_axes
 from forcegp.mechanics.gauss_principle import placed
 from forcegp.robots import Robot
 
@@ -73,7 +73,7 @@ def is_contact_number(value: object) -> bool:
 
 def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> None:
     """Raise InvalidInput if there is no such contact to slide on."""
-    sliding = (not isinstance(each, LoopClosure | RollingContact) for each in contacts)
+    sliding = (not isinstance(each, LoopClosure) for each in contacts)
     numbers = [index for index, slides in enumerate(sliding) if slides]
     if contact not in numbers:
         have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"

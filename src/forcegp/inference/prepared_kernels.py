@@ -37,8 +37,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.codegen.c_writer import c_text, c_value, filled, sections
-from forcegp.codegen.derivatives import gradients
-from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated
+from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated, gradients
 from forcegp.codegen.tracing import trace
 from forcegp.inference.kernel_matrices import squared_exponential_parameters
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior

@@ -1,9 +1,6 @@
 from .integrators import (
-    ConstraintManifold as ConstraintManifold, ProjectedPosition as ProjectedPosition, INTEGRATORS as INTEGRATORS,
-    Acceleration as Acceleration, ImplicitMidpoint as ImplicitMidpoint, Integrator as Integrator,
-    Projected as Projected, RungeKutta4 as RungeKutta4, Step as Step, SymplecticEuler as SymplecticEuler,
-    integrator_named as integrator_named,
-)
-from .trajectory import (
-    SPEED_LIMIT as SPEED_LIMIT, Feedback as Feedback, Trajectory as Trajectory, integrate as integrate,
+    INTEGRATORS as INTEGRATORS, SPEED_LIMIT as SPEED_LIMIT, Feedback as Feedback, ImplicitMidpoint as ImplicitMidpoint,
+    Integrator as Integrator, RungeKutta4 as RungeKutta4, Step as Step, SymplecticEuler as SymplecticEuler,
+    Trajectory as Trajectory, integrate as integrate, integrator_named as integrator_named,
+    onto_contacts as onto_contacts, violation as violation,
 )

@@ -1,142 +1,75 @@
-"""One step of time: symplectic Euler, Runge-Kutta, implicit midpoint, and a scheme that stays on the constraint.
-
-An integrator asks for accelerations a(q, v) wherever they come from; actuator forces are constant
-over the step. All states are batched, (n, nv).
-"""
+"""Steps of time, whose accelerations a(q, v) may come from anywhere, and motions of many states (n, nv) by them."""
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
 from forcegp.model import Model
-from forcegp.robots import Kinematics
 from forcegp.robots.manifold import ConfigurationSpace
 
-POSITION_TOLERANCE = 1e-12
-"""A position counts as on the surface within this distance, |c| / |s_p|, in m."""
-MOST_ITERATIONS = 25
+ON_SURFACE, MOST_CORRECTIONS = 1e-12, 25
+"""m, |c| / |s_p| of a point on its surface; steps of Newton's method until it is there."""
 
 
-@dataclass(frozen=True, eq=False)
-class ProjectedPosition:
-    """Positions q with c(q) = 0 (where `converged`), A at them, L^-1 of M = L L^T at the given q, and iterations."""
+def violation(
+    model: Model, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"]
+) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
+    """c(q) in m and A(q) v in m/s of the contacts, for surfaces that are signed distances; NaN where q is."""
+    lost = torch.isnan(q).any(-1, keepdim=True)  # no quaternion is made of NaN
+    c, A, _ = _constraint(
+        model, torch.where(lost, model.robot.space.neutral().to(q), q) if model.robot.space.groups else q
+    )
+    return c.masked_fill(lost, torch.nan), (A @ v[..., None])[..., 0].masked_fill(lost, torch.nan)
 
-    q: Float[Tensor, "n nq"]
-    A: Float[Tensor, "n m nv"]
-    inverse_lower: Float[Tensor, "n nv nv"]
-    converged: Bool[Tensor, " n"]
-    iterations: int
 
+def onto_contacts(
+    model: Model, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"]
+) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
+    """The states near (q, v) with c(q) = 0 to 1e-12 m and A v = 0: Newton's method along M^-1 A^T, M fixed.
 
-@dataclass(frozen=True, eq=False)
-class ConstraintManifold:
-    """{(q, v): c(q) = 0, A(q) v = 0} of the contacts of a model; everything, if it has none.
-
-    Distances are measured by the mass matrix, |dq|_M^2 = dq^T M dq, so that corrections act along M^-1 A^T like the
-    contact forces themselves. Redundant contacts are legal: all inverses of A M^-1 A^T are pseudo-inverses.
+    Hairer, Lubich & Wanner (2006), sections IV.4 and VII.1.4; redundant contacts are legal. NumericalError names a
+    state for which no position on all surfaces is found.
     """
-
-    model: Model
-
-    def violation(
-        self, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"]
-    ) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
-        """c(q) in m and A(q) v in m/s, for surfaces that are signed distances; NaN where q is."""
-        space = self.model.robot.space
-        lost = None if space.is_vector_space else torch.isnan(q).any(-1, keepdim=True)
-        if lost is not None:  # no quaternion is made of NaN
-            q = torch.where(lost, space.neutral().to(q), q)
-        c, A, _ = self._constraint(self.model.robot.kinematics(q))
-        rate = (A @ v[..., None])[..., 0]
-        return (c, rate) if lost is None else (c.masked_fill(lost, torch.nan), rate.masked_fill(lost, torch.nan))
-
-    def project_position(self, q: Float[Tensor, "n nq"]) -> ProjectedPosition:
-        """The positions on all surfaces that Newton's method finds from q: dq = -M^-1 A^T (A M^-1 A^T)^+ c, M fixed.
-
-        Source: Hairer, Lubich & Wanner (2006), Geometric Numerical Integration, sections IV.4 and VII.1.4, with the
-        gradients renewed in every iteration. Converged means |c| <= 1e-12 m |s_p| in all contacts: 1e-12 m from the
-        surface, whatever the scale of the function that describes it (|s_p| = 1 for signed distances). States that do
-        not converge are returned as such, for the caller to judge.
-        """
-        space = self.model.robot.space
-        given_finite = torch.isfinite(q).all(-1)
-        q = torch.where(given_finite[:, None], q, space.neutral().to(q.device) if space.groups else 0.0)
-        kinematics = self.model.loaded_robot.kinematics(q)
-        _, inverse_lower = factors(self.model.mass_matrix_at(kinematics))
-        iteration, differentiable = 0, torch.is_grad_enabled() and q.requires_grad
-        while True:
-            c, A, slope = self._constraint(kinematics)
-            on_surface = (c.abs() <= POSITION_TOLERANCE * slope).all(-1)
-            finite = torch.isfinite(A).all(-1).all(-1) & torch.isfinite(c).all(-1) & given_finite
-            moving = ~on_surface & finite
-            if iteration == MOST_ITERATIONS or not bool(moving.any()):
-                if not differentiable:
-                    return ProjectedPosition(q, A, inverse_lower, on_surface & finite, iteration)
-                # one step more, of rounding's size: without one, a q on the surface would have the derivative 1
-                moving, differentiable = on_surface & finite, False
-            A_white = torch.where(finite[:, None, None], A @ inverse_lower.mT, 0.0)
-            white = _pseudo_inverse(A_white) @ torch.where(finite[:, None], c, 0.0)[..., None]
-            q = torch.where(moving[:, None], space.integrate(q, -(inverse_lower.mT @ white)[..., 0]), q)
-            kinematics = self.model.robot.kinematics(q)
-            iteration += 1
-
-    def project_velocity(self, at: ProjectedPosition, v: Float[Tensor, "n nv"]) -> Float[Tensor, "n nv"]:
-        """The nearest velocity with A v = 0 there: v - M^-1 A^T (A M^-1 A^T)^+ A v."""
-        rate = (at.A @ v[..., None])[..., 0]
-        finite = torch.isfinite(at.A).all(-1).all(-1) & torch.isfinite(rate).all(-1)
-        A_white = torch.where(finite[:, None, None], at.A @ at.inverse_lower.mT, 0.0)
-        inverse = _pseudo_inverse(A_white)
-        for _ in range(2):  # the second time removes what rounding of the first has left
-            v = v - (at.inverse_lower.mT @ (inverse @ (at.A @ v[..., None])))[..., 0]
-        return v
-
-    def project(
-        self, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"]
-    ) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
-        """Both. Raises NumericalError, naming the state, where no position on all surfaces is found near q."""
-        at = self.project_position(q)
-        if not bool(at.converged.all()):
-            row = int(torch.nonzero(~at.converged)[0])
-            c, _ = self.violation(at.q[row], v[row])
-            raise NumericalError(
-                f"state {row} cannot be moved onto the surfaces of the contacts: after {at.iterations} Newton steps "
-                f"|c| is still {float(c.abs().max()):.2e} m. Start nearer to the surfaces, check that the robot can "
-                "reach them and that the contacts do not contradict each other, or use an integrator that does not "
-                "project."
-            )
-        return at.q, self.project_velocity(at, v)
-
-    def _constraint(self, kinematics: Kinematics) -> tuple[Tensor, Tensor, Tensor]:
-        """c (..., m), A (..., m, nv) and |s_p| (..., m)."""
-        batch, nv = kinematics.batch_shape, self.model.robot.nv
-        contacts = self.model.contacts
-        if not contacts:
-            empty = kinematics.twists.new_zeros(*batch, 0)
-            return empty, kinematics.twists.new_zeros(*batch, 0, nv), empty
-        values, rows, slopes = [], [], []
-        for contact in contacts:
-            value, A, gradient, _ = contact.row(kinematics)
-            values.append(value)
-            rows.append(A)
-            slopes.append(torch.linalg.vector_norm(gradient, dim=-1))
-        return torch.stack(values, dim=-1), torch.stack(rows, dim=-2), torch.stack(slopes, dim=-1)
+    lower = factors(model.mass_matrix_at(model.loaded_robot.kinematics(q)))[1]
+    iteration, (c, A, slope) = 0, _constraint(model, q)
+    while bool((missing := ~(c.abs() <= ON_SURFACE * slope).all(-1)).any()) and bool(A.isfinite().all()):
+        if iteration == MOST_CORRECTIONS:
+            break
+        inverse = lower.mT @ torch.linalg.pinv(A @ lower.mT, rtol=REDUNDANCY_TOLERANCE)
+        q = model.robot.space.integrate(q, -(inverse @ c[..., None])[..., 0])
+        iteration, (c, A, slope) = iteration + 1, _constraint(model, q)
+    if bool(missing.any()):
+        row = int(missing.nonzero()[0])
+        raise NumericalError(
+            f"state {row} cannot be moved onto the surfaces of the contacts: after {iteration} Newton steps |c| is "
+            f"still {float(c[row].abs().max()):.2e} m. Start nearer, and check that the robot can reach "
+            "them and that the contacts do not contradict each other."
+        )
+    inverse = lower.mT @ torch.linalg.pinv(A @ lower.mT, rtol=REDUNDANCY_TOLERANCE)
+    for _ in range(2):  # the second time removes what rounding of the first has left
+        v = v - (inverse @ (A @ v[..., None]))[..., 0]
+    return q, v
 
 
-def _pseudo_inverse(A_white: Tensor) -> Tensor:
-    """(A L^-T)^+: for a single contact a division, which is much faster than the general case."""
-    if A_white.shape[-2] == 1:
-        square = A_white.square().sum(-1, keepdim=True)
-        return torch.where(square > 0.0, A_white / square, 0.0).mT
-    return torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE) if A_white.shape[-2] else A_white.mT
+def _constraint(model: Model, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """c (..., m), A (..., m, nv) and |s_p| (..., m)."""
+    if not model.contacts:
+        empty = q.new_zeros(*q.shape[:-1], 0)
+        return empty, empty[..., None].expand(*empty.shape, model.robot.nv), empty
+    kinematics = model.robot.kinematics(q)
+    rows = [contact.row(kinematics) for contact in model.contacts]
+    c, A = torch.stack([row.value for row in rows], dim=-1), torch.stack([row.A for row in rows], dim=-2)
+    return c, A, torch.stack([torch.linalg.vector_norm(row.gradient, dim=-1) for row in rows], dim=-1)
 
 
 MOST_STEPS, MOST_TRIALS = 200, 12
@@ -153,10 +86,9 @@ Rows = Callable[[Tensor], Tensor]
 def find_roots(residual: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n k"], Bool[Tensor, " n"]]:
     """The roots that Newton's method reaches from x, and where it found them; differentiable once in `residual`'s own.
 
-    A step d is shortened, by the secant rule, where J^-1 r has turned round by more than half at its end: in one
-    dimension, where it overshoots the root by more. To ask for a smaller |r|, as textbooks do, ends at bumps of a
-    friction curve. A Jacobian with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with speed,
-    the plain step leads away from the root.
+    A step is shortened, by the secant rule, where J^-1 r has turned round by more than half at its end; a smaller |r|
+    ends at bumps of a friction curve. J with an eigenvalue below `SMALLEST_SLOPE` is shifted: where friction falls with
+    speed, the plain step leads away from the root.
     """
     with torch.no_grad():
         x = x.detach()
@@ -249,12 +181,6 @@ class Integrator(ABC):
     failure: ClassVar[str] = ""
     """Why a step can have no end, for a warning."""
 
-    def start(
-        self, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"]
-    ) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
-        """The state at which a motion from (q, v) begins: itself, unless the method needs another."""
-        return q, v
-
     @abstractmethod
     def step(self, acceleration: Acceleration, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"], dt: float) -> Step:
         """The state `dt` seconds later."""
@@ -281,8 +207,7 @@ class SymplecticEuler(Integrator):
 class RungeKutta4(Integrator):
     """The classical method of fourth order, four evaluations (Hairer, Norsett & Wanner 1993, table II.1.2).
 
-    On a manifold for the step from q in the chart of the exponential (Munthe-Kaas 1999; Hairer, Lubich & Wanner 2006,
-    section IV.8.2), of the same order.
+    On a manifold in the chart of the exponential (Munthe-Kaas 1999).
     """
 
     space: ConfigurationSpace = VECTORS
@@ -304,9 +229,8 @@ class RungeKutta4(Integrator):
 class ImplicitMidpoint(Integrator):
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
-    Gauss' method of one stage, A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method, for
-    which torch has to be able to differentiate the acceleration. On a manifold by
-    the Cayley transform, with which a tumbling body in free fall keeps its energy and momentum exactly.
+    A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method with derivatives by torch. On a
+    manifold q+ = q exp(dt v_m).
     """
 
     space: ConfigurationSpace = VECTORS
@@ -317,65 +241,19 @@ class ImplicitMidpoint(Integrator):
         half = 0.5 * dt
 
         def moved(at: Tensor, share: float) -> Tensor:
-            return self.space.integrate(q, share * self.space.midpoint_step(dt * at))
+            return self.space.integrate(q, share * dt * at)
 
         def residual(at: Tensor) -> Tensor:
-            middle = moved(at, 0.5)
-            a = acceleration(middle, at)
-            if self.space.groups:
-                a = self.space.midpoint_acceleration(dt * at, a, acceleration(middle, torch.zeros_like(at)))
-            return at - v - half * a
+            return at - v - half * acceleration(moved(at, 0.5), at)
 
         middle, found = find_roots(residual, v)
         return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)
 
 
-@dataclass(frozen=True, eq=False)
-class Projected(Integrator):
-    """A RATTLE-like scheme of second order: after every step c(q) = 0 to 1e-12 m and A v = 0 to rounding.
-
-    Velocity Verlet whose position is projected onto c = 0 and whose velocity onto A v = 0, both along M^-1 A^T, as in
-    RATTLE (Andersen 1983; Hairer, Lubich & Wanner 2006, VII.1.4). As the accelerations may depend on v, the second one
-    is taken at the velocity that Euler's rule predicts. Two evaluations per step. A motion begins at the state nearest
-    to the given one that meets the constraint.
-    """
-
-    manifold: ConstraintManifold
-    space: ConfigurationSpace = VECTORS
-    failure = "no position on the surfaces of the contacts near the predicted one"
-
-    @override
-    def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        return self.manifold.project(q, v)
-
-    @override
-    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
-        a = acceleration(q, v)
-        at = self.manifold.project_position(self.space.integrate(q, dt * v + 0.5 * dt**2 * a))
-        # Where it failed, the step is refused anyway: go on from the old position, at which models can be asked.
-        reached = torch.where(at.converged[:, None], at.q, q)
-        predicted = torch.where(at.converged[:, None], self.manifold.project_velocity(at, v + dt * a), v)
-        later = acceleration(reached, predicted)
-        halfway = self.space.difference(q, at.q) / dt  # v + dt a / 2 and the impulse of the position's correction
-        v_next = self.manifold.project_velocity(at, halfway + 0.5 * dt * later)
-        return Step(at.q, v_next, a, at.converged)
-
-
-def _projected(model: Model) -> Projected:
-    switched = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
-    if switched:
-        raise InvalidInput(
-            f"integrator 'projected' holds all contacts at all times, and {', '.join(switched)} switch some of them; "
-            "use another integrator, or contacts without a switch."
-        )
-    return Projected(ConstraintManifold(model), model.robot.space)
-
-
-INTEGRATORS: dict[str, Callable[[Model], Integrator]] = {
-    "symplectic-euler": lambda model: SymplecticEuler(model.robot.space),
-    "rk4": lambda model: RungeKutta4(model.robot.space),
-    "implicit-midpoint": lambda model: ImplicitMidpoint(model.robot.space),
-    "projected": _projected,
+INTEGRATORS: dict[str, Callable[[ConfigurationSpace], Integrator]] = {
+    "symplectic-euler": SymplecticEuler,
+    "rk4": RungeKutta4,
+    "implicit-midpoint": ImplicitMidpoint,
 }
 """Integrators by the name that rollouts and the command line use."""
 
@@ -383,7 +261,7 @@ INTEGRATORS: dict[str, Callable[[Model], Integrator]] = {
 def integrator_named(name: str, model: Model) -> Integrator:
     """The integrator of that name for motions of `model`. Raises InvalidInput for any other name."""
     require_known("integrator", name, "forcegp", INTEGRATORS, cutoff=0.4)
-    return INTEGRATORS[name](model)
+    return INTEGRATORS[name](model.robot.space)
 
 
 def check_time_step(dt: Any) -> None:
@@ -395,3 +273,116 @@ def check_time_step(dt: Any) -> None:
 def _all(q: Tensor) -> Tensor:
     device = getattr(q, "device", None)  # expressions of CasADi, which take explicit steps, have none
     return torch.ones(q.shape[0], dtype=torch.bool, device=device)
+
+
+SPEED_LIMIT = 100.0
+"""A motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast."""
+
+
+Feedback = Callable[[int, Tensor, Tensor], Tensor]
+"""(k, q, v) -> what a controller adds to u[k], of the shape of u; asked once per step, at the state where it begins."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """n motions of T steps: q, v (T+1, n, nv), a (T, n, nv) at the beginning of each step.
+
+    `diverged_at` (n,) is the first row of q and v that is NaN, else -1; `not_found` those the integrator could not
+    carry on.
+    """
+
+    q: Float[Tensor, "rows n nq"]
+    v: Float[Tensor, "rows n nv"]
+    a: Float[Tensor, "steps n nv"]
+    diverged_at: Int[Tensor, " n"]
+    not_found: Bool[Tensor, " n"]
+
+
+def integrate(
+    integrator: Integrator,
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor],
+    q0: Float[Tensor, "n nq"],
+    v0: Float[Tensor, "n nv"],
+    u: Float[Tensor, "steps n nu"],
+    dt: float,
+    *,
+    feedback: Feedback | None = None,
+    what: str = "motions",
+) -> Trajectory:
+    """Carry n states through T steps of `dt` seconds; u[k] + feedback(k, q[k], v[k]) acts from row k to row k + 1.
+
+    A motion that is no longer finite, faster than `SPEED_LIMIT`, or that the integrator cannot carry on, is NaN from
+    there, and a NumericalWarning names `what`. `acceleration` and `feedback` see finite states only. Differentiable
+    in q0, v0, u and what `feedback` adds. InvalidInput for a dt that is no positive number or a start beyond the limit.
+    """
+    check_start(v0, dt)
+    q, v = q0, v0
+    steps, n = u.shape[:2]
+    rows_q, rows_v, rows_a = [q], [v], []  # stacked in the end, which keeps the graph where there is one
+    diverged_at = torch.full((n,), -1, dtype=torch.int64, device=q.device)
+    not_found = torch.zeros(n, dtype=torch.bool, device=q.device)
+    alive = torch.ones(n, dtype=torch.bool, device=q.device)
+    for k in range(steps):
+        forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
+        step = integrator.step(_at_finite_states(acceleration, q, v, forces), q, v, dt)
+        rows_a.append(torch.where(alive[:, None], step.a, math.nan))
+        bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
+        good = alive & bounded & step.found
+        if not bool(good.all()):
+            ended = alive & ~good
+            diverged_at[ended] = k + 1
+            not_found |= ended & ~step.found
+            alive = good
+        # A motion that has ended stays where it last was: there its acceleration can be computed.
+        q, v = torch.where(good[:, None], step.q, q), torch.where(good[:, None], step.v, v)
+        for rows, x in ((rows_q, q), (rows_v, v)):
+            rows.append(torch.where(good[:, None], x, math.nan))
+        if not bool(alive.any()):
+            for rows in (rows_q, rows_v, rows_a):
+                rows += [torch.full_like(rows[-1], math.nan)] * (steps - k - 1)
+            break
+    warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
+    return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at, not_found)
+
+
+def check_start(v0: Tensor, dt: float) -> None:
+    """Raise InvalidInput where `dt` is no positive number or a start is faster than the limit."""
+    check_time_step(dt)
+    if bool((v0.abs() > SPEED_LIMIT).any()):
+        raise InvalidInput(
+            f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
+            "m/s counts as diverged, check its units."
+        )
+
+
+def _at_finite_states(
+    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], q0: Tensor, v0: Tensor, u: Tensor
+) -> Acceleration:
+    """a(q, v) under u, which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
+
+    def guarded(q: Tensor, v: Tensor) -> Tensor:
+        finite = torch.isfinite(q).all(-1, keepdim=True) & torch.isfinite(v).all(-1, keepdim=True)
+        if bool(finite.all()):
+            return acceleration(q, v, u)
+        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)
+
+    return guarded
+
+
+def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, failure: str, dt: float, what: str) -> None:
+    """A NumericalWarning of those that ended."""
+    ended = diverged_at >= 0
+    if not bool(ended.any()):
+        return
+    first = int(diverged_at[ended].min())
+    lost = int(not_found.sum())
+    cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
+    if lost:
+        cause = failure + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")
+    warnings.warn(
+        f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
+        f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model with more physics "
+        "avoids this.",
+        NumericalWarning,
+        stacklevel=3,
+    )

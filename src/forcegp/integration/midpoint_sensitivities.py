@@ -1,21 +1,12 @@
 """Motions by the implicit midpoint rule, of many windows at once, with derivatives in start and parameters.
 
-With a step h and a constant u in each, the middle of a step obeys (`ImplicitMidpoint`)
-
-    v_m = v + h/2 a(q + h/2 v_m, v_m, u; p),    q+ = q + h v_m,    v+ = 2 v_m - v.
-
-Linearised at a guess (q_m, v_m) of the middle of every step, this is one affine recursion along each window,
+Linearised at a guess (q_m, v_m) of the middle of every step, the rule is one affine recursion along each window,
 
     (1 - h/2 a_v - h^2/4 a_q) v_m = v + h/2 (a - a_q (q_m - q) - a_v v_m + a_p dp)    (right side at the guess),
 
-whose pass gives new guesses of all middles, and the derivatives of the motion in its start and in p as well. Repeated,
-it is Newton's method on all steps of all windows at once (the lifted or multiple-shooting method of Bock & Plitt 1984;
-Albersmeyer & Diehl, "The lifted Newton method", SIAM J. Optim. 2010): accelerations are asked for all steps together,
-and a motion that explicit steps would lose is found, because the guess comes from a recording.
-
-Where a base moves, q+ = q exp(m(h v_m)), with the acceleration that belongs to this step (`midpoint_step`,
-`midpoint_acceleration`). Positions then follow from the guessed v_m exactly, and the recursion runs over steps from
-them in body axes: those at the end of a step are X dq + Y dv_m, those at its middle alike, with the exact derivatives.
+which is Newton's method on all steps of all windows at once when repeated (lifted: Bock & Plitt 1984; Albersmeyer &
+Diehl, SIAM J. Optim. 2010). Where a base moves, positions follow from the guessed v_m exactly, and the recursion runs
+over steps from them in body axes.
 """
 
 from collections.abc import Callable
@@ -35,10 +26,7 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Accelerations (n, nv) at states, and derivatives in q, v (n, nv, nv) and parameters (n, nv, P).
-
-    Where a base moves, the derivative in q is that in a step from there.
-    """
+    """Accelerations (n, nv), and derivatives in q, or a step from there, v (n, nv, nv) and parameters (n, nv, P)."""
 
     a: Float[Tensor, "*n nv"]
     a_q: Float[Tensor, "*n nv nv"]
@@ -48,10 +36,7 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Accelerations:
-    """The accelerations of states (q, v, u), each (n, nv), which torch can differentiate, and their `Linear`.
-
-    `linear` is asked with and without derivatives in the parameters; `space` is that of q.
-    """
+    """Accelerations (n, nv) of states (q, v, u), differentiable, and their `Linear`, with or without parameters."""
 
     mean: Callable[[Tensor, Tensor, Tensor], Tensor]
     linear: Callable[[Tensor, Tensor, Tensor, bool], Linear]
@@ -62,8 +47,7 @@ class Accelerations:
 class WindowMotions:
     """Motions of K windows of T steps: states, the middles of the steps, whether Newton's method found them.
 
-    `in_start` and `in_parameters` are the derivatives of q in (q_0, v_0) and in p; where a base moves, of steps from q
-    in steps from q_0.
+    `in_start` and `in_parameters` are derivatives of q, or of steps from it, in (q_0, v_0) and in p.
     """
 
     q: Float[Tensor, "K rows nq"]
@@ -88,8 +72,7 @@ def window_motions(
 ) -> WindowMotions:
     """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
 
-    Where a base moves, a guess of the middle velocities is enough, and the positions are not looked at. Windows that
-    `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
+    Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
     found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
@@ -124,7 +107,7 @@ def _step_by_step(
         moved = ImplicitMidpoint(space).step(lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
         ended &= moved.found
         middle = torch.where(ended[:, None], 0.5 * (v + moved.v), v)  # the others only stay finite
-        step = space.midpoint_step(h * middle)
+        step = h * middle
         positions.append(space.integrate(q, 0.5 * step))
         velocities.append(middle)
         q, v = space.integrate(q, step), 2.0 * middle - v
@@ -143,41 +126,26 @@ def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameter
 def _along(
     accelerations: Accelerations, q0: Tensor, u: Tensor, w: Tensor, h: float, parameters: bool
 ) -> tuple[Tensor, Tensor, Linear, Tensor, Tensor]:
-    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations of the steps, X and Y (K, T, ...).
+    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations, X and Y (K, T, ...).
 
     Derivatives of these accelerations are in the step from where a step begins and in its w.
     """
-    space, nv = accelerations.space, w.shape[-1]
-    steps, path = space.midpoint_step(h * w), [q0]
-    for step in steps.unbind(1):
-        path.append(space.integrate(path[-1], step))
+    space, nv, path = accelerations.space, w.shape[-1], [q0]
+    for at in w.unbind(1):
+        path.append(space.integrate(path[-1], h * at))
     q = torch.stack(path, dim=1)
-    start, end, middle = q[:, :-1], q[:, 1:], space.integrate(q[:, :-1], 0.5 * steps)
+    start, end, middle = q[:, :-1], q[:, 1:], space.integrate(q[:, :-1], 0.5 * h * w)
 
     def moved(z: Tensor) -> Tensor:
-        at, step = space.integrate(start, z[..., :nv]), space.midpoint_step(h * (w + z[..., nv:]))
-        ends = (
-            space.difference(middle, space.integrate(at, 0.5 * step)),
-            space.difference(end, space.integrate(at, step)),
-        )
-        return torch.cat(ends, dim=-1)
-
-    def accelerated(z: Tensor) -> Tensor:
-        at, a, still = z.split(nv, dim=-1)
-        return space.midpoint_acceleration(h * at, a, still)
+        at, step = space.integrate(start, z[..., :nv]), h * (w + z[..., nv:])
+        halfway = space.difference(middle, space.integrate(at, 0.5 * step))
+        return torch.cat([halfway, space.difference(end, space.integrate(at, step))], dim=-1)
 
     _, slopes = _jacobian(moved, w.new_zeros(*w.shape[:2], 2 * nv), 2 * nv)
     half, whole = slopes.split(nv, dim=-2)
-    both = _at(accelerations, torch.cat([middle] * 2), torch.cat([w, 0.0 * w]), torch.cat([u] * 2), parameters)
-    parts = ([None] * 2 if x is None else x.chunk(2) for x in (both.a, both.a_q, both.a_v, both.a_p))
-    fast, still = (Linear(*each) for each in zip(*parts, strict=True))
-    a, slopes = _jacobian(accelerated, torch.cat([w, fast.a, still.a], dim=-1), nv)
-    of_w, of_fast, of_still = slopes.split(nv, dim=-1)
-    at_middle = of_fast @ fast.a_q + of_still @ still.a_q
-    a_q, a_w = (at_middle @ part for part in half.split(nv, dim=-1))
-    a_p = None if fast.a_p is None or still.a_p is None else of_fast @ fast.a_p + of_still @ still.a_p
-    at = Linear(a, a_q, a_w + of_w + of_fast @ fast.a_v, a_p)
-    return q, middle, at, whole[..., :nv], whole[..., nv:]
+    at = _at(accelerations, middle, w, u, parameters)
+    a_q, a_w = (at.a_q @ part for part in half.split(nv, dim=-1))
+    return q, middle, Linear(at.a, a_q, a_w + at.a_v, at.a_p), whole[..., :nv], whole[..., nv:]
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], x: Tensor, size: int) -> tuple[Tensor, Tensor]:

@@ -3,8 +3,7 @@ from .gauss_principle import (
     State as State, fixed_frame as fixed_frame, fixed_point as fixed_point,
 )
 from .constraints import LoopClosure as LoopClosure, loop_frame as loop_frame, loop_point as loop_point
-from .constraints import RollingContact as RollingContact, rolling as rolling
 from .surfaces import (
-    Cylinder as Cylinder, Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
+    Held as Held, ImplicitSurface as ImplicitSurface, Plane as Plane, Sphere as Sphere,
     Surface as Surface, surface_axes as surface_axes,
 )

@@ -3,9 +3,8 @@
     M a = Q + Q_I,  A a = b   gives   a = M^-1 Q_b + H Q,   lambda = (A M^-1 A^T)^+ (b - A M^-1 Q),   Q_I = A^T lambda
     H = M^-1 - M^-1 A^T (A M^-1 A^T)^+ A M^-1,   Q_b = A^T (A M^-1 A^T)^+ b
 
-(Udwadia & Kalaba 1992; Rath et al. 2021, eqs. 2-4.) With the Cholesky factor M = L L^T and A~ = A L^-T everything is
-read from the one small pseudo-inverse A~^+, which also covers redundant constraints: (A M^-1 A^T)^+ = (A~^+)^T A~^+ and
-H = L^-T (I - A~^+ A~) L^-1. The condition number is that of A~, not its square.
+(Udwadia & Kalaba 1992; Rath et al. 2021, eqs. 2-4), from the pseudo-inverse of A~ = A L^-T with M = L L^T, redundant
+constraints included: (A M^-1 A^T)^+ = (A~^+)^T A~^+, H = L^-T (I - A~^+ A~) L^-1.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,8 +58,7 @@ def placed(
 class Contact:
     """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
 
-    `point` is given in m in the axes of the link frame `frame`. With a `switch` the constraint acts only in rows whose
-    input of that name, a last column of u, is 1, and not where it is 0: the stance of a foot.
+    `point` is in m in the link frame `frame`. With a `switch` it acts in rows whose input of that name is 1, not 0.
     """
 
     frame: str
@@ -73,8 +71,7 @@ class Contact:
             raise InvalidInput(f"Contact frame is {self.frame!r}; give the name of a link.")
         if not isinstance(self.surface, Surface):
             raise InvalidInput(
-                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, Cylinder, "
-                "ImplicitSurface ..."
+                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, ImplicitSurface ..."
             )
         if self.switch is not None and not (isinstance(self.switch, str) and self.switch):
             raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")
@@ -116,8 +113,7 @@ class Contact:
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
-        b = -A' v - 2 zeta omega A v - omega^2 c: the second time derivative of s(p(q)) = 0 (Rath et al. 2021,
-        section 2).
+        b = -A' v - 2 zeta omega A v - omega^2 c (Rath et al. 2021, section 2).
         """
         c, A, gradient, drift = self.row(state.kinematics, state.v)
         assert drift is not None, "velocities are given"
@@ -141,10 +137,9 @@ def fixed_point(
 
 
 def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tuple[Contact, ...]:
-    """A link that neither moves nor turns, such as a flat foot: three of its points are held.
+    """A link that neither moves nor turns, such as a flat foot: its origin and points `size` m along x and y are held.
 
-    The points are its origin and those `size` m along its x and y axes. Of these nine constraints six are independent
-    in every position, and redundant ones are legal: the multipliers are the smallest that hold it.
+    Of these nine constraints six are independent, which is legal: the multipliers are the smallest that hold it.
     """
     points = ((0.0, 0.0, 0.0), (size, 0.0, 0.0), (0.0, size, 0.0))
     return tuple(contact for point in points for contact in fixed_point(frame, point, switch))
@@ -152,10 +147,9 @@ def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tup
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Positions, velocities and inputs of equal batch, and the inertial parameters that hold there.
+    """Positions, velocities and inputs of equal batch, and the standard parameters of `bodies` (None: the robot's).
 
-    `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators: u itself where each
-    joint has one. `bodies` are standard parameters of the bodies (`Kinematics.torque_regressor`); None: the robot's.
+    `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators.
     """
 
     q: Float[Tensor, "*batch nq"]
@@ -239,9 +233,8 @@ class AffineMap(NamedTuple):
 class ConstrainedDynamics:
     """The dynamics at a batch of states, affine in the joint forces that are still unknown.
 
-    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_K` (..., nv); `normals` (..., m, 3) are the
-    surface gradients s_p, so that the contact force on the robot in N is s_p^T lambda. `state` holds (q, v, u)
-    themselves, `contacts` what the rows of A belong to (none for a constraint that was given as a matrix).
+    `A` (..., m, nv), `b` (..., m), `M`, `H` (..., nv, nv), `Q_K` (..., nv); `normals` (..., m, 3) are gradients s_p, so
+    that the contact force on the robot in N is s_p^T lambda. `contacts` are what the rows of A belong to.
     """
 
     state: State
@@ -267,10 +260,7 @@ class ConstrainedDynamics:
         Q_K: Float[Tensor, "*batch nv"],
         contacts: tuple[Contact, ...] = (),
     ) -> "ConstrainedDynamics":
-        """Gauss' principle for M (..., nv, nv) and A a = b.
-
-        Raises NumericalError when M is not positive definite or A is not finite.
-        """
+        """Gauss' principle for M and A a = b. NumericalError where M is not positive definite or A not finite."""
         identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
         inverse_lower = factors(M)[1]
         A_white = A @ inverse_lower.mT

@@ -1,9 +1,7 @@
-"""Surfaces s(p) = 0 that a point of the robot can be held on.
+"""Surfaces s(p) = 0 that a point of the robot can be held on, with derivatives; p (..., 3) in m, world axes.
 
-A surface returns its value, gradient and Hessian at points p (..., 3) in m, world axes. The built-in surfaces are
-signed distances, so their gradient is a unit normal and the multiplier of a contact is the normal force in N. A new
-surface is one subclass of `Surface` that defines `value`; the derivatives follow by autograd unless it defines them. To
-be stored with a dataset or a model it also needs an entry in `SURFACES` and plain numbers as its fields.
+The built-in ones are signed distances, so a multiplier is the normal force in N. One of your own is a subclass with
+`value`; to be stored it needs an entry in `SURFACES` and plain numbers as its fields.
 """
 
 import math
@@ -24,10 +22,7 @@ Kind = TypeVar("Kind")
 
 
 def object_from_dict(what: str, registry: Mapping[str, type[Kind]], stored: object) -> Kind:
-    """The object that `stored` describes, its lists as tuples; `what` names its kind in messages.
-
-    Raises FileFormatError for anything but a mapping, an unknown type or wrong fields.
-    """
+    """The object that `stored` describes, lists as tuples; FileFormatError for anything else than a `what`."""
     if not isinstance(stored, Mapping):
         raise FileFormatError(f"a stored {what} is {stored!r}; expected an object with a type")
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
@@ -99,10 +94,7 @@ class Plane(_Flat):
 
 @dataclass(frozen=True)
 class Held(_Flat):
-    """No place but a direction: a point on it does not move along `normal`, wherever it stands.
-
-    Its value is 0 everywhere, so nothing pulls the point back, and the multiplier is the force along `normal` in N.
-    """
+    """A direction `normal` along which a point does not move, wherever it stands: its value is 0 everywhere."""
 
     normal: Vector
 
@@ -114,34 +106,8 @@ class Held(_Flat):
         return torch.zeros_like(p[..., 0])
 
 
-class _Round(Surface):
-    """All points at distance `radius` from a centre or an axis."""
-
-    radius: float
-
-    @abstractmethod
-    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """The ray to p from the nearest point there, and its derivative d ray / dp, a projector."""
-
-    @override
-    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return torch.linalg.vector_norm(self._radial(p)[0], dim=-1) - self.radius
-
-    @override
-    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        ray = self._radial(p)[0]
-        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
-
-    @override
-    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-        ray, projector = self._radial(p)  # (projector - n n^T) / |ray|
-        distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
-        normal = ray[..., None] / distance
-        return (projector - normal @ normal.mT) / distance
-
-
 @dataclass(frozen=True)
-class Sphere(_Round):
+class Sphere(Surface):
     """The sphere |p - center| = radius; the normal points outwards."""
 
     center: Vector
@@ -152,36 +118,26 @@ class Sphere(_Round):
         object.__setattr__(self, "radius", positive("Sphere radius", self.radius))
 
     @override
-    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        return p - _tensor(self.center, p), torch.eye(3, dtype=p.dtype, device=p.device)
-
-
-@dataclass(frozen=True)
-class Cylinder(_Round):
-    """All points at distance `radius` from the line through `point` along `axis`; the normal points outwards."""
-
-    point: Vector
-    axis: Vector
-    radius: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", direction("Cylinder axis", self.axis)[0])
-        object.__setattr__(self, "point", _vector("Cylinder point", self.point))
-        object.__setattr__(self, "radius", positive("Cylinder radius", self.radius))
+    def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1) - self.radius
 
     @override
-    def _radial(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        axis = _tensor(self.axis, p)
-        projector = torch.eye(3, dtype=p.dtype, device=p.device) - torch.outer(axis, axis)
-        return (p - _tensor(self.point, p)) @ projector, projector
+    def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        ray = p - _tensor(self.center, p)
+        return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+
+    @override
+    def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+        normal = self.gradient(p)[..., None]  # (1 - n n^T) / |ray|
+        distance = torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1)[..., None, None]
+        return (torch.eye(3, dtype=p.dtype, device=p.device) - normal @ normal.mT) / distance
 
 
 @dataclass(frozen=True)
 class ImplicitSurface(Surface):
     """s(p) = function(p) for any twice differentiable `function` of one point (3,) -> scalar, written in torch.
 
-    The multiplier of a contact is then the normal force divided by |s_p|. A function cannot be stored in a file (files
-    never carry code): a subclass of `Surface` with numbers as fields can.
+    The multiplier of a contact is the normal force divided by |s_p|. Files never carry code, so it cannot be stored.
     """
 
     function: Callable[[Tensor], Tensor] = field(compare=True)
@@ -202,7 +158,7 @@ class ImplicitSurface(Surface):
         return value
 
 
-SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder, "held": Held}
+SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "held": Held}
 """Surfaces that files can carry, by the name they have there."""
 
 
@@ -244,10 +200,7 @@ def _vector(name: str, values: object) -> Vector:
 
 
 def direction(name: str, values: object) -> tuple[Vector, float]:
-    """The unit vector along three numbers, and their length.
-
-    The length is 1 where it is so already up to rounding, so that storing changes nothing.
-    """
+    """The unit vector along three numbers, unchanged where it is one up to rounding, and their length."""
     entries = _vector(name, values)
     length = math.hypot(*entries)
     if not 0.0 < length < math.inf:
@@ -264,9 +217,8 @@ TURNED_OVER = -0.9
 def surface_axes(gradients: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Columns t1, t2, n of the rotation that turns the world's z axis the shortest way onto the normal n.
 
-    `gradients` are surface gradients of any positive length. On a table the tangents are x and y; they vary smoothly
-    with the normal wherever it does not point nearly straight down (there they start from -z, and t2 is -y). With
-    axis w = z x n and c = n_z, the rotation is I + [w] + [w]^2 / (1 + c) (Rodrigues' formula).
+    `gradients` have any positive length. On a table the tangents are x and y; they are smooth but where n points nearly
+    straight down (from -z there, and t2 is -y): I + [w] + [w]^2 / (1 + c) with w = z x n, c = n_z (Rodrigues' formula).
     """
     n = gradients / torch.linalg.vector_norm(gradients, dim=-1, keepdim=True)
     down = n[..., 2] < TURNED_OVER

@@ -1,8 +1,9 @@
 from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
 from .prediction import Components as Components, Curve as Curve, ForceComponent as ForceComponent
-from .estimates import Estimate as Estimate, Estimates as Estimates
-from .motion_intervals import HORIZONS as HORIZONS, MotionIntervals as MotionIntervals
+from .fitted import (
+    HORIZONS as HORIZONS, Estimate as Estimate, Estimates as Estimates, MotionIntervals as MotionIntervals,
+)
 from .observed_wrench import observing as observing
 from .posterior import Posterior as Posterior
 from .prediction import Linearization as Linearization, Gaussian as Gaussian, Prediction as Prediction

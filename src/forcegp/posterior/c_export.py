@@ -1,8 +1,4 @@
-"""A fitted model as C99 that needs nothing but <math.h>: `export_c`.
-
-The program is that of a compiled predictor (`programs`) for one state, with its tables inside as constants; what
-is written is compiled and compared with `posterior.predict` before the folder appears.
-"""
+"""A fitted model as C99 that needs nothing but <math.h>, compiled and compared with `predict` before it appears."""
 
 import ctypes
 import importlib.metadata
@@ -224,10 +220,7 @@ SUFFIXES = {"covariance": "mean_covariance"}
 
 @dataclass(frozen=True)
 class CExport:
-    """What `export_c` wrote: bytes by file, and how far each function is from `predict`, relative to the largest value.
-
-    `differences` is empty where nothing was compared. `inflation` is how much wider standard deviations are at most.
-    """
+    """What `export_c` wrote: bytes by file, and the relative difference of each function from `predict`."""
 
     name: str
     folder: Path
@@ -250,21 +243,13 @@ def export_c(
 ) -> CExport:
     """Write the model as C99 to a new folder: NAME.c, NAME.h, an example, a self-test, CMake, forms for CasADi, acados.
 
-    Parameters
-    ----------
-    covariance: with NAME_mean_covariance, whose covariance is the compressed one of `posterior.predictor()`.
-    jacobian: with NAME_linearize, and NAME_step_jacobian if there are steps.
-    steps: with NAME_step, a step of so many seconds by the `integrator`, "symplectic-euler", "rk4" or
-        "implicit-midpoint".
-    name: of files and functions, made a C identifier; None: that of the robot.
-    source: what the header names as the model's origin.
-    unchecked: do not compile and compare.
+    `covariance` adds NAME_mean_covariance (the compressed one), `jacobian` NAME_linearize, `steps` NAME_step of so many
+    seconds by the `integrator` ("symplectic-euler", "rk4", "implicit-midpoint") and its Jacobian; a base that moves
+    adds NAME_integrate, and derivatives in a step from q. `name` of files and functions is by default the robot's,
+    `source` what the header names as the model's origin; `unchecked` neither compiles nor compares.
 
-    A robot whose base moves has NAME_integrate, too, and derivatives in a step from q.
-
-    Raises InvalidInput for another kind of model, measured torques, a prior that cannot be exported, a covariance where
-    the engine has none to compress, steps that are no positive number, another integrator, and a folder that has files;
-    CompilerError where the compiler fails, NumericalError where the program and `predict` differ, OSError.
+    Raises InvalidInput for what cannot be exported and a folder that has files, CompilerError where the compiler fails,
+    NumericalError where the program and `predict` differ, OSError.
     """
     require_type("posterior", posterior, Posterior)
     posterior = posterior.to("cpu") if posterior.training.q.device.type != "cpu" else posterior

@@ -1,8 +1,7 @@
 """A posterior as a CasADi function, with all derivatives: for do-mpc, acados, IPOPT, and CasADi's own C.
 
-The graph that programs are written from (`programs`) becomes scalar expressions (SX); sums over centres become
-products of matrices (MX), whose size does not grow with the derivatives. CasADi is an extra (LGPL): it is imported here
-and only here.
+The graph of programs becomes scalar expressions (SX), sums over centres products of matrices (MX), whose size does not
+grow with derivatives. CasADi is an extra (LGPL), imported here only.
 """
 
 import math
@@ -41,14 +40,10 @@ def casadi_function(
 ) -> Any:
     """The mean acceleration as a `casadi.Function` (q, v, u) -> a, (nq,), (nv,), (nu,) -> (nv,) in units of `predict`.
 
-    With `steps` instead (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`:
-    "symplectic-euler", "rk4" or "implicit-midpoint", whose step is solved by CasADi's Newton method. Where a base moves
-    steps are explicit, a second result of the acceleration is q_dot (nq,), and quaternions count as their directions.
-
-    Differentiable as CasADi functions are (`jacobian`, `hessian`, `generate`, `map`, ...); no compiler is needed. In
-    `name`, that of the function, what CasADi does not take is replaced.
-    Raises MissingExtra without CasADi, InvalidInput for other models than structured ones, for operations that no
-    graph holds, steps that are no positive number, and other integrators.
+    With `steps` (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`: "symplectic-euler",
+    "rk4", or "implicit-midpoint" by CasADi's Newton method. Where a base moves steps are explicit, a second result of
+    the acceleration is q_dot (nq,), and quaternions count as their directions. Raises MissingExtra without CasADi,
+    InvalidInput for operations that no graph holds, steps that are no positive number, and other integrators.
     """
     casadi: Any = required_extra("casadi", "casadi", "casadi_function")
     require_type("posterior", posterior, Posterior)
@@ -80,8 +75,8 @@ def export_casadi(
 ) -> dict[str, float]:
     """Write NAME.casadi, and with `steps` NAME_step.casadi, to a folder, for `casadi.Function.load`.
 
-    Returns the largest difference from `predict` (a predictor's `step`) at states around the training data, relative to
-    the largest value, by file. Raises as `casadi_function`, and NumericalError where they differ.
+    Returns the largest relative difference from `predict` (a predictor's `step`) around the training data by file.
+    Raises as `casadi_function`, and NumericalError where they differ.
     """
     called = identifier(name or posterior.model.robot.name)
     functions = {called: casadi_function(posterior, name=called)}

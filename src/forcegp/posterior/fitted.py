@@ -1,15 +1,29 @@
-"""`Fitted`: what a fit has found, which rows it knows, and how well it predicts those that are left out."""
+"""What a fit has found: `Estimates` of numbers, `MotionIntervals`, and `Fitted`.
 
-from collections.abc import Mapping
+Covariances of estimates are a block jackknife over stretches of the log (Kuensch 1989), by one step of the search, so
+that errors that last count, and what the prior leaves open of what the log does not show:
+
+    (K - 1) / K sum_k d_k d_k^T + F^-1 G F^-1,    F = J^T J + G
+
+with the prior's information G and the changes d_k about their mean. The half width of joint j at horizon h is
+c_hj 1.96 sqrt(s_hj^2 + r_hj^2), with the spread s of sampled functions (0 without), the rms r of errors, and c_hj that
+makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.stats import t as student
 from torch import Tensor
 from typing_extensions import override
 
+from forcegp.errors import UnknownName, require_known
+from forcegp.evidence.identifiability import BaseParameters
 from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.training_data import TrainingData
 from forcegp.forces import IndependentAccelerations, JointAccelerations, JointForces
@@ -23,9 +37,262 @@ from forcegp.inference import (
 )
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
-from forcegp.posterior.estimates import Estimates
-from forcegp.posterior.motion_intervals import MotionIntervals
-from forcegp.summary import Summary, rounded
+from forcegp.summary import Summary, listed, rounded
+
+STRETCHES = 20
+"""Of time; residuals of different ones count as independent."""
+REACH = float(student.ppf(0.975, STRETCHES - 1))
+"""Standard deviations from the estimate to the ends of its 95 % interval."""
+HELD = 0.5
+"""A number whose standard deviation is above this fraction of its prior's is one that the log does not decide."""
+SEEN = 1.0
+"""Information of the log about a coordinate, in that of its prior, below which the rows do not show it at all."""
+NAMED = 0.3
+"""Correlation from which on another number is named as one that does the same."""
+
+Decider = Literal["log", "prior"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One number: value and std in `unit`, its start and prior std, and what decides it, with the reason."""
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    start: float
+    prior_std: float
+    decided_by: Decider
+    why: str
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Of 95 %, including what the log leaves open."""
+        return self.value - REACH * self.std, self.value + REACH * self.std
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {**vars(self), "interval_95": list(self.interval)}
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        doubt = "" if self.decided_by == "log" else f" (the prior decides: {self.why})"
+        return f"{self.value:.4g} ± {REACH * self.std:.2g}{unit}{doubt}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimates(Summary, Mapping[str, Estimate]):
+    """The numbers that a fit estimated, by name: `estimates["payload.mass"].value`; `settled` if the search converged.
+
+    `covariance` (n, n) is that of all values, in SI units; `open_directions` are combinations that the prior decides.
+    """
+
+    entries: tuple[Estimate, ...] = ()
+    covariance: Float[np.ndarray, "n n"] | None = None
+    open_directions: tuple[str, ...] = ()
+    by_body: Mapping[str, int] | None = None
+    """Of ten directions of each body, how many the prior decides, where it decides any."""
+    base: BaseParameters | None = None
+    """Base parameters of the recorded motion, where all bodies were estimated."""
+    evidence: str = ""
+    rows: int = 0
+    evaluations: int = 0
+    settled: bool = True
+    thickened: tuple[str, ...] = ()
+    """Links that were lines, plates or points, and got some thickness."""
+
+    @override
+    def __getitem__(self, name: str) -> Estimate:
+        require_known("parameter", name, "this fit", list(self), UnknownName)
+        return self._by_name[name]
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    @override
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Estimate]:
+        return {each.name: each for each in self.entries}
+
+    @override
+    def facts(self) -> dict[str, object]:
+        """The first estimates, and what the log leaves open."""
+        values = [f"{each.name} {each}" for each in self.entries]
+        return {
+            "estimated": listed(values, most=6),
+            "from": f"{self.rows} rows, {self.evidence}",
+            "decided by the prior": listed(each.name for each in self.entries if each.decided_by == "prior"),
+            "converged": self.settled,
+        }
+
+    @property
+    def total_mass(self) -> tuple[float, float]:
+        """Of all bodies that were estimated, and its standard deviation in kg."""
+        own = [k for k, each in enumerate(self.entries) if each.name.endswith(".mass")]
+        assert self.covariance is not None, "there are estimates"
+        variance = float(self.covariance[np.ix_(own, own)].sum())
+        return sum(self.entries[k].value for k in own), max(variance, 0.0) ** 0.5
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON values."""
+        return {
+            "parameters": {each.name: each.to_dict() for each in self.entries},
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "open_directions": list(self.open_directions),
+            "by_body": None if self.by_body is None else dict(self.by_body),
+            "base_parameters": None if self.base is None else list(self.base.expressions),
+            "condition_number": None if self.base is None else self.base.condition,
+            **{name: getattr(self, name) for name in ("evidence", "rows", "evaluations", "settled")},
+            "thickened": list(self.thickened),
+        }
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Estimates":
+        """What `to_dict` gave, without base parameters."""
+        known = Estimate.__dataclass_fields__
+        entries = tuple(Estimate(**{k: v for k, v in x.items() if k in known}) for x in stored["parameters"].values())
+        covariance = None if stored["covariance"] is None else np.array(stored["covariance"], dtype=np.float64)
+        kept: dict[str, Any] = {
+            name: stored[name] for name in ("by_body", "evidence", "rows", "evaluations", "settled")
+        }
+        kept |= {name: tuple(stored[name]) for name in ("open_directions", "thickened")}
+        return cls(entries, covariance, **kept)
+
+    @classmethod
+    def of_search(
+        cls,
+        parameters: Sequence[Any],
+        values: Float[np.ndarray, " n"],
+        slopes: Float[np.ndarray, "n k"],
+        white: Float[np.ndarray, "N k+1"],
+        stretches: Sequence[np.ndarray],
+        prior: Float[np.ndarray, "k k"],
+        **more: Any,
+    ) -> "Estimates":
+        """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
+
+        `slopes` are derivatives of the values in the coordinates. Without stretches the covariance is F^-1.
+        """
+        J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
+        information = J.T @ J
+        whole, root = information + G, np.linalg.inv(np.linalg.cholesky(G)).T
+        moved = []
+        for at in stretches:
+            own = J[at]
+            # in coordinates in which the prior is the identity, what is left has eigenvalues of 1 at least
+            sizes, vectors = np.linalg.eigh(root.T @ (whole - own.T @ own) @ root)
+            turned = root @ vectors
+            moved.append(turned @ ((turned.T @ (own.T @ r[at])) / np.maximum(sizes, 1.0)))
+        covariance = None
+        if moved:
+            apart, count = np.stack(moved) - np.mean(moved, axis=0), len(moved)
+            unseen = np.linalg.solve(whole, np.linalg.solve(whole, G).T)
+            covariance = (count - 1) / count * apart.T @ apart + unseen
+        given = parameters, values, slopes, np.linalg.inv(whole), prior
+        return cls.of_covariance(*given, covariance=covariance, **more)
+
+    @classmethod
+    def of_covariance(
+        cls,
+        parameters: Sequence[Any],
+        values: Float[np.ndarray, " n"],
+        slopes: Float[np.ndarray, "n k"],
+        inverse: Float[np.ndarray, "k k"],
+        prior: Float[np.ndarray, "k k"],
+        covariance: Float[np.ndarray, "k k"] | None = None,
+        **more: Any,
+    ) -> "Estimates":
+        """From F^-1, the inverse of all information; `covariance` is that of the coordinates, if another."""
+        G = prior.T @ prior
+        information = np.linalg.inv(inverse) - G
+        spread = slopes @ (inverse if covariance is None else covariance) @ slopes.T
+        std = np.sqrt(np.maximum(spread.diagonal(), 0.0))
+        a_priori = slopes @ np.linalg.solve(G, slopes.T)
+        prior_std = np.sqrt(np.maximum(a_priori.diagonal(), 0.0))
+        posterior = slopes @ inverse @ slopes.T
+        size = np.sqrt(np.maximum(posterior.diagonal(), 1e-300))
+        alike = abs(posterior / np.outer(size, size))
+        np.fill_diagonal(alike, 0.0)
+        shown = (slopes @ np.linalg.solve(G, information @ np.linalg.solve(G, slopes.T))).diagonal()
+        names, entries = [each.name for each in parameters], []
+        for k, each in enumerate(parameters):
+            held = size[k] > HELD * prior_std[k]
+            other = int(alike[k].argmax()) if len(alike) > 1 else k
+            if not held:
+                why = "its rows show it"
+            elif shown[k] < SEEN * prior_std[k] ** 2:
+                why = "no row shows it"
+            elif alike[k, other] >= NAMED:
+                why = f"rows show it only together with {names[other]}"
+            else:
+                why = "rows show it only together with others"
+            numbers = float(values[k]), float(std[k]), each.start, float(prior_std[k])
+            entries.append(Estimate(each.name, each.unit, *numbers, "prior" if held else "log", why))
+        return cls(tuple(entries), spread, _open_directions(information, prior, slopes, names), **more)
+
+
+def _open_directions(
+    information: np.ndarray, prior: np.ndarray, slopes: np.ndarray, names: Sequence[str]
+) -> tuple[str, ...]:
+    """Combinations of numbers, in their prior deviations, of which the log holds less than the prior; worst first."""
+    root = np.linalg.inv(np.linalg.cholesky(prior.T @ prior)).T  # a body of which some parts are open has more rows
+    values, vectors = np.linalg.eigh(root.T @ information @ root)
+    out = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value >= 1.0:
+            break
+        change = slopes @ (root @ vector)
+        scale = np.sqrt(np.maximum(((slopes @ root) ** 2).sum(1), 1e-300))
+        share = change / scale
+        main = [k for k in np.argsort(-abs(share)) if abs(share[k]) >= 0.5 * abs(share).max()][:3]
+        sign = 1.0 if share[main[0]] > 0 else -1.0
+        text = " ".join(f"{'-' if sign * change[k] < 0 else '+'} {abs(change[k]):.2g} {names[k]}" for k in main)
+        out.append(text.removeprefix("+ "))
+    return tuple(out)
+
+
+HORIZONS = (0.1, 0.25, 0.5, 1.0)  # s, by default
+DEVIATIONS = 1.959963984540054  # of a normal distribution, which hold 95 % of it
+
+
+@dataclass(frozen=True, eq=False)
+class MotionIntervals:
+    """Widths by horizon [s] of q (or steps from it) and v: `rms`, and `factors` with samples and without."""
+
+    horizons: Float[np.ndarray, " H"]
+    rms: Float[np.ndarray, "H 2 nv"]
+    factors: Float[np.ndarray, "2 H 2 nv"]
+    inputs: tuple[str, ...] = ()
+
+    def half_width(self, quantity: str, time: Tensor, spread: Tensor | None) -> Float[Tensor, "*batch rows nv"]:
+        """Of the 95 % interval; `spread` is the standard deviation of samples (..., T+1, nv)."""
+        kind = ("q", "v").index(quantity)
+        rms, factor = self.rms[:, kind], self.factors[int(spread is None), :, kind]
+        at = time.cpu().numpy()
+        ends = np.array([0.0, *self.horizons])
+        # beyond the last horizon errors go on as they grew
+        beyond = np.maximum(at / self.horizons[-1], 1.0)[:, None]
+        r = np.stack([np.interp(at, ends, [0.0, *each]) for each in rms.T], axis=-1) * beyond
+        c = np.stack([np.interp(at, self.horizons, each) for each in factor.T], axis=-1)
+        r, c = (torch.as_tensor(x, device=time.device) for x in (r, c))
+        return DEVIATIONS * c * (r if spread is None else (spread.square() + r.square()).sqrt())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        arrays = {name: getattr(self, name).tolist() for name in ("horizons", "rms", "factors")}
+        return arrays | {"inputs": list(self.inputs)}
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
+        """What `to_dict` gave."""
+        arrays = {name: np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors")}
+        return cls(**arrays, inputs=tuple(stored.get("inputs", ())))
+
 
 AnyFitted = TypeVar("AnyFitted", bound="Fitted")  # beartype cannot check Self where a module is hooked
 
@@ -34,10 +301,9 @@ AnyFitted = TypeVar("AnyFitted", bound="Fitted")  # beartype cannot check Self w
 class Fitted(Summary):
     """a = M^-1 Q_b + H (Q_K + B f) + noise, f ~ GP (Rath et al. 2021, eqs. 6-7), conditioned on a log by `forcegp.fit`.
 
-    `trained` is the model with the numbers that were found; `hyperparameters` are those of kernels and noise by name;
-    `estimates` the numbers of laws and bodies (`parameters`); `settings` is the resolved configuration of the fit
-    (plain JSON values), with at least `points` (training rows), `seed` and `data` (metadata and episodes of the
-    training data); `result` is the history of the search and why it ended.
+    `trained` is the model with the numbers that were found, `hyperparameters` those of kernels and noise by name,
+    `estimates` those of laws and bodies; `settings` is the resolved configuration (JSON values; `points`, `seed`,
+    `data`); `result` the history of the search.
     """
 
     trained: Model
@@ -75,11 +341,7 @@ class Fitted(Summary):
         solution: Tensor | None = None,
         estimates: Estimates | None = None,
     ) -> AnyFitted:
-        """The posterior at given hyper-parameters, without a search: what a stored one is loaded with.
-
-        `engine` computes it, where there is a choice; `solution` is what that engine had found (`Posterior.solution`),
-        which saves it most of its work.
-        """
+        """The posterior at given hyper-parameters, without a search; `solution` is what its `engine` had found."""
         likelihood = MarginalLikelihood(model, replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
         engine = engine or Exact()
         # now: a failure belongs to the fit, not to the first prediction
@@ -109,10 +371,7 @@ class Fitted(Summary):
 
     @cached_property
     def negative_log_likelihood(self) -> float:
-        """-log p(a | q, v, u) of the training data at the fitted parameters, in nats, without any hyperprior.
-
-        With inducing points its upper bound.
-        """
+        """-log p(a | q, v, u) of the training data in nats, without hyperpriors; of inducing points the bound."""
         with torch.no_grad():
             if isinstance(self.latent, InducingPosterior):
                 return float(self.likelihood.bound(self.kernels, self.hyperparameters, self.latent.features))
@@ -175,8 +434,5 @@ class Fitted(Summary):
 
     @property
     def widening(self) -> float:
-        """How many times as wide intervals are as those of `latent`, whose hyper-parameters count as known.
-
-        `fit/widening.py` says why and how much; `posterior.with_settings(widening=1.0)` does without.
-        """
+        """How many times as wide intervals are as at known hyper-parameters (`fit/widening.py`); 1.0 does without."""
         return float(self.settings.get("widening", 1.0))

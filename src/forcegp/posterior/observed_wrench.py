@@ -30,24 +30,15 @@ SLOW, AHEAD, LEARNING = 4.0, 0.5, 10.0  # s: of the mean that stays, of what is 
 def observing(
     posterior: Posterior, dataset: Dataset, *, seconds: float | None = None, whole: bool = False
 ) -> tuple[Posterior, Dataset]:
-    """The posterior and the recording with an `ObservedWrench`, in six or twelve more columns of u.
+    """The posterior and the recording with an `ObservedWrench`, in six or twelve more columns of u, and observed wind.
 
-    Where the fit found the wind of its rows (`in_air`), three more hold the velocity of the air, an `ObservedWind`
-    that the rows before show (`AirLaw.wind_before`).
-
-    Row k holds the mean of the wrench that the posterior's mean leaves unexplained, over the rows before k of its
-    episode, with weights that fall by e in `seconds`: what a first-order disturbance observer reports in flight (Chen
-    et al., "Disturbance-observer-based control and related methods", IEEE TIE 2016). No row sees itself or
-    what follows, and rows with a past shorter than that time are left out unless `whole`. By default the prior's
-    `AerodynamicForce` gives link and time. Where it leaves the time open, each component takes that of .02 to 1 s
-    which missed least in the second before; and where no wind is observed, six more columns hold what will last of it,
-    to which predicted motions fade. Otherwise they hold it: what is left of gusts beside an observed wind stays longer.
-    Without such a prior, or where its time is 0, both come back as they are.
-
-    Calibrated intervals of motions go along unless `seconds` is given.
-
-    Raises InvalidInput for a time that is not positive, for a model that cannot carry its forces to another system, and
-    for a recording that is too short or whose rows are not in order of time.
+    Row k holds the mean of the wrench left unexplained over the rows before k of its episode, with weights that fall by
+    e in `seconds`: what a first-order disturbance observer reports in flight (Chen et al., IEEE TIE 2016). Rows with a
+    shorter past are left out unless `whole`. By default the prior's `AerodynamicForce` gives link and time; where it
+    leaves the time open, each component takes that of .02 to 1 s which missed least in the second before, and six more
+    columns hold what will last of it. Without such a prior both come back as they are. Calibrated intervals go along
+    unless `seconds` is given. Raises InvalidInput for a time that is not positive, models that cannot carry their
+    forces along, and recordings that are too short or not in order of time.
     """
     own = next((term for term in posterior.trained.unknown_forces if isinstance(term, AerodynamicForce)), None)
     times = TRIED if seconds is None else (seconds,)
@@ -78,10 +69,8 @@ def observing(
 def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] | None:
     """What air did in the rows, for the settings of a fit, and the rows with columns that hold it and a model for them.
 
-    Where the rows show their wind (`forcegp.data.find_wind`), these are its law and velocity; else, for several
-    episodes, an `ObservedWrench` with the force that each has of its own (`steady_forces`), so that no function has to
-    explain it. None where the model has no `AerodynamicForce` or observes nothing (`observe=0`), where it
-    observes already, and where the rows show neither.
+    The law and velocity of the wind where rows show it, else for several episodes the force that each has of its own.
+    None where the model has no `AerodynamicForce` or observes nothing, observes already, or rows show neither.
     """
     of_air = [term for term in model.unknown_forces if isinstance(term, AerodynamicForce) and term.observe != 0.0]
     if not of_air or _observes(model) or dataset.u.shape[1] != model.sizes[2]:
@@ -124,11 +113,7 @@ def require_unobserved(posterior: Posterior, what: str) -> None:
 
 
 def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
-    """Rows to `update` with as the system has them that the model was trained on: with the wind, where that has it.
-
-    Raises InvalidInput for a posterior that was carried to another system, and for rows with less than .1 s of their
-    own past, which show no wind.
-    """
+    """Rows to `update` with, as the model's own. InvalidInput after `with_model`, and for less than .1 s of past."""
     target, own = posterior.target, posterior.trained
     if target is None:
         return rows
@@ -144,10 +129,7 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
 
 
 def in_own_air(posterior: Posterior, rows: Dataset) -> Dataset:
-    """Rows of the recording of a fit with the columns that the model's own rows have: wind, or the force that stays.
-
-    Rows that show no wind are left out. Raises InvalidInput where all have less than .1 s of their own past.
-    """
+    """Rows with the columns of the fit: wind, or the force that stays; InvalidInput where all lack .1 s of past."""
     if (steady := posterior.settings.get("steady_forces")) is not None:
         return _with_forces(posterior, rows, steady)
     if "air" not in posterior.settings:
@@ -204,10 +186,7 @@ def _unexplained(
 def _observed(
     wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float], held: bool
 ) -> Float[np.ndarray, "rows columns"]:
-    """The wrench that the rows before each show, none at the first of an episode, and what lasts unless it is held.
-
-    Of several times each component takes the one whose observer missed least in the rows before.
-    """
+    """The wrench that the rows before each show, none at the first of an episode, and what lasts unless it is held."""
     observed = np.zeros((len(wrench), 6 if held else 12))
     for number, rows, _ in episodes_in_order(dataset):
         own = np.flatnonzero(dataset.episode == number)
@@ -223,8 +202,8 @@ def _lasting(
 ) -> Float[np.ndarray, "rows 6"]:
     """What stays of the wrench `now`: the mean of the last 4 s, and a share of how far it is from that.
 
-    The share is the one with which the mean of the coming .5 s would have been predicted best in the rows before (least
-    squares, drawn to one half), where the rest fades (`ObservedWrench`).
+    The share would have predicted the mean of the coming .5 s best in the rows before (least squares, drawn to one
+    half).
     """
     slow = _past_mean(wrench, time, SLOW)
     count = max(1, round(AHEAD / float(np.median(np.diff(time))))) if len(time) > 1 else 1

@@ -1,6 +1,6 @@
 """`Posterior`: what a fit knows of a model, as a value that predicts."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
@@ -15,8 +15,7 @@ from forcegp.evidence import Accelerations
 from forcegp.evidence.training_data import second_moments, shrunk
 from forcegp.forces import Force
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration import Feedback
-from forcegp.integration.integrators import check_time_step
+from forcegp.integration.integrators import Feedback, check_time_step
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import FORCE, Noise
@@ -51,8 +50,8 @@ from forcegp.robots import Robot
 class Posterior(Fitted):
     """a = M^-1 Q_b + H (Q_K + B f) + noise, f ~ GP (Rath et al. 2021, eqs. 6-7), conditioned on a log by `forcegp.fit`.
 
-    It predicts any quantity that is affine in the forces, rolls motions out, becomes programs, learns more rows, and
-    moves to other models. What was found stands in the fields of `Fitted`.
+    It predicts, rolls motions out, becomes programs, learns more rows, moves to other models. Its fields are
+    `Fitted`'s.
     """
 
     def dynamics(
@@ -80,14 +79,11 @@ class Posterior(Fitted):
     ) -> Prediction | tuple[Gaussian, ...]:
         """Distribution of the acceleration and, where the model predicts them, of the forces behind it.
 
-        It is a `Prediction`, or with `of` a tuple with one `Gaussian` for each quantity in it: `Accelerations()`, a
-        contact of the model (the force on the robot there, (..., 3) in N), or an unknown force of it (its joint force).
-
-        States (..., nv) are in rad, rad/s and Nm (m, m/s and N for prismatic joints). Arrays, lists and tensors are
-        taken; results are float64 tensors. With `covariance=False` only means are computed, much faster. Differentiable
-        in q, v and u where these are tensors that require gradients.
-        Raises InvalidInput for wrong shapes or values that are not finite, and inside `torch.func.vmap`, whose batch
-        the leading dimensions are; NumericalError where the result is not finite.
+        A `Prediction`, or with `of` one `Gaussian` for each of `Accelerations()`, contacts of the model (the force on
+        the robot there, (..., 3) in N) and its unknown forces (joint forces). States (..., nv) are in rad, rad/s and Nm
+        (m, m/s and N), arrays, lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u.
+        InvalidInput for wrong shapes, values that are not finite, and inside `vmap`; NumericalError where the result is
+        not finite.
         """
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
@@ -156,8 +152,7 @@ class Posterior(Fitted):
     def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
         """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
 
-        States as for `predict`, as many as fit into memory at once. `components(q, v, u)["joint-friction"].joint_force`
-        is a `Gaussian` (..., nv) in Nm or N. Raises InvalidInput for wrong shapes or values that are not finite.
+        `components(q, v, u)["joint-friction"].joint_force` is a `Gaussian` (..., nv) in Nm or N. Raises as `predict`.
         """
         require_type("covariance", covariance, bool)
         states, batch = self.checked_states(q, v, u)
@@ -167,16 +162,11 @@ class Posterior(Fitted):
 
     @usable_arguments("curve")
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
-        """One process of the prior over its features: a friction curve, for example.
+        """One process of the prior, one of `latent_names`, over its features: a friction curve, for example.
 
-        Parameters
-        ----------
-        latent: its name, one of `latent_names`.
-        features: (n, d), or (n,) where the process has one feature, in the units of `prior.feature_names`. None takes
-            `points` values over the range that the training data visited, for processes of one feature; a constant,
-            which has none, is one value.
-
-        Raises InvalidInput for another name, wrong shapes, and None for processes of several features.
+        `features` are (n, d) in the units of `prior.feature_names`, (n,) for one feature, or None for `points` values
+        over the range of the training data. Raises InvalidInput for another name, wrong shapes, and None for several
+        features.
         """
         return curve_of(self, latent, features, points)
 
@@ -185,42 +175,28 @@ class Posterior(Fitted):
     ) -> Predictor:
         """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
 
-        Parameters
-        ----------
-        covariance: "compressed" uses so few combinations of the data that standard deviations are up to `tolerance`
-            (relative) larger than the exact ones at states around the training data, and never smaller; "exact" is the
-            covariance of `predict`; "none" leaves it out and prepares faster. "auto" is "compressed" after exact
-            inference, and "exact" after another engine, which lacks what compression needs.
-        tolerance, largest_rank: the rank is the smallest that keeps the tolerance, and at most `largest_rank`; a
-            NumericalWarning is given where that does not suffice.
-        compile: rigid-body terms and kernels as machine code on the CPU; False computes by torch, on any device. Where
-            no C compiler works, torch does, too, and a NumericalWarning says so.
-
-        Raises
-        ------
-        InvalidInput: an argument is out of range, a model is not a structured Gaussian process, or cannot be compiled.
+        `covariance` "compressed" uses so few combinations of the data, `largest_rank` at most (a NumericalWarning says
+        where that does not suffice), that standard deviations are up to `tolerance` (relative) larger than the exact
+        ones around the training data, and never smaller; "exact", "none"; "auto" is "compressed" after exact inference,
+        else "exact". `compile=False` computes by torch, on any device, as does a computer without a C compiler, with a
+        NumericalWarning. Raises InvalidInput for arguments out of range and models that cannot be compiled.
         """
         return prepared_predictor(self, covariance, tolerance, largest_rank, compile)
 
     def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
-        """States as rows of float64 tensors on the model's device, and their batch dimensions.
-
-        Raises InvalidInput for wrong shapes or values that are not finite.
-        """
+        """States as float64 rows on the model's device, and their batch; InvalidInput for shapes, not finite values."""
         return state_rows(self.model, q, v, u)
 
-    def programs(
-        self, model: Model | None = None, compressed: CompressedCovariance | None = None, key: str | None = None
-    ) -> Programs:
-        """What is compiled and exported, in another model if one is given; `key` is that of records on disk.
+    def programs(self, model: Model | None = None, compressed: CompressedCovariance | None = None) -> Programs:
+        """What is compiled and exported, in another model if one is given.
 
-        Raises InvalidInput for models on another device and noisy torques, and when something is made of them for
-        operations that no graph holds.
+        Raises InvalidInput for other devices and noisy torques and, when something is made of them, what no graph
+        holds.
         """
         model = self.model if model is None else model
         rows = rows_for(self.training, self.trained, model)
         example = [x[:1] for x in (rows.q, rows.v, rows.u)]
-        return Programs(Physics.of(self, model), example, self.latent, self.widening, compressed, key)
+        return Programs(Physics.of(self, model), example, self.latent, self.widening, compressed)
 
     def rollout(
         self,
@@ -235,33 +211,19 @@ class Posterior(Fitted):
         samples: int = 0,
         seed: int = 0,
         grad: bool = False,
-        progress: Callable[[int, int], None] | None = None,
     ) -> Rollout:
         """Where the robot goes from (q0, v0) under the forces u: the integrated mean acceleration.
 
-        Parameters
-        ----------
-        q0, v0: initial states (..., nv) in rad and rad/s (m and m/s), any batch.
-        u: actuator forces (..., T, nv) in Nm or N; row k acts from k to k + 1. Batches broadcast. An `ObservedWrench`
-            follows from the first row.
-        dt: time step in s.
-        integrator: "symplectic-euler" (first order, as in PyBullet and the paper), "rk4" (fourth order),
-            "implicit-midpoint" (second order, for stiff friction) or "projected" (second order; contacts hold exactly
-            after every step, also in the first state, which is moved onto them).
-        baumgarte: stabilisation in this rollout, instead of that of the model; None for none.
-        feedback: a controller that adds to u: feedback(k, q, v) -> (..., nv) in Nm or N, asked once at the beginning of
-            step k and constant until k + 1, with the batch dimensions of the motions (those of q0, for sampled motions
-            after one for the samples). Without one the motion is open loop, where small errors of a model grow as the
-            robot lets them.
-        samples: also integrate this many functions drawn from the posterior, by pathwise conditioning; `seed` draws
-            them.
-        grad: keep the graph, so that the result can be differentiated once in q0, v0, u and what `feedback` adds.
-            Memory grows with the number of steps.
-        progress: called as progress(step, steps).
+        `q0`, `v0` (..., nv) in rad and rad/s (m and m/s), `u` (..., T, nv) in Nm or N, row k from k to k + 1; batches
+        broadcast; `dt` in s. An `ObservedWrench` follows from the first row. `integrator` is "symplectic-euler" (first
+        order, as in PyBullet and the paper), "rk4" (fourth order) or "implicit-midpoint" (second order, for stiff
+        friction); `baumgarte` stabilises instead of the model's, None: not at all. feedback(k, q, v) -> (..., nv) adds
+        to u, asked at the beginning of step k, with the batch dimensions of the motions. `samples` functions drawn from
+        the posterior with `seed` are integrated, too. `grad` keeps the graph in q0, v0, u and what `feedback` adds.
 
-        A motion that diverges is NaN from then on, `Rollout.diverged_at` holds the row, and a NumericalWarning is
-        given. Raises InvalidInput for arguments that do not fit, among them tensors that require a gradient without
-        `grad`, NumericalError where the initial state cannot be projected.
+
+        A motion that diverges is NaN from then on, `diverged_at` holds the row, and a NumericalWarning is given. Raises
+        InvalidInput for arguments that do not fit, and tensors that require a gradient without `grad`.
         """
         if baumgarte is not None and not self.model.contacts:
             raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
@@ -272,7 +234,7 @@ class Posterior(Fitted):
         if self.model.memory.names:
             given = state_tensor("u", u, self.model.sizes[2], self.model.robot.device)
             u, feedback = remembering(self.model, given, dt, feedback)
-        how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed, "progress": progress}
+        how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed}
         moved = roll_out(self, model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
         return replace(moved, intervals=self.motion_intervals)
 
@@ -289,18 +251,10 @@ class Posterior(Fitted):
     ) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
-        Parameters, noise level and standardization stay those of the fit, so the result is exactly that of
-        conditioning on all rows at once, in time O(N^2) for N rows instead of O(N^3).
-
-        Parameters
-        ----------
-        rows: with the same joints, of the robot that the model was trained on.
-        budget: keep this many rows at most: those that the posterior would change most without
-            (docs/how-to/incremental.md).
-            The result is then exactly that of conditioning on these. None keeps all.
-
-        Raises InvalidInput for rows that do not fit and for models that would have to be trained again, ContactError
-        for rows at which the contacts cannot hold.
+        Parameters, noise level and standardization stay, so it is that of conditioning on all rows at once, in O(N^2).
+        With a `budget` it keeps so many rows, those that it would change most without (docs/how-to/incremental.md);
+        with a `horizon` in s, for all terms or by name, it forgets. Raises InvalidInput for rows that do not fit and
+        models that would have to be trained again, ContactError for rows at which the contacts cannot hold.
         """
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
@@ -312,11 +266,9 @@ class Posterior(Fitted):
     def with_model(self, model: Model) -> "Posterior":
         """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.
 
-        Those of contacts that it lacks are zero there, and its `forces` do not list them.
-
-        Raises InvalidInput for other joints, and, without `RigidBodies`, for another robot: the processes hold
-        the weight and inertia of the one that they were trained on; UnknownFrame where a force acts on a frame that the
-        robot lacks.
+        Forces of contacts that it lacks are zero there. Raises InvalidInput for other joints and, without
+        `RigidBodies`, another robot, whose weight and inertia the processes lack; UnknownFrame where a force acts on a
+        frame that is not there.
         """
         require_type("model", model, Model)
         trained = self.trained
@@ -349,23 +301,16 @@ class Posterior(Fitted):
     def with_contacts(self, contacts: Sequence[Contact | Sequence[Contact]]) -> "Posterior":
         """The same knowledge under other contacts, without another fit: another surface, or none at all, `[]`.
 
-        What was learned of joint forces stays as it is; forces of a contact follow the contact with their number, and
-        are zero without it. Raises InvalidInput as `with_model`.
+        Forces of a contact follow the contact with their number. Raises InvalidInput as `with_model`.
         """
         return self.with_model(self.model.known.with_contacts(contacts))
 
     def with_robot(self, robot: Robot) -> "Posterior":
-        """The same knowledge on another robot with the same joints, for example with another known tool.
-
-        Raises InvalidInput as `with_model`.
-        """
+        """The same on another robot with the same joints, as with a known tool. InvalidInput as `with_model`."""
         return self.with_model(self.model.with_robot(robot))
 
     def to(self, device: torch.device | str) -> "Posterior":
-        """The same knowledge on another device, for instance "cuda": conditioned there on the same rows.
-
-        Raises InvalidInput for a device that is not there.
-        """
+        """The same, conditioned on another device, such as "cuda". InvalidInput for one that is not there."""
         model = self.trained.to(device)
         at: torch.device = model.robot.device
         result = replace(self.result, parameters=_all_on(self.result.parameters, at))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, UnknownName, UnknownRow, require_known
+from forcegp.errors import InvalidInput, NumericalError, UnknownName, require_known
 from forcegp.evidence import Accelerations
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
@@ -28,7 +28,6 @@ Positions = Float[Tensor, "rows nq"]
 Inputs = Float[Tensor, "rows nu"]
 """One number per state and input of the system."""
 Array = Tensor | np.ndarray | Sequence[Any]
-AnyGaussian = TypeVar("AnyGaussian", bound="Gaussian")  # beartype cannot check Self where a module is hooked
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,24 +63,6 @@ class Gaussian(Summary):
         """The distribution of some entries."""
         return Gaussian(self.mean[..., which], None if self.covariance is None else self.covariance[..., which, which])
 
-    def __getitem__(self: AnyGaussian, index: Any) -> AnyGaussian:
-        """The same for some of the states: `prediction[i]`, `prediction[:10]`, `prediction[mask]`.
-
-        `index` is for the batch dimensions. Raises UnknownRow for states that are not there.
-        """
-        batch = self.mean.shape[:-1]
-        try:
-            rows = torch.arange(batch.numel(), device=self.mean.device).reshape(batch)[index]
-        except (IndexError, TypeError) as error:
-            raise UnknownRow(f"no states {index!r} in a batch of shape {tuple(batch)}: {error}") from None
-
-        def chosen(part: Any) -> Any:
-            if isinstance(part, Tensor):
-                return part.flatten(0, len(batch) - 1)[rows] if batch else part[None][rows]
-            return part[index] if isinstance(part, Gaussian) else part
-
-        return type(self)(**{item.name: chosen(getattr(self, item.name)) for item in fields(self)})
-
     @override
     def facts(self) -> dict[str, object]:
         """Shape, and the largest mean and standard deviation."""
@@ -98,12 +79,9 @@ class Prediction(Gaussian):
     """The acceleration (`mean` in rad/s^2 or m/s^2, `covariance`), without measurement noise, and the forces behind it.
 
     `multiplier` is lambda (..., m); `contact_force` the world force on the robot at each contact in turn (..., 3 m) in
-    N; `unknown_force` Q_U (..., nv) in Nm or N: what the Gaussian processes carry, which without an analytical mean
-    includes Q_K. Accelerations show nothing of a force along the contact normals: that part of `unknown_force`, and
-    through it `multiplier` and `contact_force`, rests on the prior alone, and is no surer than the prior is right.
-    The three are None where a model predicts no forces.
-    `noise_covariance` (..., nv, nv) is that of a measurement: add it to `covariance` to compare with noisy data. Where
-    the noise differed between training rows, it is that of their root-mean-square level.
+    N; `unknown_force` Q_U (..., nv) in Nm or N, without a mean with Q_K in it; None where a model predicts no forces.
+    Along contact normals accelerations show nothing: there all three rest on the prior alone. `noise_covariance` (...,
+    nv, nv) is that of a measurement, at the root-mean-square level where that differed between rows.
     """
 
     multiplier: Gaussian | None
@@ -185,9 +163,8 @@ def state_tensor(name: str, values: Array, size: int, device: torch.device) -> T
 class ForceComponent:
     """One of the forces that add up to the unknown force, at a batch of states.
 
-    `joint_force` (..., nv) in Nm or N; `latents` (..., C) are the values of its processes, in `latent_units`;
-    `point_force` (..., 3) in N along the axes of the world, for forces that act at a point of the robot, else None;
-    `acceleration` (..., nv) in rad/s^2 or m/s^2 is what it adds to the acceleration under the constraint.
+    `joint_force` (..., nv) in Nm or N; `latents` (..., C) in `latent_units`; `point_force` (..., 3) in N, world axes,
+    of forces at a point; `acceleration` (..., nv) is what it adds under the constraint, in rad/s^2 or m/s^2.
     """
 
     name: str
@@ -201,11 +178,9 @@ class ForceComponent:
 
 @dataclass(frozen=True, eq=False)
 class Components(Mapping[str, ForceComponent]):
-    """The components by name, what they add up to, and the constraint's answer.
+    """The components by name; their sum `total` (..., nv) in Nm or N; the constraint's answer with known forces.
 
-    `total` (..., nv) in Nm or N is the whole unknown force, with the covariances between components; `multiplier` is
-    lambda (..., m) and `contact_force` the world force of every contact on the robot (..., 3 m), in N, both with the
-    known forces in them.
+    `multiplier` is lambda (..., m), `contact_force` the world force of every contact on the robot (..., 3 m), in N.
     """
 
     total: Gaussian
@@ -256,8 +231,8 @@ def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: 
 class Curve:
     """One process over some of its features, for example a friction curve: force over velocity.
 
-    `features` (n, d) and their names with units; `mean` and `std` (n,) in `unit`; `visited` (2, d) is the range of the
-    features in the training data.
+    `features` (n, d) and names with units; `mean`, `std` (n,) in `unit`; `visited` (2, d) is the range of the training
+    data.
     """
 
     name: str
@@ -308,9 +283,8 @@ def require_actuated(posterior: Any) -> None:
 def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool) -> Gaussian:
     """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a Posterior at rows of q, v and a.
 
-    u stands on both sides: friction in proportion to the load changes with what presses the robot onto the surface,
-    and processes may have u among their features. Newton's method solves for it, in one step where neither is so. With
-    J = d(Q_K + Q_U)/du and the covariance S of the processes, that of u is to first order J^-1 B S B^T J^-T.
+    Friction under load and processes may depend on u: Newton's method. With J = d(Q_K + Q_U)/du and the covariance S of
+    the processes, that of u is to first order J^-1 B S B^T J^-T.
     """
     require_actuated(posterior)
     q, v, a = (x.detach() for x in states)

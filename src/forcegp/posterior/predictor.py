@@ -1,8 +1,4 @@
-"""`Predictor`: a posterior prepared for control rates, where a prediction is due every millisecond.
-
-Rigid-body terms, constraints, prior, features and processes become one C program (`programs`), and the covariance uses
-few combinations of the data (`inference.prepared_kernels`).
-"""
+"""`Predictor`: a posterior as C programs, for control rates, where a prediction is due every millisecond."""
 
 import math
 import warnings
@@ -20,7 +16,6 @@ from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration import integrate
 from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
 from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
 from forcegp.posterior.programs import Programs, steps_of
@@ -29,9 +24,9 @@ from forcegp.posterior.rollout import (
     Motions,
     StepLinearization,
     checked_start,
-    fused,
     linearized_on_manifold,
     linearized_step,
+    moved,
     stepped,
 )
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
@@ -51,18 +46,14 @@ BLOCK = 256
 class Predictor(Summary):
     """The acceleration that a posterior predicts, fast; made by `posterior.predictor()`.
 
-    States are float64 tensors or arrays (size,) or (n, size) in the units of `posterior.predict`, with the `sizes` of
-    q, v and u; results are tensors with the same leading dimension. They are those of `predict`: means to rounding,
-    covariances exactly or never below, as `kind` says. Differentiable once in q, v and u where these are tensors that
-    require gradients; with `compile=False` any number of times, also forward and by `torch.func`, but for `vmap`: give
-    it all states as rows.
+    States are float64 tensors or arrays (size,) or (n, size), in the units of `predict`, with the `sizes` of q, v and
+    u. Results are those of `predict`: means to rounding, covariances exactly or never below, as `kind` says
+    ("compressed", "exact", "none"; `rank`, `inflation`). Differentiable once in tensors that require gradients; with
+    `compile=False` any number of times, and by `torch.func`, but for `vmap`. `prepare_seconds` is what preparing took,
+    with the compiler.
 
-    `kind` is that of the covariance, "compressed", "exact" or "none"; `rank` and `inflation` describe how it was
-    compressed; `prepare_seconds` is what preparing took, the C compiler included where its work is not kept yet.
-
-    Raises InvalidInput for wrong shapes, for values that are not finite and where derivatives would be lost,
-    NumericalError where the result is not finite. Where nothing can be compiled, torch computes the same, and one
-    NumericalWarning says how much slower that is.
+    Raises InvalidInput for wrong shapes, values that are not finite and where derivatives would be lost, NumericalError
+    where the result is not finite. Where nothing can be compiled, torch computes the same, with one NumericalWarning.
     """
 
     posterior: Any
@@ -92,7 +83,7 @@ class Predictor(Summary):
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
 
     def refreshed(self, posterior: Any) -> "Predictor":
-        """That of `posterior.update(...)` in milliseconds: the same programs, traced at most once, with other tables.
+        """That of `posterior.update(...)` in milliseconds: the same programs with other tables.
 
         Raises InvalidInput for other posteriors, compressed covariances, and kernels with numbers in the programs.
         """
@@ -145,10 +136,7 @@ class Predictor(Summary):
         return _single(self.run("mean", states)[0], single)
 
     def __call__(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor]:
-        """Mean (nv,) and covariance (nv, nv) of the acceleration, or (n, nv) and (n, nv, nv); without noise.
-
-        Raises InvalidInput where the predictor was made with covariance="none".
-        """
+        """Mean (nv,) and covariance (nv, nv) of the acceleration, or of rows, without noise."""
         if self.kind == "none":
             raise InvalidInput("this predictor has no covariance; make it with covariance='compressed' or 'exact'.")
         nv, compiled = self.nv, self.compiled("covariance") if self.compressed is not None else None
@@ -163,10 +151,7 @@ class Predictor(Summary):
         return _finished(means, single), _finished(covariances, single)
 
     def linearize(self, q: Any, v: Any, u: Any) -> Linearization:
-        """The mean acceleration and its Jacobians in q, v and u, without a graph.
-
-        Where a base moves, da_dq (..., nv, nv) is that in a step d from q: q moves to `robot.integrate(q, d)`.
-        """
+        """The mean and its Jacobians in q, or where a base moves in a step from q (nv,), v and u; without a graph."""
         (_, nv, nu), compiled = self.sizes, self.compiled("linearize")
         if compiled and (one := self._one_state(q, v, u)):
             a, jacobian = self._at_one("linearize", compiled, one)
@@ -180,9 +165,8 @@ class Predictor(Summary):
     def step(self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler") -> tuple[Tensor, Tensor]:
         """The state (q, v) `dt` seconds later under constant u, (size,) or (n, size); differentiable as `mean`.
 
-        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint" (docs/how-to/rollouts.md), which is
-        differentiable once. Raises InvalidInput for "projected", other names and a dt that is no positive number,
-        NumericalError where an implicit step is not found.
+        `integrator` is "symplectic-euler", "rk4" or "implicit-midpoint", which is differentiable once. InvalidInput for
+        other names and a dt that is no positive number, NumericalError where an implicit step is not found.
         """
         states, single = self._states(q, v, u)
         state = self._stepped(torch.cat(states, dim=-1), dt, integrator)
@@ -204,10 +188,7 @@ class Predictor(Summary):
     def linearize_step(
         self, q: Any, v: Any, u: Any, dt: float, integrator: str = "symplectic-euler"
     ) -> StepLinearization:
-        """That state and the affine model x+ = A x + B u + c of the step, x = (q, v), without a graph.
-
-        Where a base moves, x = (d, v) and x+ = (d+, v+) with the steps d from q, and d+ from the q after the step.
-        """
+        """That state and the affine model x+ = A x + B u + c, x = (q, v) or (step from q, v), without a graph."""
         states, single = self._states(q, v, u)
         model, rows = self.posterior.model, torch.cat(states, dim=-1)
         if self.space.is_vector_space:
@@ -229,13 +210,11 @@ class Predictor(Summary):
         seed: int = 0,
         threads: int | None = None,
     ) -> Motions:
-        """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast.
+        """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast, without a graph.
 
-        As `posterior.rollout` with the predictor's own model; what diverges is NaN from the row `diverged_at` on. Under
-        the mean, or with `functions` once under each of so many functions drawn from the posterior, which then are the
-        first dimension; `divided` takes motions (functions, ..., nv) instead, each under the function of its own. A
-        compiled predictor steps many at once on `threads` threads (None: as many as torch has), without a graph.
-        Raises InvalidInput for arguments that do not fit.
+        As `posterior.rollout`, under the mean, or with `functions` under each of so many drawn ones, which are the
+        first dimension; `divided` takes motions (functions, ..., nv), each under its own. Compiled, many steps are done
+        at once on `threads` threads (None: as torch has). Raises InvalidInput for arguments that do not fit.
         """
         threads = None if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
@@ -262,12 +241,7 @@ class Predictor(Summary):
             elif tuple(batch[:1]) != (functions,):
                 raise InvalidInput(f"divided motions need a first dimension of {functions} functions; given: {batch}.")
         with torch.no_grad():
-            if loops is None:
-                motion = integrate(method, acceleration, start, v, forces, dt)
-            else:
-                motion = fused(loops, method, acceleration, start, v, forces, dt, threads)
-        q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (motion.q, motion.v, motion.a))
-        return Motions(q, v, a, motion.diverged_at.reshape(batch))
+            return moved(batch, loops, method, acceleration, start, v, forces, dt, threads=threads)
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""
@@ -283,15 +257,16 @@ class Predictor(Summary):
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
 
-        u = M a + h - A^T lambda - Q_U with the known forces -h: friction under load is that of this lambda, which
-        `normal_force` (m,) or (n, m) gives in N, positive where the surface pushes the robot off, as in
-        `predict(...).multiplier`; None is 0. The covariance is that of Q_U at u, to first order, and None for a
-        predictor without one. `a` has to obey A a = b, else the contacts change it. Results have no graph.
-        Raises InvalidInput for models without analytical mean or actuation, NumericalError where no u is found.
+        u = M a + h - A^T lambda - Q_U; friction under load is that of `normal_force` lambda (m,) or (n, m) in N,
+        positive where the surface pushes the robot off. The covariance is that of Q_U at u, to first order. `a` has to
+        obey A a = b, else contacts change it. Raises InvalidInput for models without bodies or actuation,
+        NumericalError where no u is found.
         """
         states, single = self._states(q, v, a, "qva")
         found = inverse_dynamics(self.posterior, states, normal_force, self.kind != "none")
-        return found[0] if single else found
+        if not single:
+            return found
+        return Gaussian(found.mean[0], None if found.covariance is None else found.covariance[0])
 
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
         """The outputs (n, size) of a program at states (n, nv) that were checked, without a graph."""

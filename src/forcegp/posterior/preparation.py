@@ -3,7 +3,6 @@
 import math
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,16 +13,14 @@ from torch import Tensor
 from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.evidence.training_data import TrainingData
 from forcegp.forces import ObservedWrench
-from forcegp.inference.posterior import ExactPosterior, LatentPosterior
+from forcegp.inference.posterior import ExactPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress
 from forcegp.model import Model
 from forcegp.posterior.predictor import Predictor
-from forcegp.posterior.programs import Physics, kept_record, record_key
+from forcegp.posterior.programs import Physics
 from forcegp.robots.manifold import ConfigurationSpace
 
 COVARIANCES = ("auto", "compressed", "exact", "none")
-UNCHANGED = 1e-7
-"""Relative difference from torch that rounding and tables explain."""
 SAMPLES, CHECKS = 300, 150
 """States that choose the compressed covariance, and others that show how good it is."""
 STEP = 0.3
@@ -46,8 +43,6 @@ def prepared_predictor(
     physics, training = Physics.of(posterior, model), rows_for(posterior.training, posterior.trained, model)
     if covariance == "auto":
         covariance = "compressed" if isinstance(latent, ExactPosterior) else "exact"
-    options = [covariance, tolerance, largest_rank, posterior.widening]
-    key = record_key(physics, options, _numbers(latent, training, physics))
     compressed = None
     if covariance == "compressed" and len(latent.kernels.dense):
         if not isinstance(latent, ExactPosterior):
@@ -56,7 +51,7 @@ def prepared_predictor(
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        compressed = _kept(key, lambda: _compressed(latent, training, physics, tolerance, largest_rank))
+        compressed = _compressed(latent, training, physics, tolerance, largest_rank)
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > tolerance:
             warnings.warn(
@@ -66,37 +61,15 @@ def prepared_predictor(
                 NumericalWarning,
                 stacklevel=3,
             )
-    code = posterior.programs(compressed=compressed, key=key) if compile else None
+    code = posterior.programs(compressed=compressed) if compile else None
     where = model.robot.space, model.sizes, training.q.device
     made = Predictor(posterior, *where, code, covariance, compressed)
-    first = "mean" if compressed is None else "covariance"
-    if made.compiled(first) and code is not None and not code.is_traced:
-        some = [x[:: 1 + len(x) // 3] for x in (training.q, training.v, training.u)]
-        with torch.no_grad():
-            expected = made.by_torch(*some)
-        if float((made.run(first, some)[0] - expected).abs().max()) > UNCHANGED * float(expected.abs().max()):
-            made = replace(made, code=replace(code, key=None), _made={})  # a prior's code changed: no key shows it
-            made.compiled(first)
+    made.compiled("mean" if compressed is None else "covariance")
     return replace(made, prepare_seconds=time.perf_counter() - begin)
 
 
-def _kept(key: str | None, make: Callable[[], CompressedCovariance]) -> CompressedCovariance:
-    """A compressed covariance, found or made."""
-
-    def made() -> tuple[dict[str, Tensor], str]:
-        found = make()
-        return {str(k): F for k, F in enumerate(found.factors)} | {"inflation": found.inflation}, ""
-
-    numbers, _ = kept_record(key, "compressed", made)
-    return CompressedCovariance(tuple(numbers[str(k)] for k in range(len(numbers) - 1)), numbers["inflation"])
-
-
 def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingData:
-    """The training rows with the inputs of another system, such as one without the switches of contacts.
-
-    A wrench that an observer reports was 0 where nothing observed it. Raises InvalidInput for other inputs that they
-    lack.
-    """
+    """The training rows with another model's inputs, 0 for an observed wrench; InvalidInput for others."""
     had = trained.inputs
     if model.inputs == had:
         return training
@@ -108,13 +81,6 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
         )
     with_zero = torch.nn.functional.pad(training.u, (0, 1))
     return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in model.inputs]])
-
-
-def _numbers(latent: LatentPosterior, training: TrainingData, physics: Physics) -> list[Tensor]:
-    """All that decide a predictor of a described system and prior."""
-    found = [training.q, training.v, training.u, *latent.features, *latent.weights]
-    found += [*latent.kernels.state_dict().values(), *physics.standardization.shift, *physics.standardization.scale]
-    return [*found, latent.system.factor.lower.diagonal()] if isinstance(latent, ExactPosterior) else found
 
 
 def _compressed(
@@ -141,10 +107,9 @@ def _compressed(
 def sample_states(
     training: TrainingData, space: ConfigurationSpace, count: int, seed: int, rows: int
 ) -> list[Float[Tensor, "_ size"]]:
-    """q, v and u of states of three kinds: `rows` training rows, or all, and a third of `count` of the others each.
+    """q, v, u: `rows` training rows, and a third of `count` each of two other kinds of states around them.
 
-    These are rows moved by a fraction of the difference of two others; and positions, velocities and forces of
-    different rows together.
+    Rows moved by a fraction of the difference of two others; and positions, velocities and forces of different rows.
     """
     generator = torch.Generator().manual_seed(seed)
     states = [training.q, training.v, training.u]

@@ -1,60 +1,33 @@
-"""Predictions of a posterior as programs: one graph, traced once, and what is compiled of it, kept on disk.
+"""Predictions of a posterior as programs: one graph, traced once, and what is compiled of it.
 
-The Python code that `predict` runs is traced (`codegen.tracing`); processes are C functions that the graph calls
-(`inference.kernel_sums`). From the one graph come the mean, its Jacobians, the covariance and loops of steps, each
-compiled when it is first asked for. A step calls the program of the acceleration; the implicit one is Newton's method
-with its exact Jacobian, shortened where it overshoots.
-
-What took long to make lies beside the compiled libraries, in records named by a hash of all that decides them: the code
-of this package, the model, the data and the hyper-parameters. Models whose parts cannot be described, such as surfaces
-of the user's own code, have none. The oldest records go where all together grow too large.
+Processes are C functions that the graph calls (`inference.kernel_sums`). From it come the mean, its Jacobians, the
+covariance and loops of steps, each compiled when it is first asked for.
 """
 
-import contextlib
-import hashlib
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
-from forcegp.atomic_files import atomic_file
 from forcegp.codegen.c_writer import ROWS, Program, c_text, filled, head, sections, write_entry, write_function
-from forcegp.codegen.derivatives import jacobian
-from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph
-from forcegp.codegen.library import (
-    RowFunction,
-    aligned,
-    code_digest,
-    default_folder,
-    load_library,
-    opened_library,
-    own_file,
-    own_folder,
-    vector_unit,
-)
+from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph, jacobian
+from forcegp.codegen.library import RowFunction, aligned, load_library, vector_unit
 from forcegp.codegen.tracing import trace
-from forcegp.errors import CompilerError, ForceGPError, InvalidInput
+from forcegp.errors import InvalidInput
 from forcegp.evidence.training_data import Standardization
-from forcegp.forces import Actuation, RigidBodies, UnknownForces, force_to_dict
+from forcegp.forces import Actuation, RigidBodies, UnknownForces
 from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls, refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance
-from forcegp.integration.integrators import check_time_step, integrator_named
-from forcegp.integration.trajectory import SPEED_LIMIT
+from forcegp.integration.integrators import SPEED_LIMIT, check_time_step, integrator_named
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.robots.manifold import ConfigurationSpace
 
-LARGEST = 2**30
-"""Bytes of all records together."""
 WITH_SLOPES = ("linearize", "forces")
 STEPS = sections(__name__, "rollout_steps.c")
 """One step in C: from x = [q, v, u] to q1, v1, with the acceleration a at its beginning."""
@@ -119,13 +92,9 @@ class Physics:
     ) -> list[Tensor]:
         """[lambda, b - A a, r, s, t, H, G], by which derivatives do not go through factors and pseudo-inverses.
 
-        With the acceleration, the multiplier and what is `left` of b - A a (redundant contacts) held,
-
-            r = Q - M a + A^T lambda,  s = b - A a,  t = A^T left,
-            da = H dr + G (ds + G^T dt),  G = M^-1 A^T (A M^-1 A^T)^+
-
-        which is implicit differentiation, and for `left` the derivative of a pseudo-inverse of constant rank (Golub &
-        Pereyra, SIAM J. Numer. Anal. 10, 1973, eq. 4.12).
+        With the acceleration, the multiplier and what is `left` of b - A a held, r = Q - M a + A^T lambda, s = b - A a
+        and t = A^T left: da = H dr + G (ds + G^T dt), G = M^-1 A^T (A M^-1 A^T)^+ (implicit differentiation; for `left`
+        Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973, eq. 4.12).
         """
         dynamics = self.model.dynamics(q, v, u)
         A, lower, inverse = dynamics.A, dynamics.inverse_lower, dynamics.pseudo_inverse
@@ -161,9 +130,9 @@ class Traced(NamedTuple):
 
 @dataclass(eq=False)
 class Programs:
-    """The programs of a posterior in a model, and their C text; `example` are one state's q, v and u (1, size).
+    """The programs of a posterior in a model; `example` is one state (1, size).
 
-    `key` names their records. Raises InvalidInput, when something is traced, for what no graph holds.
+    InvalidInput for what no graph holds.
     """
 
     physics: Physics
@@ -171,7 +140,6 @@ class Programs:
     latent: LatentPosterior
     widening: float
     compressed: CompressedCovariance | None = None
-    key: str | None = None
     given: tuple[Traced, tuple[LatentCall, ...]] | None = None
     """What was traced of another posterior, and the processes of this one."""
 
@@ -183,11 +151,6 @@ class Programs:
                 f"compiled code runs on the CPU, and the model is on {self.example[0].device}; give compile=False, or "
                 "a model on the CPU."
             )
-
-    @property
-    def is_traced(self) -> bool:
-        """Whether something was made anew."""
-        return "traced" in vars(self)
 
     @cached_property
     def sums(self) -> tuple[LatentCall, ...]:
@@ -289,7 +252,10 @@ class Programs:
             finish = {"covariance": ("covariance", self.sizes[1] ** 2)}
         text.append(write_function("program", program.graph, program.nodes, lanes, names))
         if integrator:
-            text += [*self.motion_source(lanes), ROWS, self._loop_source(integrator, len(program.nodes))]
+            words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
+            words |= {"OUTPUTS": len(program.nodes), "LIMIT": SPEED_LIMIT}
+            words["STEP"] = self.step_source(integrator, "program")
+            text += [*self.motion_source(lanes), ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
         else:
             text.append(entry or write_entry(program, "program", finish))
         return "\n".join(text)
@@ -298,11 +264,6 @@ class Programs:
         """The text of a step that calls `function`, whose slopes are those in a step from q, v and u."""
         columns = 2 * self.sizes[1] + self.sizes[2]
         return filled(steps_of(self.space)[integrator], {"PROGRAM": function, "COLUMNS": columns})
-
-    def _loop_source(self, integrator: str, outputs: int) -> str:
-        words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
-        words |= {"OUTPUTS": outputs, "LIMIT": SPEED_LIMIT, "STEP": self.step_source(integrator, "program")}
-        return filled(c_text(__name__, "rollout_loop.c"), words)
 
     def motion_source(self, lanes: int) -> list[str]:
         """C functions that steps on a manifold call: q after a step, and the rate of a step under a velocity."""
@@ -337,7 +298,7 @@ class Programs:
     def refreshed(self, latent: LatentPosterior) -> "Programs":
         """Those of another posterior with the same kernels. Raises InvalidInput as `refreshed_calls`."""
         given = self.traced, refreshed_calls(self.sums, latent)
-        return replace(self, latent=latent, key=None, given=given)
+        return replace(self, latent=latent, given=given)
 
     def drawn(self, samples: int, seed: int) -> "Sequence[Programs] | None":
         """Those of each drawn function, whose texts are equal; None where one has no form in pieces."""
@@ -346,7 +307,7 @@ class Programs:
         drawn = drawn_calls(self.latent, self.sums, samples, seed, self.widening)
         if drawn is None:
             return None
-        return [replace(self, compressed=None, key=None, given=(self.traced, calls)) for calls in drawn]
+        return [replace(self, compressed=None, given=(self.traced, calls)) for calls in drawn]
 
     def function(self, kind: str) -> RowFunction:
         """A program, or the loop of an integrator: found or made. Raises CompilerError where that cannot be."""
@@ -358,21 +319,12 @@ class Programs:
             "mean": [nv],
         }.get(kind, [0] * 4)  # a loop gives as much as it is asked for
         inputs = 3 + (kind in steps_of(self.space))
-
-        def make() -> tuple[dict[str, Tensor], str]:
-            text = self.c_source(kind, vector_unit()[0])
-            library = load_library(f"predictor-{kind}", text, lambda _: text)
-            return {str(k): x for k, x in enumerate(self.tables(kind))}, Path(library._name).name
-
-        numbers, path = kept_record(self.key, kind, make)
-        tables = [aligned(numbers[str(k)].numpy()) for k in range(len(numbers))]
-        return RowFunction(opened_library(path), inputs, outputs, tables)
+        text = self.c_source(kind, vector_unit()[0])
+        library = load_library(f"predictor-{kind}", text, lambda _: text)
+        return RowFunction(library, inputs, outputs, self.tables(kind))
 
     def loops(self, integrator: str, samples: int = 0, seed: int = 0) -> list[RowFunction] | None:
-        """Over the mean or each drawn function; None where one has no form in pieces, or no such step is written in C.
-
-        Raises CompilerError.
-        """
+        """Over the mean or each drawn function; None without such a step or form. Raises CompilerError."""
         if integrator not in steps_of(self.space):
             return None
         if not samples:
@@ -381,48 +333,3 @@ class Programs:
             return None
         first = codes[0].function(integrator)
         return [first.with_tables(code.tables()) for code in codes]
-
-
-def record_key(physics: Physics, options: Sequence[object], numbers: Iterable[Tensor]) -> str | None:
-    """The hash of a description, of tensors, and of the code; None where the physics holds code of the user's."""
-    try:
-        parts = [physics.model.to_dict(), *map(force_to_dict, physics.forces.terms), options, torch.__version__]
-        text = json.dumps([*parts, repr(vector_unit()), code_digest()])
-    except (ForceGPError, TypeError, ValueError):
-        return None
-    digest = hashlib.sha256(text.encode())
-    for x in numbers:
-        values = x.detach().cpu().contiguous()
-        digest.update(repr((values.shape, values.dtype)).encode())
-        digest.update(values.numpy().data)
-    return digest.hexdigest()[:32]
-
-
-def kept_record(
-    key: str | None, kind: str, make: Callable[[], tuple[Mapping[str, Tensor], str]]
-) -> tuple[Mapping[str, Tensor], Path]:
-    """Numbers and the file of a library in the folder: found, or made and kept where that is possible."""
-    with contextlib.suppress(OSError, SafetensorError, CompilerError):
-        path = own_folder() / f"predictor-{key}-{kind}.safetensors"
-        if key is not None and path.is_file():
-            own_file(path)
-            with safe_open(path, "pt") as file:  # type: ignore[reportUnknownVariableType]  # no types
-                numbers = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
-                library = path.parent / Path(file.metadata()["library"]).name
-            if library.exists():
-                path.touch()
-                return numbers, library
-    numbers, name = make()
-    folder = default_folder()
-    with contextlib.suppress(OSError, CompilerError):
-        folder = own_folder()
-        if key is not None:
-            data = save({name: x.detach().contiguous() for name, x in numbers.items()}, {"library": name})
-            with atomic_file(folder / f"predictor-{key}-{kind}.safetensors") as path:
-                path.write_bytes(data)
-            left = LARGEST
-            for path in sorted(folder.glob("predictor-*.safetensors"), key=lambda path: -path.stat().st_mtime):
-                left -= path.stat().st_size
-                if left < 0:
-                    path.unlink()
-    return numbers, folder / name

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -13,12 +14,21 @@ from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.pathwise import draw_functions, mean_function
-from forcegp.integration import INTEGRATORS, ConstraintManifold, Feedback, integrate, integrator_named
-from forcegp.integration.integrators import VECTORS, ImplicitMidpoint, Integrator, check_time_step, rows_jacobian
-from forcegp.integration.trajectory import Trajectory, check_start, warn_of_divergence
-from forcegp.mechanics import Baumgarte
+from forcegp.integration.integrators import (
+    Feedback,
+    ImplicitMidpoint,
+    Integrator,
+    Trajectory,
+    check_start,
+    check_time_step,
+    integrate,
+    integrator_named,
+    rows_jacobian,
+    violation,
+    warn_of_divergence,
+)
 from forcegp.model import Model
-from forcegp.posterior.motion_intervals import MotionIntervals
+from forcegp.posterior.fitted import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
 from forcegp.posterior.programs import steps_of
 from forcegp.robots.arguments import broadcast_batch, whole_number
@@ -29,17 +39,14 @@ STEPS_TO_COMPILE = 2000
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
-Quantity = Literal["q", "v", "a", "constraint", "velocity_constraint"]
+Quantity = Literal["q", "v", "a", "constraint"]
 
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
 
 
 def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0) -> AccelerationFunction:
-    """The mean acceleration of a `Posterior` at states (n, nv) of this model.
-
-    With `samples`, that of so many functions drawn from it, each at n / samples of the states.
-    """
+    """The mean acceleration of a `Posterior` at states (n, nv), or of `samples` functions, each at its part."""
     prior, standardize = posterior.trained.unknown, posterior.likelihood.standardization
     samples = samples if len(posterior.kernels.kernels) else 0  # without unknown forces all functions are the same
     latent, functions = posterior.latent, mean_function(posterior.latent)
@@ -73,6 +80,25 @@ class Motions(NamedTuple):
     diverged_at: Tensor
 
 
+def moved(
+    batch: Sequence[int],
+    loops: Sequence[RowFunction] | None,
+    method: Integrator,
+    acceleration: AccelerationFunction,
+    *given: Any,
+    threads: int | None = None,
+    what: str = "motions",
+    **how: Any,
+) -> Motions:
+    """`integrate` with these batch dimensions, by compiled loops where there are some."""
+    if loops is None:
+        found = integrate(method, acceleration, *given, what=what, **how)
+    else:
+        found = fused(loops, method, acceleration, *given, threads=threads, what=what)
+    q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (found.q, found.v, found.a))
+    return Motions(q, v, a, found.diverged_at.reshape(tuple(batch)))
+
+
 def fused(
     loops: Sequence[RowFunction],
     method: Integrator,
@@ -86,9 +112,8 @@ def fused(
 ) -> Trajectory:
     """`integrate`, by compiled loops; each takes as many motions as the others, one after the other.
 
-    Several motions stand in the lanes of vector registers, with no Python per step, on several threads. Those that a
-    loop cannot carry to the end, because they diverge, because Newton's method fails, or because they leave the range
-    of a table, are integrated again by torch, with those of the other loops from the same place.
+    Those that a loop cannot carry to the end (they diverge, Newton's method fails, a table ends) are integrated again
+    by torch, with those of the other loops from the same place.
     """
     check_start(v, dt)
     own, (steps, count, _) = len(q) // len(loops), u.shape
@@ -119,46 +144,41 @@ def fused(
 class Rollout:
     """Motions of T steps from one or more initial states; batch dimensions are those of q0.
 
-    Fields
-    ------
-    time: (T+1,) in s, from 0.
-    q, v: (..., T+1, nv) in rad and rad/s (m and m/s), q of a base that moves (..., T+1, nq); row 0 is the initial
-        state, which `integrator="projected"` moves onto the constraint first. Angles are not wrapped.
-    a: (..., T, nv) in rad/s^2 (m/s^2), the acceleration at row k under u[k] and what feedback adds to it there.
-    constraint: c(q) (..., T+1, m) in m, the distance of every contact point from its surface (for surfaces that are
-        signed distances).
-    velocity_constraint: A(q) v (..., T+1, m) in m/s.
-    initial_correction: (..., 2) largest change of any joint's position and velocity that the projection of the initial
-        state made; 0 for integrators that do not project.
-    diverged_at: (...) the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
-    integrator, baumgarte: how the motion was computed.
-    samples: with samples=S, the same for S functions drawn from the model's posterior, shapes (S, ..., T+1, nv);
-        None without. Each sample is one function: it answers the same state always with the same force.
-    intervals: calibrated widths of intervals, of the model; None without.
-    space: of the positions. Where a base moves they do not add up, so deviations of q are steps (nv,) from the q here,
-        in the axes of the base: `robot.difference(rollout.q, other)`.
+    `time` (T+1,) in s; `q`, `v` (..., T+1, nv) in rad and rad/s (m and m/s), of a base that moves q (..., T+1, nq),
+    angles not wrapped; `a` (..., T, nv) in rad/s^2 (m/s^2) at row k under u[k] and what feedback adds to it.
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
+    `samples` (S, ...) are the same under S functions drawn from the posterior, one function each; None without.
+    `intervals` are the calibrated widths of the posterior's. Where a base moves, deviations of q are steps (nv,) from
+    the q here, in the axes of the base: `robot.difference(rollout.q, other)`.
     """
 
     time: Float[Tensor, " rows"]
     q: Float[Tensor, "*batch rows nq"]
     v: Float[Tensor, "*batch rows nv"]
     a: Float[Tensor, "*batch steps nv"]
-    constraint: Float[Tensor, "*batch rows m"]
-    velocity_constraint: Float[Tensor, "*batch rows m"]
-    initial_correction: Float[Tensor, "*batch 2"]
     diverged_at: Int[Tensor, "*batch"]
     integrator: str
-    baumgarte: Baumgarte | None
+    model: Model
     samples: "Rollout | None" = None
     intervals: MotionIntervals | None = None
-    space: ConfigurationSpace = VECTORS
+
+    @property
+    def space(self) -> ConfigurationSpace:
+        """Of the positions."""
+        return self.model.robot.space
+
+    @cached_property
+    def constraint(self) -> Float[Tensor, "*batch rows m"]:
+        """c(q) (..., T+1, m) in m, the distance of every contact point from its surface, where that is signed."""
+        rows = (x.flatten(0, -2).split(ROWS_PER_BLOCK) for x in (self.q, self.v))
+        found = torch.cat([violation(self.model, *block)[0] for block in zip(*rows, strict=True)])
+        return found.reshape(*self.q.shape[:-1], -1)
 
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
-        """Lower and upper ends (..., T+1, nv) of the 95 % interval.
+        """Lower and upper ends (..., T+1, nv) of the 95 % interval: calibrated, or quantiles of the samples.
 
-        Of a model with calibrated intervals (`forcegp.fit.calibrated`) those, centred on the mean; else the
-        quantiles of the samples. Where a base moves, ends of q are steps from q: another motion lies within where
-        `low <= robot.difference(rollout.q, other) <= high`. Raises InvalidInput where there is neither.
+        Of q where a base moves, as steps: `low <= robot.difference(rollout.q, other) <= high`. InvalidInput where there
+        is neither.
         """
         if self.intervals is None:
             low, high = self.quantiles((0.025, 0.975), quantity)
@@ -170,17 +190,13 @@ class Rollout:
         return center - half, center + half
 
     def std(self, quantity: Quantity = "q") -> Tensor:
-        """Standard deviation over the samples, of the shape of the quantity; NaN from where one sample diverged.
-
-        Of q where a base moves, that of steps (..., T+1, nv).
-        Raises InvalidInput for a rollout with fewer than two samples.
-        """
+        """Standard deviation over two samples or more, NaN from where one diverged; of steps where a base moves."""
         return self._sampled(quantity, least=2).std(0)
 
     def quantiles(self, levels: Sequence[float] = (0.025, 0.5, 0.975), quantity: Quantity = "q") -> Tensor:
-        """Quantiles (levels, ...) over the samples; NaN from where one sample diverged. Where a base moves, of steps.
+        """Quantiles (levels, ...) over the samples, NaN from where one diverged.
 
-        Raises InvalidInput for a rollout without samples, or levels outside 0 to 1.
+        InvalidInput for levels not in 0 to 1.
         """
         if not all(0.0 <= level <= 1.0 for level in levels):
             raise InvalidInput(f"quantile levels are {tuple(levels)}; each must be from 0 to 1.")
@@ -211,48 +227,30 @@ def roll_out(
     samples: int,
     seed: int,
     grad: bool,
-    progress: Callable[[int, int], None] | None,
 ) -> Rollout:
     """What `Posterior.rollout` documents, under the stabilisation of `model`."""
     samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
     method = integrator_named(integrator, model)
     require_type("grad", grad, bool)
-    robot = model.robot
-    q, v, forces, batch = checked_start(model.sizes, robot.device, q0, v0, u, None if grad else "give grad=True")
-    steps = forces.shape[0]
-    total = steps * (1 + bool(samples))
-    counted = None if progress is None else lambda before: lambda done, _: progress(before + done, total)
+    remedy = None if grad else "give grad=True"
+    q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u, remedy)
+    steps = len(forces)
 
-    def run(copies: int, what: str, before: int) -> Rollout:
+    def run(copies: int, what: str) -> Rollout:
         shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
-        start = q.repeat(count, 1), v.repeat(count, 1)
-        given = method, accelerations(posterior, model, copies, seed), *start, forces.repeat(1, count, 1), dt
-        loops = None
+        given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
+        loops, how = None, {}
         if feedback is None and not grad:
             loops = _loops(posterior, model, integrator, steps, copies, seed)
-        if loops is None:
-            control = None if feedback is None else _flat_feedback(feedback, shape, forces.shape[-1])
-            report = None if counted is None else counted(before)
-            motion = integrate(*given, feedback=control, what=what, progress=report)
-        else:
-            motion = fused(loops, *given, what=what)
-            if progress is not None:
-                progress(before + steps, total)
-        q_rows, v_rows, a_rows = (
-            x.movedim(0, 1).reshape(*shape, x.shape[0], x.shape[-1]) for x in (motion.q, motion.v, motion.a)
-        )
-        blocks = zip(*(x.reshape(-1, x.shape[-1]).split(ROWS_PER_BLOCK) for x in (q_rows, v_rows)), strict=True)
-        parts = zip(*(ConstraintManifold(model).violation(*block) for block in blocks), strict=True)
-        c, rate = (torch.cat(part).reshape(*q_rows.shape[:-1], -1) for part in parts)
-        change = [(after[0] - given).abs().amax(-1) for after, given in zip((motion.q, motion.v), start, strict=True)]
-        correction, diverged_at = torch.stack(change, dim=-1).reshape(*shape, 2), motion.diverged_at.reshape(shape)
+        if feedback is not None:
+            how["feedback"] = _flat_feedback(feedback, shape, forces.shape[-1])
+        found = moved(shape, loops, method, accelerations(posterior, model, copies, seed), *given, what=what, **how)
         time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
-        moved = (q_rows, v_rows, a_rows, c, rate, correction, diverged_at)
-        return Rollout(time, *moved, integrator, model.baumgarte, space=robot.space)
+        return Rollout(time, *found, integrator, model)
 
     with torch.set_grad_enabled(grad), blas_threads(0):
-        mean = run(0, "rollouts", 0)
-        return replace(mean, samples=run(samples, "sampled rollouts", steps)) if samples else mean
+        mean = run(0, "rollouts")
+        return replace(mean, samples=run(samples, "sampled rollouts")) if samples else mean
 
 
 def remembering(
@@ -313,10 +311,7 @@ def _flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedb
 def checked_start(
     sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
 ) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, size), u (T, n, size) as float64 tensors on the robot's device, and the batch dimensions.
-
-    Raises InvalidInput for what does not fit; with `remedy` also for tensors whose gradient would be lost.
-    """
+    """q0, v0 (n, size), u (T, n, size), and the batch; InvalidInput, with `remedy` also for tensors with gradients."""
     given = {}
     for size, (name, values) in zip(sizes, (("q0", q0), ("v0", v0), ("u", u)), strict=True):
         tensor = given[name] = state_tensor(name, values, size, device).to(device)
@@ -342,9 +337,8 @@ def checked_start(
 class StepLinearization(NamedTuple):
     """The state (q, v) after a step from x = (q, v) under u, and the affine model of the step: x+ = A x + B u + c.
 
-    `q`, `v` (nv,); `A` (2 nv, 2 nv) and `B` (2 nv, nu) are the derivatives in x and u, and `c` (2 nv,) = x+ - A x - B u
-    makes the model exact at this x and u. All with the leading dimension of states. Where a base moves, q in x and x+
-    is a step (nv,) from the given q and from the `q` (nq,) here, at which both are 0.
+    `A` (2 nv, 2 nv), `B` (2 nv, nu), `c` (2 nv,), all with the leading dimension of states. Where a base moves, q in x
+    and x+ is a step (nv,) from the given q and from the `q` (nq,) here, at which both are 0.
     """
 
     q: Tensor
@@ -429,10 +423,4 @@ def linearized_on_manifold(
 
 def _method(model: Model, dt: Any, integrator: Any) -> Integrator:
     check_time_step(dt)
-    method = integrator_named(integrator, model)
-    if integrator == "projected":
-        raise InvalidInput(
-            "a step is not 'projected': it would move the given state onto the contacts first; give "
-            f"{', '.join(map(repr, INTEGRATORS.keys() - {integrator}))}, or roll out with integrator='projected'."
-        )
-    return method
+    return integrator_named(integrator, model)

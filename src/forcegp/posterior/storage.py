@@ -1,9 +1,6 @@
-"""Fitted models on disk: a folder with `model.json`, `tensors.safetensors` and `robot.urdf`. No code, no pickle.
+"""Fitted models on disk: a folder with `model.json`, `tensors.safetensors`, `robot.urdf`, digests. No code, no pickle.
 
-`SHA256SUMS` holds the digest of each: a flipped bit would hardly ever be noticed otherwise. Another program may have
-written both, so what is read must have the shapes that the model needs. A model that was carried to another one
-(`with_model`) has `target.urdf`, too, the robot there. The folder holds the training points and parameters; loading
-runs the same conditioning as fitting, so predictions are the same.
+It holds training points and parameters, after `with_model` also `target.urdf`; loading conditions as fitting does.
 """
 
 import json
@@ -24,7 +21,7 @@ from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_a
 from forcegp.evidence.training_data import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.model import Model
-from forcegp.posterior.estimates import Estimates
+from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.posterior import Posterior
 
 KIND = "forcegp posterior"
@@ -52,11 +49,7 @@ ROBOT, TARGET = "robot.urdf", "target.urdf"
 def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = False) -> None:
     """Write `posterior` as the folder `path`, whole or not at all; with `overwrite` an old model stays until then.
 
-    Raises
-    ------
-    FileFormatError: `path` is there, is not an empty folder, and `overwrite` is false, or is not a model folder, or is
-        one to which files were added.
-    ContactError: a surface of the system holds code.
+    Raises FileFormatError where `path` is no empty folder and may not be replaced, ContactError for surfaces with code.
     """
     require_type("posterior", posterior, Posterior)
     path = Path(path)
@@ -109,12 +102,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
 
 @usable_arguments("load_posterior")
 def load_posterior(path: str | Path) -> Posterior:
-    """Read a folder that `save_posterior` wrote; it predicts without the training file.
-
-    Raises
-    ------
-    FileFormatError: not such a folder, damaged, or written by another version.
-    """
+    """Read what `save_posterior` wrote. FileFormatError for others, damaged, or of another version."""
     path = Path(path)
     document = _document(path)
     require_unchanged(path, "fit the model again")

@@ -1,7 +1,6 @@
 """A fitted model that learns from more rows: exact conditioning at the parameters that it has, in bounded memory."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import DataWarning, InvalidInput, require_known
+from forcegp.errors import InvalidInput, require_known
 from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.training_data import TrainingData, check_distance
 from forcegp.forces import UnknownForces
@@ -27,9 +26,6 @@ Structured = Any
 
 SHARE_AT_ONCE = 4
 """With a budget, rows are taken in by budget / SHARE_AT_ONCE at a time, which bounds the memory of many rows."""
-
-OTHER_NOISE = 0.1
-"""Part of the fit's level of noise by which rows may state another one without a warning."""
 
 
 def learn_more_rows(
@@ -103,11 +99,9 @@ def _parts_kept(
 
 def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
     """The likelihood of other rows, checked, with the standardization at hand instead of one that is computed again."""
-    likelihood, noise = posterior.likelihood, posterior.trained.noise
-    training, stated = likelihood.training, rows.noise_std
+    likelihood, stated = posterior.likelihood, rows.noise_std
+    training = likelihood.training
     reference = training if training.reference is None else training.reference
-    if noise is not None and noise.from_data and reference.noise_std is None:
-        _warn_of_another_noise(posterior.noise_std.cpu().numpy(), rows)
     if reference.noise_std is not None and stated is not None and stated.ndim == 1:
         rows = replace(rows, noise_std=np.tile(stated, (len(rows), 1)))  # every row states it then
     alike = training.correlated_rows
@@ -115,22 +109,6 @@ def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
     likelihood.model.check_states(added.q, added.v, added.u)
     check_distance(likelihood.model, added)
     return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
-
-
-def _warn_of_another_noise(level: np.ndarray, rows: Dataset) -> None:
-    """DataWarning where rows state one noise for all of them, another than the fit's data did, which stays in use."""
-    stated = rows.noise_std
-    if stated is None or stated.ndim == 2:
-        return  # nothing stated, or stated row by row: then every row is as noisy as stated
-    if bool((np.abs(stated / level - 1.0) > OTHER_NOISE).any()):
-        levels = ", ".join(f"{mine:.3g} ({fit:.3g})" for mine, fit in zip(stated, level, strict=True))
-        warnings.warn(
-            f"the new rows state another noise per joint than the data of the fit (in brackets): {levels}. The level "
-            "of the fit is used for them, too; state the noise of every row (noise_std of shape (rows, nv)) in the fit "
-            "and here, or fit again to all rows",
-            DataWarning,
-            stacklevel=5,
-        )
 
 
 def _require_memory(latent: ExactPosterior, added: int, height: int, budget: int | None) -> None:

@@ -86,11 +86,7 @@ def import_recordings(
     options = options or ImportOptions()
     if not paths:
         raise InvalidInput("no logs are given.")
-    robot, wheels = None, set[str]()
-    if model is not None:  # wheels that roll turn as often as they like
-        robot = model.robot
-        rolling = [each for each in model.contacts if isinstance(each, forcegp.mechanics.RollingContact)]
-        wheels = {robot.layout.bodies[robot.frame(each.frame)[0]].name for each in rolling}
+    robot = None if model is None else model.robot
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
     plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
@@ -103,7 +99,7 @@ def import_recordings(
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         report(index, len(sources), f"reading {label}")
-        believed = own.joints if "q" in mapping.unit else wheels
+        believed = own.joints if "q" in mapping.unit else ()
         recordings.append(read_recording(source, own, label, options, robot, believed))
     step = _even_step(recordings, options)
     done = _what_was_done(mapping, plan, recordings, step, options, sources)

@@ -17,7 +17,7 @@ from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping
 from forcegp.recordings.source import Source
 from forcegp.robots import Robot
 from forcegp.robots.layout import WORLD
-from forcegp.robots.manifold import ConfigurationSpace, Group
+from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace, Group
 
 ANGLES = ("roll", "pitch", "yaw")
 TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
@@ -30,7 +30,7 @@ def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> t
     """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
     names = list(joints)
     for group, span in spans(robot.space, orientation):
-        names[span.start : span.start] = [f"{group.name}.{part}" for part in _written(group, orientation)]
+        names[span.start : span.start] = [f"{group.name}.{part}" for part in _written(orientation)]
     return tuple(names)
 
 
@@ -38,16 +38,14 @@ def spans(space: ConfigurationSpace, orientation: str) -> Iterator[tuple[Group, 
     """Every base and its columns among those of q in a log."""
     more = 0
     for group in space.groups:
-        start, size = group.place + more, len(_written(group, orientation))
-        more += size - len(group.motion.positions)
+        start, size = group.place + more, len(_written(orientation))
+        more += size - len(POSITIONS)
         yield group, slice(start, start + size)
 
 
-def _written(group: Group, orientation: str) -> tuple[str, ...]:
-    place, turn = group.motion.positions[: group.motion.turn.start], group.motion.positions[group.motion.turn]
-    if orientation == "angles":
-        return place + (ANGLES[2:] if group.kind == "planar" else ANGLES)
-    return place + (turn[-1:] + turn[:-1] if orientation == "wxyz" and group.kind != "planar" else turn)
+def _written(orientation: str) -> tuple[str, ...]:
+    place, turn = POSITIONS[: TURN.start], POSITIONS[TURN]
+    return place + (ANGLES if orientation == "angles" else turn[-1:] + turn[:-1] if orientation == "wxyz" else turn)
 
 
 def bases(robot: Robot) -> tuple[Group, ...]:
@@ -104,17 +102,15 @@ def read_poses(
     q = np.delete(table, [column for _, span in turned for column in range(span.start, span.stop)], axis=1)
     jumps, notes = list[Jumps](), list[str]()
     for group, span in turned:
-        given, first = table[:, span], group.motion.turn.start
-        if orientation == "angles" and group.kind == "planar":
-            turn = np.hstack([np.cos(given[:, first:]), np.sin(given[:, first:])])
-        elif orientation == "angles":
+        given, first = table[:, span], TURN.start
+        if orientation == "angles":
             turn = np.array(Rotation.from_euler("xyz", given[:, first:]).as_quat())
         else:
             length = np.linalg.norm(given[:, first:], axis=1, keepdims=True)
             error = np.abs(length[:, 0] - 1.0)
             row = int(error.argmax())
             if error[row] > LARGEST_ERROR:
-                names = ", ".join(group.motion.positions[group.motion.turn])
+                names = ", ".join(POSITIONS[TURN])
                 raise DatasetError(
                     f"{source.path}: the orientation of {group.name!r} ({names}) has the length {length[row, 0]:.4g} "
                     f"at {source.place(row)}; a turn has length 1. Map its columns, give `orientation` angles if they "
@@ -123,7 +119,7 @@ def read_poses(
             if error[row] > ROUNDED:
                 notes.append(f"orientations divided by their length, which differs from 1 by up to {error[row]:.2g}")
             turn = given[:, first:] / length
-        turn, jumped = following(group, turn, turn[0])
+        turn, jumped = following(turn, turn[0])
         jumped[begins] = False
         seen = f"{group.name!r} turns by more than a quarter of a turn"
         remedy = (
@@ -178,7 +174,7 @@ class Layout:
         more = {"gravity": torch.tensor(self.gravity, dtype=torch.float64)} if signal == "a" else {}
         for group in self.bases:
             own = {**more, "v": moving[:, group.rows]} if more else {}
-            found[:, group.rows] = in_base(group, at[:, group.places], found[:, group.rows], self.axes[signal], **own)
+            found[:, group.rows] = in_base(at[:, group.places], found[:, group.rows], self.axes[signal], **own)
         return found.numpy()
 
 
@@ -197,7 +193,7 @@ def layout_of(mapping: ColumnMapping, model: Model | None, lacking: Mapping[str,
         )
     for name, group in ((name, group) for name in axes for group in groups):
         for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
-            rows = {group.row + k for k, entry in enumerate(group.motion.free) if entry in part}
+            rows = {group.row + k for k in part}
             if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
                 raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
     if model is None:

@@ -1,12 +1,11 @@
-"""Checks of what callers pass in: numbers, devices, shapes, and batches that broadcast.
+"""Checks of what callers pass in, numbers, shapes and robot files; real numbers become float64, others are refused."""
 
-Real numbers of any precision are taken and computed with in float64, which changes none of them. What would be read as
-other numbers than were meant is refused: text, dates, booleans, complex numbers, masked entries.
-"""
-
+import contextlib
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+import shlex
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -14,7 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import ForceGPError, InvalidInput, UnknownJoint, require_known
+from forcegp.errors import (
+    ForceGPError,
+    InvalidInput,
+    RobotFileWarning,
+    RobotModelError,
+    UnknownJoint,
+    require_known,
+)
 
 LARGEST = 2**63 - 1
 """Of the integers that every library takes."""
@@ -144,9 +150,11 @@ def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.nd
 
 
 def checked_point(point: Vector, device: torch.device) -> Tensor:
-    """A point (..., 3) in m as a float64 tensor on ``device``; :class:`~forcegp.errors.InvalidInput` for others."""
+    """A point (3,) in m as a float64 tensor on ``device``; InvalidInput for others."""
     if not isinstance(point, Tensor):
         point = torch.as_tensor(finite_vector("point", point, 3), device=device)
+    if point.dim() != 1:
+        raise InvalidInput(f"point has shape {tuple(point.shape)}; give one point (3,), x, y, z in m.")
     return checked_tensor("point", point, 3, "x, y, z in m", device)
 
 
@@ -183,3 +191,79 @@ def locked_positions(locked: Mapping[str, float | int]) -> dict[str, float]:
         if not np.isfinite(out[name]):
             raise InvalidInput(f"locked[{name!r}] is {position!r}; give a finite position in rad or m.")
     return out
+
+
+LISTED = 12
+"""Problems of one kind that a message lists; the error has all of them."""
+
+
+class Problems:
+    """What is wrong with a file, and what was repaired, in one report with the arguments that mend it together.
+
+    `source` begins every message; `given` are arguments that the remedy keeps; `reader` reads the file.
+    """
+
+    def __init__(self, source: str, given: Mapping[str, Any] | None = None, reader: str = "Robot.from_urdf") -> None:
+        self.source, self.given, self.reader = source, dict(given or {}), reader
+        self.errors: list[RobotModelError] = []
+        self.broken: set[str] = set()
+        """Links of which something is reported, so that nothing else need be."""
+        self.notes: dict[str, list[str]] = {}
+
+    @contextlib.contextmanager
+    def collected(self, link: str | None = None) -> Iterator[None]:
+        """Keep an error of the file, of a `link` for example, for the report, and go on."""
+        try:
+            yield
+        except RobotModelError as error:
+            self.errors.append(error)
+            if link is not None:
+                self.broken.add(link)
+
+    def note(self, what: str, where: str) -> None:
+        """Note what was ignored or repaired, and of which element."""
+        self.notes.setdefault(what, []).append(where)
+
+    def warn(self, stacklevel: int) -> None:
+        """One RobotFileWarning about all that was noted."""
+        if self.notes:
+            text = "; ".join(f"{what} ({', '.join(where)})" for what, where in self.notes.items())
+            warnings.warn(f"{self.source}: {text}.", RobotFileWarning, stacklevel=stacklevel)
+
+    def raise_all(self) -> None:
+        """Raise what was collected as one error: of their class where they are alike, else a RobotModelError."""
+        if not self.errors:
+            return
+        remedy: dict[str, Any] = {}
+        for arguments in (*(error.remedy for error in self.errors), self.given):
+            for name, value in arguments.items() if remedy or arguments is not self.given else ():
+                before = remedy.get(name)
+                remedy[name] = {**value, **(before or {})} if isinstance(value, Mapping) else before or value
+        alike: dict[str, list[str]] = {}  # what to do is said once for all that are alike
+        for error in self.errors:
+            alike.setdefault(error.advice, []).append(error.seen.removeprefix(f"{self.source}: "))
+        texts = [
+            "; ".join([*seen[:LISTED], *([f"and {len(seen) - LISTED} more like these"] * (len(seen) > LISTED))])
+            + advice
+            for advice, seen in alike.items()
+        ]
+        many, by_hand = len(self.errors) > 1, not all(error.remedy for error in self.errors)
+        text = f"{self.source}: {f'{len(self.errors)} problems: ' if many else ''}{' '.join(texts)}"
+        if remedy:
+            which = "the others, when the file is corrected" if by_hand else "all" if many else "it"
+            text += f" The remedy for {which}: {remedy_text(remedy, self.reader)}"
+        kinds = {type(error) for error in self.errors}
+        found = (kinds.pop() if len(kinds) == 1 else RobotModelError)(text, "", {} if by_hand else remedy)
+        found.problems = tuple(str(error) for error in self.errors)
+        raise found from None
+
+
+def remedy_text(remedy: Mapping[str, Any], reader: str) -> str:
+    """The arguments in Python, and the options of the command line that they are."""
+    words = []
+    for name, value in remedy.items():
+        short = {k: f"{x:g}" if float(f"{x:g}") == x else repr(x) for k, x in value.items()} if name == "locked" else {}
+        listed = ",".join(f"{k}={x}" for k, x in short.items()) if short else value
+        words.append(f"--{'lock' if name == 'locked' else name} {shlex.quote(listed)}")
+    python = ", ".join(f"{name}={value!r}" for name, value in remedy.items())
+    return f"{reader}(path, {python}), or {' '.join(words)}."

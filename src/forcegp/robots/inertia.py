@@ -1,12 +1,7 @@
-"""Inertial parameters of a rigid body: mass, centre of mass, inertia <-> pseudo-inertia.
+"""Rotations, and inertial parameters of a body: mass, centre of mass, inertia <-> pseudo-inertia P (4, 4).
 
-The 4x4 pseudo-inertia of a body (Wensing, Kim & Slotine, "Linear matrix inequalities for physically consistent inertial
-parameter identification", RA-L 2018) in the axes of its link frame is
-
-    P = [[Sigma + m c c^T, m c], [m c^T, m]],    Sigma = tr(I)/2 1 - I,
-
-with mass ``m`` (kg), centre of mass ``c`` (m) and inertia ``I`` about the centre of mass (kg m^2). A mass distribution
-with these parameters exists if and only if P is positive semi-definite, which includes the triangle inequality of I.
+P = [[Sigma + m c c^T, m c], [m c^T, m]], Sigma = tr(I)/2 1 - I (Wensing, Kim & Slotine, RA-L 2018); a body of mass m in
+kg, centre c in m and inertia I about it in kg m^2 has P if and only if that is positive semi-definite.
 """
 
 import math
@@ -91,11 +86,7 @@ _STANDARD[[1, 4, 2, 8, 6, 9], [5, 5, 7, 7, 8, 8]] = -1.0
 
 
 def standard_basis(device: torch.device | None = None) -> Float[Tensor, "16 10"]:
-    """The matrix that turns standard parameters (10,) into the pseudo-inertia, its entries row by row.
-
-    Standard parameters are ``m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz`` in kg, kg m and kg m^2, inertia about
-    the *origin* of the frame (Pinocchio's order). Joint forces are linear in them.
-    """
+    """From standard parameters m, m c, I about the *origin* (10,) to the pseudo-inertia by rows (Pinocchio's order)."""
     return torch.as_tensor(_STANDARD, device=device)
 
 
@@ -125,11 +116,7 @@ def physical_of_pseudo_inertia(pseudo: np.ndarray) -> tuple[float, np.ndarray, n
 
 
 def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> str | None:
-    """What makes these inertial parameters physically impossible, or ``None`` if a body can have them.
-
-    Ideal rods, plates and points (singular pseudo-inertia) are possible; a violation within float64 rounding is
-    forgiven. Whether a joint can move such a body: :func:`axis_inertia_vanishes`.
-    """
+    """What makes these parameters impossible beyond rounding, or None; ideal rods, plates and points are possible."""
     if not (np.isfinite(mass) and np.isfinite(center_of_mass).all() and np.isfinite(inertia).all()):
         return "it holds values that are not finite"
     if mass < 0.0:
@@ -150,21 +137,13 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
 
 
 def axis_inertia_vanishes(pseudo: np.ndarray) -> bool:
-    """Whether all mass of a body (pseudo-inertia (4, 4), joint axis along z through the origin) lies on that axis.
-
-    The inertia about the axis is ``P_xx + P_yy``; below ``SINGULAR`` of the trace of the second moments it is what
-    rounding left of zero.
-    """
+    """Whether all mass of a body (pseudo-inertia (4, 4), axis along z through the origin) lies on that axis."""
     second_moments = pseudo.diagonal()[:3]
     return bool(second_moments[:2].sum() <= SINGULAR * second_moments.sum())
 
 
-def turns_with_inertia(kind: str, pseudo: np.ndarray) -> bool:
-    """Whether a body (pseudo-inertia (4, 4)) under a planar, spherical or floating joint resists every turn.
-
-    A spherical joint turns it about the origin; the others leave it free to turn about its centre of mass.
-    """
+def turns_with_inertia(pseudo: np.ndarray) -> bool:
+    """Whether a body (pseudo-inertia (4, 4)) that moves freely resists every turn."""
     first, mass = pseudo[:3, 3], pseudo[3, 3]
-    second = pseudo[:3, :3] - (0.0 if kind == "spherical" else np.outer(first, first) / mass)
-    least = second[0, 0] + second[1, 1] if kind == "planar" else np.linalg.eigvalsh(second)[1]
+    least = np.linalg.eigvalsh(pseudo[:3, :3] - np.outer(first, first) / mass)[1]
     return bool(least > SINGULAR * pseudo.diagonal()[:3].sum())

@@ -1,24 +1,16 @@
 """One kinematics pass over a batch of states, from which every dynamic and geometric quantity is read.
 
-A twist is the 3x4 matrix ``[[w]x, v]`` (the upper rows of an element of se(3)), with ``w`` the angular velocity and
-``v`` the velocity of the body point that passes the origin. The pseudo-inertia of a body in the world is
-``P_w = T P T^T``. With both,
+A twist is the 3x4 matrix S = [[w]x, v]. With pseudo-inertias P in the world and accelerations A_k = T''_k T_k^-1,
 
-    M_ij   = < S_i, S_j P_c,j >      for joint i above or equal to joint j, P_c,j summed over what joint j moves
-    tau_i  = < S_i, sum_k A_k P_k >  over the bodies k that joint i moves
+    M_ij = < S_i, S_j P_c,j > for i above j,    tau_i = < S_i, sum_k A_k P_k >
 
-where <., .> is the sum of products of entries and ``A_k = T''_k T_k^-1`` the acceleration of body k. These are the
-composite-rigid-body and recursive Newton-Euler algorithms (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6
-and 5) with their recursions over the tree written as products with the (n, n) descendant matrix.
-
-Tensors over joints or bodies have shape (n, rows, columns, batch): joints lead, so that sums over the tree are single
-matrix products; the batch, flattened to one dimension, trails, so that products of thousands of 4x4 matrices are
-vectorised over it (4 to 5 times faster on a CPU than ``torch.bmm`` with the batch in front). All functions compose
-differentiable operations without branches on values, so vmap, jacrev, jacfwd and repeated differentiation apply.
+(composite rigid bodies, recursive Newton-Euler: Featherstone 2008, ch. 6 and 5), recursions over the tree as products
+with the (n, n) descendant matrix. Tensors over bodies are (n, rows, columns, batch): a trailing batch is vectorised 4
+to 5 times faster than `torch.bmm`. No branches on values, so vmap, jacrev, jacfwd and repeated derivatives apply.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -30,8 +22,7 @@ from forcegp.robots.arguments import JointValues, Vector, broadcast_batch, check
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
 from forcegp.robots.manifold import Group, pose
-from forcegp.robots.structure import RobotStructure
-from forcegp.robots.tree import Tree
+from forcegp.robots.structure import RobotStructure, Tree
 
 Bodies = Float[Tensor, "n 4 4 batch"]
 """A 4x4 matrix of every body: its pose or its pseudo-inertia."""
@@ -112,7 +103,7 @@ def _replaced(tree: Tree, values: Tensor, of_group: Callable[[Group], Tensor]) -
 
 
 def _group_pose(group: Group, q: Float[Tensor, "nq batch"]) -> Float[Tensor, "1 4 4 batch"]:
-    rotation, origin = pose(group.kind, q[group.places].mT)
+    rotation, origin = pose(q[group.places].mT)
     upper = torch.cat([rotation, origin[..., None]], -1).movedim(0, -1)
     last = q.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, q.shape[-1])
     return torch.cat([upper, last])[None]
@@ -124,17 +115,13 @@ def _group_vectors(group: Group, body: Float[Tensor, "4 4 batch"]) -> Float[Tens
     axes = rotation.movedim(1, 0)  # (3, 3, batch), one axis in the world each
     moments = torch.linalg.cross(origin.expand_as(axes), axes, dim=1)
     linear = torch.cat([torch.zeros_like(axes), axes], dim=1)
-    return torch.cat([linear, torch.cat([axes, moments], dim=1)])[list(group.motion.free)]
+    return torch.cat([linear, torch.cat([axes, moments], dim=1)])
 
 
 def body_accelerations(
     tree: Tree, twists: Twists, v: Float[Tensor, "n batch"], a: Float[Tensor, "n batch"] | None = None
 ) -> Twists:
-    """Accelerations ``A = T'' T^-1`` of all bodies, without gravity; ``a`` of None is zero.
-
-    With V the body's and V_p its parent body's twist, ``A = A_p + (V_p + V) S v + S a``: differentiating ``T' = V T``
-    twice along a chain, the bracket and the squared terms collapse to that one product.
-    """
+    """A = A_p + (V_p + V) S v + S a of all bodies, without gravity, from their twists; ``a`` of None is 0."""
     moving = twists * v[:, None, None]
     step = product(over_tree(tree.velocity_sum, moving)[:, :, :3], moving)
     if a is not None:
@@ -149,12 +136,9 @@ def world_inertias(poses: Bodies, inertias: Float[Tensor, "n 4 4 #batch"]) -> Bo
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Body poses, joint twists and accelerations of a robot at states (q, v); made by ``robot.kinematics(q, v)``.
+    """Poses, twists and accelerations at states (q, v), made by ``robot.kinematics(q, v)``; its fields are internal.
 
-    All methods are differentiable in q, v and their arguments. Batch dimensions broadcast. Methods that need velocities
-    raise :class:`~forcegp.errors.InvalidInput` if the kinematics was made without.
-
-    The fields are internal: the batch is flattened and trails.
+    Methods are differentiable, broadcast, and raise InvalidInput where they need velocities and it was made without.
     """
 
     robot: RobotStructure
@@ -202,52 +186,38 @@ class Kinematics:
 
     def inverse_dynamics(self, a: JointValues) -> Float[Tensor, "... nv"]:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
-        a = self.robot.checked_input("a", a)
-        at = self._expanded("a", a.shape[:-1])
-        _, v = at._moving("inverse_dynamics")
-        tree, a = self.robot.tree, _columns(a, at.batch_shape)
-        forces = at._joint_forces(body_accelerations(tree, at.twists, v, of_bodies(tree, a)), at.inertias)
-        return at._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
+        tree, a = self.robot.tree, self._given("a", a)
+        forces = self._joint_forces(self._accelerations(a), self.inertias)
+        return self._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
     def forward_dynamics(self, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
-        tau = self.robot.checked_input("tau", tau)
-        at = self._expanded("tau", tau.shape[:-1])
-        net = _columns(tau, at.batch_shape).mT - at._bias_forces(at.inertias)
+        net = self._given("tau", tau).mT - self._bias_forces(self.inertias)
         try:
-            factor = torch.linalg.cholesky(at._mass_matrix(at.inertias))
+            factor = torch.linalg.cholesky(self._mass_matrix(self.inertias))
         except torch.linalg.LinAlgError as error:
             raise NumericalError(NOT_POSITIVE_DEFINITE) from error
-        return at._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
+        return self._rows(torch.cholesky_solve(net[..., None], factor).squeeze(-1))
 
     def torque_regressor(self, a: Float[Tensor, "*batch nv"]) -> Float[Tensor, "... nv bodies parameters"]:
         """Joint forces per unit of the standard parameters of each body (..., nv, bodies, 10), armature left out.
 
-        A body is what a joint moves as one, also a joint that mimics another: its child link and all that is fixed to
-        it. Parameters are about the origin and in the axes of the child link, in the order of
-        :func:`forcegp.robots.inertia.standard_basis`.
+        A body is what a joint moves as one; parameters are in the frame of the child link (`inertia.standard_basis`).
         """
-        a = self.robot.checked_input("a", a)
-        at = self._expanded("a", a.shape[:-1])
-        _, v = at._moving("torque_regressor")
-        tree = self.robot.tree
-        accelerations = body_accelerations(tree, at.twists, v, of_bodies(tree, _columns(a, at.batch_shape)))
-        frames = product(at.poses, self._child_frames()[..., None])
+        tree, accelerations = self.robot.tree, self._accelerations(self._given("a", a))
+        frames = product(self.poses, self._child_frames()[..., None])
         basis, columns = standard_basis(self.robot.device), []
         for k in range(len(frames)):  # tau_i = tr((S_i T)^T (A_k - g) T P), P row by row
             frame = frames[k : k + 1]
-            left, right = product(at.twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
+            left, right = product(self.twists, frame), product(accelerations[k : k + 1] - tree.fall, frame)
             gathered = product(left.transpose(1, 2), right) * tree.descendants[:, k, None, None, None]
             columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
-        return at._rows(of_joints(tree, torch.stack(columns, dim=2)))
+        return self._rows(of_joints(tree, torch.stack(columns, dim=2)))
 
     def dynamics_of_bodies(
         self, parameters: Float[Tensor, "bodies 10"]
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
-        """Mass matrix and bias forces for any standard parameters of the bodies, as :meth:`torque_regressor` has them.
-
-        No body need have the parameters, so the mass matrix need not be positive definite.
-        """
+        """Mass matrix and bias forces for standard parameters of the bodies, which no body need have."""
         frames = self._child_frames()
         pseudo = frames @ pseudo_inertia_of_standard(parameters) @ frames.mT
         inertias = world_inertias(self.poses, pseudo[..., None])
@@ -261,30 +231,25 @@ class Kinematics:
         return self._rows(product(self.poses[body], offset[..., None]).movedim(-1, 0))
 
     def frame_jacobian(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
-        """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
-        at, body, position = self._world_point(frame, point)
+        """Jacobian (..., 6, nv) of a ``point`` (3,) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
+        body, position = self._world_point(frame, point)
         if body == WORLD:
-            return self.twists.new_zeros(*at.batch_shape, 6, self.robot.nv)
-        linear = product(at.twists, position)[:, :, 0]
-        jacobian = torch.cat([linear, at.vectors[:, :3]], dim=1)
+            return self.twists.new_zeros(*self.batch_shape, 6, self.robot.nv)
+        jacobian = torch.cat([product(self.twists, position)[:, :, 0], self.vectors[:, :3]], dim=1)
         tree = self.robot.tree
         jacobian = (jacobian * tree.descendants[:, body, None, None]).permute(2, 1, 0)
-        return at._rows(jacobian @ tree.coupling if tree.coupled else jacobian.contiguous())
+        return self._rows(jacobian @ tree.coupling if tree.coupled else jacobian.contiguous())
 
     def frame_bias_acceleration(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6"]:
-        """Classical acceleration (..., 6) of a ``point`` fixed in ``frame`` at zero joint acceleration.
-
-        This is ``Jdot v`` for :meth:`frame_jacobian`: [linear; angular], in m/s^2 and rad/s^2, without gravity.
-        """
-        at, body, position = self._world_point(frame, point)
-        accelerations, _ = at._moving("frame_bias_acceleration")
+        """Jdot v (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], m/s^2 and rad/s^2, no gravity."""
+        body, position = self._world_point(frame, point)
+        accelerations, _ = self._moving("frame_bias_acceleration")
         if body == WORLD:
-            return self.twists.new_zeros(*at.batch_shape, 6)
-        acceleration = accelerations[body]
-        linear = product(acceleration, position)[:, 0]
+            return self.twists.new_zeros(*self.batch_shape, 6)
+        linear = product(accelerations[body], position)[:, 0]
         # A = [dw/dt]x + [w]x [w]x, whose second part is symmetric: the basis reads dw/dt off the antisymmetric half
-        angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ acceleration.flatten(0, 1))
-        return at._rows(torch.cat([linear, angular]).mT)
+        angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ accelerations[body].flatten(0, 1))
+        return self._rows(torch.cat([linear, angular]).mT)
 
     def _rows(self, values: Tensor) -> Tensor:
         """Give values (batch, ...) their batch dimensions back."""
@@ -301,8 +266,7 @@ class Kinematics:
         above = product(self.vectors, momenta.transpose(0, 1))
         # right where the row's joint moves the column's body; elsewhere the transpose is, or neither on other branches
         out = torch.where(tree.is_above, above, above.transpose(0, 1))
-        if not tree.is_chain:
-            out = out * tree.related
+        out = out if tree.is_chain else out * tree.related
         if tree.coupled:
             out = torch.einsum("ki,klb,lj->ijb", tree.coupling, out, tree.coupling)
         if tree.has_armature:
@@ -324,35 +288,24 @@ class Kinematics:
             raise InvalidInput(f"{what} needs velocities; make the kinematics with robot.kinematics(q, v).")
         return self.accelerations, self.v
 
-    def _world_point(self, frame: str, point: Vector | None) -> "tuple[Kinematics, int, Tensor]":
-        """States broadcast against the batch of ``point``, the body of ``frame``, and the point (4, 1, batch) there."""
+    def _accelerations(self, a: Tensor) -> Twists:
+        _, v = self._moving("this")
+        return body_accelerations(self.robot.tree, self.twists, v, of_bodies(self.robot.tree, a))
+
+    def _world_point(self, frame: str, point: Vector | None) -> tuple[int, Tensor]:
+        """The body of ``frame``, and the point (4, 1, batch) of it in the world."""
         body, offset = self.robot.frame(frame)
-        at = self
-        if point is None:
-            local = offset[:, 3:, None]
-        else:
-            point = checked_point(point, self.robot.device)
-            homogeneous = offset[:, :3] @ point[..., None] + offset[:, 3:]
-            if point.dim() == 1:
-                local = homogeneous[..., None]
-            else:
-                at = self._expanded("point", point.shape[:-1])
-                local = _expand_trailing(homogeneous.movedim((-2, -1), (0, 1)), 2, at.batch_shape)
-        return at, body, local if body == WORLD else product(at.poses[body], local)
+        local = offset[:, 3:]
+        if point is not None:
+            local = offset[:, :3] @ checked_point(point, self.robot.device)[:, None] + local
+        return body, local[..., None] if body == WORLD else product(self.poses[body], local[..., None])
 
-    def _expanded(self, name: str, given: torch.Size) -> "Kinematics":
-        """These states, broadcast against the batch of the argument ``name``."""
-        batch = broadcast_batch({"the states": self.batch_shape, name: given})
-        if batch == self.batch_shape:
-            return self
-
-        def wider(values: Tensor) -> Tensor:
-            lead = values.shape[:-1]
-            return _expand_trailing(values.reshape(*lead, *self.batch_shape), len(lead), batch)
-
-        names = ("poses", "vectors", "twists", "v", "accelerations")
-        tensors = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return replace(self, batch_shape=batch, **{name: wider(value) for name, value in tensors.items()})
+    def _given(self, name: str, values: JointValues) -> Float[Tensor, "nv batch"]:
+        """Values at the joints, one for each state or one for all. Raises InvalidInput for others."""
+        values = self.robot.checked_input(name, values)
+        if broadcast_batch({"the states": self.batch_shape, name: values.shape[:-1]}) != self.batch_shape:
+            raise InvalidInput(f"{name} has shape {tuple(values.shape)} for states {tuple(self.batch_shape)}.")
+        return _columns(values, self.batch_shape)
 
 
 def _columns(values: Tensor, batch: torch.Size) -> Tensor:
@@ -361,10 +314,3 @@ def _columns(values: Tensor, batch: torch.Size) -> Tensor:
     if values.shape[:-1] != batch:
         values = values.expand(*batch, size)
     return values.reshape(batch.numel(), size).mT.contiguous()
-
-
-def _expand_trailing(values: Tensor, lead: int, batch: torch.Size) -> Tensor:
-    """Broadcast the batch dimensions that follow the first ``lead`` ones to ``batch``, and flatten them."""
-    head, own = values.shape[:lead], values.shape[lead:]
-    values = values.reshape(*head, *(1 for _ in range(len(batch) - len(own))), *own)
-    return values.expand(*head, *batch).reshape(*head, batch.numel())

@@ -1,28 +1,9 @@
 """Which body carries which link, in what order the joints come, and whether all of it is a tree.
 
-Movable joints are numbered depth first, children in the order in which their joints stand in the file. (Pinocchio
-visits children alphabetically; map by joint name when comparing.) Each of them moves a *body*: its child link and all
-links fixed to it. A body's frame is the child link's frame turned so that its z axis is the joint axis, which makes
-every joint a rotation about or a translation along z.
-
-A joint that mimics another one moves a body, too, but has no coordinate of its own (:mod:`forcegp.robots.layout`). The
-positions of the bodies' joints are ``G q + g`` with q those of the ``nv`` others; without mimic joints G is the
-identity and body i is that of joint i.
-
-A joint of several degrees of freedom stands for as many joints and bodies, one after the other, which all move together
-(:mod:`forcegp.robots.manifold`). The last of them carries the links; the bodies of the others are empty.
-
-A mimic joint moves its body by ``multiplier q + offset`` with q the position of another joint, or of the one that this
-one mimics in turn. With G from the coordinates to the joints of all bodies,
-
-    M = G^T M_all G,    bias = G^T bias_all,    J = J_all G,
-
-exact, and with the inertia that the other joint feels of it. Nothing is elastic, and nothing slips.
-
-A URDF begins at a root link, and nothing in the format tells an arm on a table from a robot that walks, drives or
-flies. To weld such a robot to the world would answer with wrong forces and no word. So the question is asked where
-links that stand still have mass, no link called world holds them by a fixed joint, and names speak of two legs, wheels
-or rotors, of a pelvis, or of something that flies (measured: benchmarks/robot_files.py).
+Movable joints are numbered depth first, children in file order (Pinocchio's: alphabetical). Each moves a body: its
+child link, turned so that z is the joint axis, and what is fixed to it. Of a joint of several degrees of freedom the
+last body carries the links. A mimic joint moves by ``multiplier q + offset``: with G from coordinates to joints of all
+bodies, M = G^T M_all G, bias = G^T bias_all, J = J_all G, exactly.
 """
 
 import re
@@ -42,13 +23,13 @@ from forcegp.errors import (
     UnsupportedJoint,
     require_known,
 )
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
-from forcegp.robots.manifold import MOTIONS, Group
-from forcegp.robots.problems import Problems
-from forcegp.robots.urdf import FREE, MOVABLE, Joint, RobotDescription, free_joint
+from forcegp.robots.manifold import POSITIONS, VELOCITIES, Group
+from forcegp.robots.urdf import MOVABLE, Joint, RobotDescription, free_joint
 
-BaseChoice = Literal["fixed", "floating", "planar", "spherical"]
-"""How the root link is held: "fixed" in the world, free, free in the plane z = 0, or free to turn about its origin."""
+BaseChoice = Literal["fixed", "floating"]
+"""How the root link is held: in the world, or not at all."""
 
 WORLDS = ("world", "map", "odom", "ground", "universe")
 WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
@@ -68,15 +49,15 @@ def check_choice(base: str | None) -> None:
 
 
 def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
-    """Report a robot that nobody said is bolted to the world, unless that was done.
+    """Report a robot that nobody said is bolted to the world, where names speak of legs, wheels, rotors or flight.
 
-    ``standing`` are the links that do not move, the root first.
+    ``standing`` are the links that do not move, the root first (measured: benchmarks/robot_files.py).
     """
     if not standing:
         return  # nothing stands still
     root, still = standing[0], set(standing)
     mass = sum(inertial.mass for name in standing if (inertial := description.links[name]))
-    asked = "base" in problems.given or any(isinstance(error, UnstatedBase) for error in problems.errors)
+    asked = "base" in problems.given
     if asked or mass == 0.0:  # one that is NaN or negative is a mistake, and no sign of a robot that is bolted
         return
     holding = {joint.type for joint in description.joints if joint.parent == root}
@@ -106,10 +87,7 @@ class Drive(NamedTuple):
 def followed(
     description: RobotDescription, locked: Mapping[str, float], problems: Problems
 ) -> tuple[dict[str, float], dict[str, tuple[str, float, float]]]:
-    """Joints that stand still, with their positions, and of mimic joints the one that they follow in the end.
-
-    A joint that follows a locked or fixed one stands still, as does one with a multiplier of 0.
-    """
+    """Positions of joints that stand still, and of mimic joints the one that they follow in the end."""
     by_name = {joint.name: joint for joint in description.joints}
     held: dict[str, float] = dict(locked)
     drives: dict[str, tuple[str, float, float]] = {}
@@ -117,7 +95,7 @@ def followed(
         multiplier, offset, at, passed = 1.0, 0.0, joint, {joint.name}
         while at.mimics is not None and at.name not in locked:
             above = by_name.get(at.mimics.joint)
-            if above is None or above.name in passed or above.type in FREE:
+            if above is None or above.name in passed or above.type == "floating":
                 problems.errors.append(_objection(description.source, joint, at, above is not None))
                 multiplier, offset = 0.0, 0.0
                 break
@@ -161,9 +139,6 @@ def with_followers(
 WORLD = -1
 BASE = "base"
 """Name of the joint between the world and a base that moves."""
-BASES: tuple[BaseChoice, ...] = ("floating", "planar")
-"""Joints by which a file itself holds its base."""
-BOLTED: BaseChoice = "fixed"
 OUTSIDE = "(world)"
 """What carries such a base; no link of the robot."""
 MOST_BODIES = 1000
@@ -203,7 +178,7 @@ class Layout:
         last = 0
         for group in self.groups:
             names += [joint.name for joint in self.joints[last : group.rows.start]]
-            names += [f"{group.name}.{each}" for each in group.motion.positions]
+            names += [f"{group.name}.{each}" for each in POSITIONS]
             last = group.rows.stop
         return (*names, *(joint.name for joint in self.joints[last:]))
 
@@ -240,10 +215,7 @@ class Layout:
 def lay_out(
     description: RobotDescription, locked: Mapping[str, float], base: BaseChoice | None, problems: Problems
 ) -> Layout:
-    """Order the joints, turn ``locked`` ones into fixed ones and merge fixed links into the bodies that carry them.
-
-    Raises what makes the joints no tree; ``problems`` collects the others, as if their remedies were applied.
-    """
+    """Order the joints and merge links that are fixed or locked; raises what makes them no tree, collects the rest."""
     _check_locked(description, locked)
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)
@@ -259,21 +231,15 @@ def lay_out(
     massive = any(inertial.mass for link in still if (inertial := description.links[link]))
     hung = root.lower() in WORLDS or not massive  # else such a joint carries something else than the robot itself
     below = [joint for link in still if hung for joint in children[link] if joint.name not in held]
-    own: dict[str, BaseChoice] = {joint.name: kind for joint in below for kind in BASES if kind == joint.type}
-    if own and base not in (None, "fixed", *own.values()):
-        other = next(iter(own))
-        raise InvalidInput(
-            f"{description.source}: base is {base!r}, and the file holds its base by joint {other!r} of type "
-            f"{own[other]!r}; leave base out, give 'fixed', or take that joint out of the file."
-        )
-    if base not in (None, "fixed") and not own:
+    own = {joint.name for joint in below if joint.type == "floating"}  # the file's own hold of its base
+    if base == "floating" and not own:
         links = {OUTSIDE: Placement(WORLD, np.eye(4))}
-        stack = [free_joint(BASE, str(base), OUTSIDE, root)]
+        stack = [free_joint(BASE, OUTSIDE, root)]
     while stack:
         joint = stack.pop()
         above = links[joint.parent]
         offset = above.offset @ joint.origin
-        free = joint.type in MOTIONS
+        free = joint.type == "floating"
         bolted = joint.name in own and base == "fixed"
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else joint_motion(joint, held.get(joint.name, 0.0))
@@ -282,10 +248,10 @@ def lay_out(
             rows, turn = [joint], transform(rotation_of_z_onto(joint.axis), np.zeros(3))
             if free:
                 row = sum(body.name not in drives for body in bodies)
-                place = row + sum(group.extra for group in groups)
-                groups.append(Group(joint.name, joint.type, row, place, len(bodies)))
-                rows = _rows_of(joint)
-                turn = turn if joint.type == "planar" else np.eye(4)
+                groups.append(Group(joint.name, row, row + len(groups), len(bodies)))
+                kinds = {each: "continuous" if each.startswith("r") else "prismatic" for each in VELOCITIES}
+                rows = [replace(joint, name=f"{joint.name}.{each}", type=kind) for each, kind in kinds.items()]
+                turn = np.eye(4)
             links[joint.child] = Placement(len(bodies) + len(rows) - 1, inverse(turn))
             bodies += rows
             parents += [above.body] * len(rows)
@@ -313,14 +279,8 @@ def lay_out(
         tuple(origins),
         {name: place for name, place in links.items() if name != OUTSIDE},
         tuple(groups),
-        base or (*own.values(), BOLTED)[0],
+        base or ("floating" if own else "fixed"),
     )
-
-
-def _rows_of(joint: Joint) -> list[Joint]:
-    """A joint of several degrees of freedom as one for each, called "base.x", "base.rz" and so on."""
-    kinds = {each: "continuous" if each.startswith("r") else "prismatic" for each in MOTIONS[joint.type].velocities}
-    return [replace(joint, name=f"{joint.name}.{each}", type=kind) for each, kind in kinds.items()]
 
 
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
@@ -329,7 +289,7 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
         require_known("joint", name, description.source, by_name, UnknownJoint)
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
-        if by_name[name].type in FREE and position != 0.0:
+        if by_name[name].type == "floating" and position != 0.0:
             raise InvalidInput(
                 f"{description.source}: joint {name!r} is {by_name[name].type}, so it can be locked at 0 alone."
             )

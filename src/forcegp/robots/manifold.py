@@ -1,22 +1,15 @@
-"""Joints of several degrees of freedom, and positions that are points of a manifold instead of vectors.
+"""A base that moves freely, and positions that are points of a manifold instead of vectors.
 
-| joint | q | v |
-|---|---|---|
-| floating | position of the child link (m), quaternion x, y, z, w | linear, then angular velocity |
-| planar | x, y (m), cos and sin of the angle | linear velocity along x and y, angular velocity |
-| spherical | quaternion x, y, z, w | angular velocity |
-
-Velocities are those of the child link in its own axes, as in Pinocchio. So `q' = q V` with V constant in the body, and
-the motion under a constant v is the exponential of v: `integrate`, whose inverse is `difference`.
-
-Pose and twist share one order of coordinates here, [linear; angular]. Formulas of the exponential of SE(3) and of the
-derivative of its logarithm: Sola, Deray & Atchuthan, "A micro Lie theory for state estimation in robotics" (2018),
-appendices B and D; Hairer, Lubich & Wanner, "Geometric Numerical Integration" (2006), eq. III.4.1 and lemma III.4.2.
+q of a floating joint is the position of the child link (m) and the quaternion x, y, z, w; v its linear and angular
+velocity in its own axes, as in Pinocchio: q' = q V. Formulas: Sola, Deray & Atchuthan, "A micro Lie theory for state
+estimation in robotics" (2018), appendices B and D; Hairer, Lubich & Wanner, "Geometric Numerical Integration" (2006),
+eq. III.4.1 and lemma III.4.2.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -25,72 +18,41 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 
 LARGEST_NORM_ERROR = 1e-4
-"""By so much the length of a quaternion, or of (cos, sin), may differ from 1: logs are rounded."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A kind of joint with several degrees of freedom: which of the six velocities of its link are free."""
-
-    free: tuple[int, ...]
-    """Places of its velocities among [linear; angular]."""
-    positions: tuple[str, ...]
-    """Names of its entries of q."""
-    turn: slice
-    """Which of them are a quaternion, or cos and sin."""
-    neutral: tuple[float, ...]
-
-    @property
-    def velocities(self) -> tuple[str, ...]:
-        """Names of its entries of v."""
-        return tuple(("x", "y", "z", "rx", "ry", "rz")[k] for k in self.free)
+"""By so much the length of a quaternion may differ from 1: logs are rounded."""
 
 
 QUATERNION = ("qx", "qy", "qz", "qw")
-MOTIONS = {
-    "floating": Motion((0, 1, 2, 3, 4, 5), ("x", "y", "z", *QUATERNION), slice(3, 7), (0.0,) * 6 + (1.0,)),
-    "planar": Motion((0, 1, 5), ("x", "y", "cos", "sin"), slice(2, 4), (0.0, 0.0, 1.0, 0.0)),
-    "spherical": Motion((3, 4, 5), QUATERNION, slice(0, 4), (0.0, 0.0, 0.0, 1.0)),
-}
+POSITIONS = ("x", "y", "z", *QUATERNION)
+VELOCITIES = ("x", "y", "z", "rx", "ry", "rz")
+TURN = slice(3, 7)
+NEUTRAL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Group:
-    """One such joint in a robot: its kind, its first entries of v and of q, and the first of its bodies.
-
-    It has as many bodies as entries of v, which all move together; the last of them carries the links.
-    """
+    """A floating joint: its first entries of v and of q, and the first of its six bodies, the last with the links."""
 
     name: str
-    kind: str
     row: int
     place: int
     body: int
-
-    @property
-    def motion(self) -> Motion:
-        """What its kind can do."""
-        return MOTIONS[self.kind]
+    kind: ClassVar[str] = "floating"
+    extra: ClassVar[int] = 1  # entries of q more than of v
 
     @property
     def rows(self) -> slice:
         """Its entries of v."""
-        return slice(self.row, self.row + len(self.motion.free))
+        return slice(self.row, self.row + 6)
 
     @property
     def places(self) -> slice:
         """Its entries of q."""
-        return slice(self.place, self.place + len(self.motion.positions))
+        return slice(self.place, self.place + 7)
 
     @property
     def bodies(self) -> slice:
         """Its bodies."""
-        return slice(self.body, self.body + len(self.motion.free))
-
-    @property
-    def extra(self) -> int:
-        """By how many q has more entries than v."""
-        return len(self.motion.positions) - len(self.motion.free)
+        return slice(self.body, self.body + 6)
 
 
 @dataclass(frozen=True)
@@ -103,7 +65,7 @@ class ConfigurationSpace:
     @property
     def nq(self) -> int:
         """Size of q."""
-        return self.nv + sum(group.extra for group in self.groups)
+        return self.nv + len(self.groups)
 
     @property
     def single_rows(self) -> list[int]:
@@ -123,7 +85,7 @@ class ConfigurationSpace:
         q, step = self._broadcast(q, step)
         return self._joined(
             lambda rows, places: q[..., places] + step[..., rows],
-            lambda group: integrated(group.kind, q[..., group.places], step[..., group.rows]),
+            lambda group: integrated(q[..., group.places], step[..., group.rows]),
         )
 
     def difference(self, start: Tensor, end: Tensor) -> Tensor:
@@ -133,7 +95,7 @@ class ConfigurationSpace:
         start, end = self._broadcast(start, end)
         return self._joined(
             lambda _, places: end[..., places] - start[..., places],
-            lambda group: difference(group.kind, start[..., group.places], end[..., group.places]),
+            lambda group: difference(start[..., group.places], end[..., group.places]),
         )
 
     def tangent(self, q: Tensor) -> Tensor:
@@ -141,7 +103,7 @@ class ConfigurationSpace:
         unit = torch.eye(self.nv, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], -1, -1)
 
         def moved(group: Group) -> Tensor:
-            return velocity_of(group.kind, q[..., None, group.places], unit[..., group.rows])
+            return velocity_of(q[..., None, group.places], unit[..., group.rows])
 
         return self._joined(lambda rows, _: unit[..., rows], moved).mT
 
@@ -156,7 +118,7 @@ class ConfigurationSpace:
             return v
         return self._joined(
             lambda rows, _: v[..., rows],
-            lambda group: chart_velocity(group.kind, step[..., group.rows], v[..., group.rows]),
+            lambda group: chart_velocity(step[..., group.rows], v[..., group.rows]),
         )
 
     def chart_matrix(self, step: Tensor) -> Tensor:
@@ -164,68 +126,32 @@ class ConfigurationSpace:
         axes = torch.eye(self.nv, dtype=step.dtype, device=step.device).expand(*step.shape, -1)
         return self.chart_velocity(step[..., None, :].expand_as(axes), axes).mT
 
-    def midpoint_step(self, step: Tensor) -> Tensor:
-        """The step (..., nv) of the implicit midpoint rule whose body velocity times dt is `step` (:func:`cayley`)."""
-        if not self.groups:
-            return step
-
-        def turned(group: Group) -> Tensor:
-            own = step[..., group.rows]
-            return cayley(group.kind, _stretch(group.motion, own) * own)
-
-        return self._joined(lambda rows, _: step[..., rows], turned)
-
-    def midpoint_acceleration(self, step: Tensor, a: Tensor, still: Tensor) -> Tensor:
-        """The acceleration (..., nv) that belongs to :meth:`midpoint_step`, from those at the middle: `a`, and at rest.
-
-        What the velocity adds (a - still) acts for the stretched step; the rest, such as gravity, for the step as it
-        is, with what the middle hides of it across the axis of the turn given back. So a free body falls exactly.
-        """
-
-        def corrected(group: Group) -> Tensor:
-            own, rest = step[..., group.rows], still[..., group.rows]
-            stretch = _stretch(group.motion, own)
-            _, angular = _parts(group.motion, stretch * own)
-            square = (angular * angular).sum(-1, keepdim=True)
-            share = 0.25 / (1.0 + torch.sqrt(1.0 + 0.25 * square))  # (sqrt(1 + t^2/4) - 1) / t^2
-            parts = _parts(group.motion, rest)
-            across = [-torch.linalg.cross(angular, torch.linalg.cross(angular, part)) for part in parts]
-            hidden = (share * torch.cat(across, -1))[..., list(group.motion.free)]
-            return rest + hidden + stretch * (a[..., group.rows] - rest)
-
-        return self._joined(lambda rows, _: a[..., rows], corrected)
-
     def neutral(self) -> Float[Tensor, "nq"]:
         """q at 0 for every joint, bases upright at the origin."""
         return self._joined(
             lambda rows, _: torch.zeros(rows.stop - rows.start, dtype=torch.float64),
-            lambda group: torch.tensor(group.motion.neutral, dtype=torch.float64),
+            lambda group: torch.tensor(NEUTRAL, dtype=torch.float64),
         )
 
     def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
-        """q with quaternions, and (cos, sin), of length 1."""
+        """q with quaternions of length 1."""
 
         def unit(group: Group) -> Tensor:
-            own, turn = q[..., group.places], group.motion.turn
-            return torch.cat([own[..., : turn.start], _unit(own[..., turn]), own[..., turn.stop :]], -1)
+            own = q[..., group.places]
+            return torch.cat([own[..., :3], _unit(own[..., TURN])], -1)
 
         return self._joined(lambda _, places: q[..., places], unit)
 
     def check(self, q: Float[Tensor, "*batch nq"]) -> None:
-        """Raise InvalidInput, naming the entries, where a quaternion, or cos and sin, is far from length 1.
-
-        Inside `torch.func.vmap`, and where code is written, no number can be looked at; there only the direction counts
-        (:func:`pose`).
-        """
+        """Raise InvalidInput for a turn far from length 1, except inside `vmap` and where code is written."""
         for group in self.groups:
-            turn = group.motion.turn
-            length = torch.linalg.vector_norm(q.detach()[..., group.places][..., turn], dim=-1).flatten()
+            length = torch.linalg.vector_norm(q.detach()[..., group.places][..., TURN], dim=-1).flatten()
             try:
                 worst = float((length - 1.0).abs().max()) if len(length) else 0.0
             except (RuntimeError, InvalidInput):
                 return
             if not worst <= LARGEST_NORM_ERROR:
-                names = ", ".join(f"{group.name}.{name}" for name in group.motion.positions[turn])
+                names = ", ".join(f"{group.name}.{name}" for name in POSITIONS[TURN])
                 raise InvalidInput(
                     f"q has ({names}) of length {float(length[(length - 1.0).abs().argmax()]):.4g}; a turn has length "
                     "1: check the order of the columns, or divide by the length with robot.normalized(q)."
@@ -248,121 +174,62 @@ class ConfigurationSpace:
         return torch.cat([*parts, singles(slice(row, self.nv), slice(place, self.nq))], -1)
 
 
-def pose(kind: str, q: Float[Tensor, "*batch positions"]) -> tuple[Tensor, Tensor]:
+def pose(q: Float[Tensor, "*batch 7"]) -> tuple[Tensor, Tensor]:
     """Rotation (..., 3, 3) and translation (..., 3) of the child link. The length of a quaternion does not count."""
-    motion = MOTIONS[kind]
-    turn = q[..., motion.turn]
-    turn = turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
-    zero, one = torch.zeros_like(q[..., 0]), torch.ones_like(q[..., 0])
-    if kind == "planar":
-        c, s = turn.unbind(-1)
-        rows = [c, -s, zero, s, c, zero, zero, zero, one]
-        return torch.stack(rows, -1).unflatten(-1, (3, 3)), torch.stack([q[..., 0], q[..., 1], zero], -1)
-    x, y, z, w = turn.unbind(-1)
+    x, y, z, w = _unit(q[..., TURN]).unbind(-1)
     rows = [
         *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
         *(2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
         *(2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
     ]
-    origin = q[..., :3] if kind == "floating" else torch.stack([zero, zero, zero], -1)
-    return torch.stack(rows, -1).unflatten(-1, (3, 3)), origin
+    return torch.stack(rows, -1).unflatten(-1, (3, 3)), q[..., :3]
 
 
-def integrated(kind: str, q: Float[Tensor, "*batch positions"], step: Float[Tensor, "*batch velocities"]) -> Tensor:
+def integrated(q: Float[Tensor, "*batch 7"], step: Float[Tensor, "*batch 6"]) -> Tensor:
     """q after the constant body velocity `step` has acted for one second."""
-    motion = MOTIONS[kind]
-    linear, angular = _parts(motion, step)
+    linear, angular = _parts(step)
     square = (angular * angular).sum(-1, keepdim=True)
-    rotation, origin = pose(kind, q)
-    a, b = _versine(square), _rest(square)
-    twice = torch.linalg.cross(angular, torch.linalg.cross(angular, linear))
-    moved = linear + a * torch.linalg.cross(angular, linear) + b * twice
-    origin = origin + (rotation @ moved[..., None])[..., 0]
-    if kind == "planar":
-        turn = rotation[..., :2, 0]
-        angle = angular[..., 2]
-        c, s = angle.cos(), angle.sin()
-        turned = torch.stack([turn[..., 0] * c - turn[..., 1] * s, turn[..., 0] * s + turn[..., 1] * c], -1)
-        return torch.cat([origin[..., :2], turned], -1)
+    rotation, origin = pose(q)
+    once = torch.linalg.cross(angular, linear)
+    moved = linear + _versine(square) * once + _rest(square) * torch.linalg.cross(angular, once)
     quarter = 0.25 * square  # quaternions turn by half the angle
     half = torch.cat([0.5 * _sine(quarter) * angular, 1.0 - quarter * _versine(quarter)], -1)
-    turned = quaternion_product(_unit(q[..., motion.turn]), half)
-    return torch.cat([origin, turned], -1) if kind == "floating" else turned
+    turned = quaternion_product(_unit(q[..., TURN]), half)
+    return torch.cat([origin + (rotation @ moved[..., None])[..., 0], turned], -1)
 
 
-def velocity_of(kind: str, q: Float[Tensor, "*#batch positions"], v: Float[Tensor, "*#batch velocities"]) -> Tensor:
+def velocity_of(q: Float[Tensor, "*#batch 7"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
     """dq/dt under the body velocity v."""
-    motion = MOTIONS[kind]
-    linear, angular = _parts(motion, v)
-    turn = q[..., motion.turn].expand(*v.shape[:-1], -1)
-    origin = (pose(kind, q)[0] @ linear[..., None])[..., 0]
-    if kind == "planar":
-        turned = torch.stack([-turn[..., 1] * angular[..., 2], turn[..., 0] * angular[..., 2]], -1)
-        return torch.cat([origin[..., :2], turned], -1)
-    turned = quaternion_product(turn, torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1))
-    return torch.cat([origin, turned], -1) if kind == "floating" else turned
+    linear, angular = _parts(v)
+    turned = quaternion_product(
+        q[..., TURN].expand(*v.shape[:-1], -1), torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1)
+    )
+    return torch.cat([(pose(q)[0] @ linear[..., None])[..., 0], turned], -1)
 
 
-def difference(kind: str, start: Float[Tensor, "*batch positions"], end: Float[Tensor, "*batch positions"]) -> Tensor:
+def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"]) -> Tensor:
     """The body velocity that leads from `start` to `end` in one second, by the shorter turn."""
-    motion = MOTIONS[kind]
-    (first, from_), (_, to) = pose(kind, start), pose(kind, end)
-    if kind == "planar":
-        (c0, s0), (c1, s1) = (_unit(value[..., motion.turn]).unbind(-1) for value in (start, end))
-        zero = torch.zeros_like(c0)
-        angular = torch.stack([zero, zero, torch.atan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1)], -1)
-    else:
-        conjugate = _unit(start[..., motion.turn]) * start.new_tensor([-1.0, -1.0, -1.0, 1.0])
-        turn = quaternion_product(conjugate, _unit(end[..., motion.turn]))
-        turn = torch.where(turn[..., 3:] < 0.0, -turn, turn)
-        angular = 2.0 * _arc((turn[..., :3] ** 2).sum(-1, keepdim=True), turn[..., 3:]) * turn[..., :3]
+    (first, from_), (_, to) = pose(start), pose(end)
+    conjugate = _unit(start[..., TURN]) * start.new_tensor([-1.0, -1.0, -1.0, 1.0])
+    turn = quaternion_product(conjugate, _unit(end[..., TURN]))
+    turn = torch.where(turn[..., 3:] < 0.0, -turn, turn)
+    angular = 2.0 * _arc((turn[..., :3] ** 2).sum(-1, keepdim=True), turn[..., 3:]) * turn[..., :3]
     square = (angular * angular).sum(-1, keepdim=True)
     linear = (first.mT @ (to - from_)[..., None])[..., 0]
     once = torch.linalg.cross(angular, linear)
     linear = linear - 0.5 * once + _cotangent(square) * torch.linalg.cross(angular, once)
-    return torch.cat([linear, angular], -1)[..., list(motion.free)]
+    return torch.cat([linear, angular], -1)
 
 
-def chart_velocity(
-    kind: str, step: Float[Tensor, "*#batch velocities"], v: Float[Tensor, "*#batch velocities"]
-) -> Tensor:
-    """d step / dt where `q0 integrated by step` moves with body velocity v: ad / (1 - exp(-ad)) v.
-
-    The series stops at the tenth power of ad: its error is below 1e-11 |v| for steps that turn by less than .5 rad.
-    """
-    motion = MOTIONS[kind]
-    own, moved = _parts(motion, step), _parts(motion, v)
+def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
+    """d step / dt where `q0 integrated by step` moves with velocity v: ad / (1 - exp(-ad)) v, to the tenth power."""
+    own, moved = _parts(step), _parts(v)
     total = torch.cat(moved, -1)
     for coefficient in _BERNOULLI:
         moved = _bracket(own, moved)
         if coefficient:
             total = total + coefficient * torch.cat(moved, -1)
-    return total[..., list(motion.free)]
-
-
-def cayley(kind: str, step: Float[Tensor, "*batch velocities"]) -> Tensor:
-    """The step whose exponential is the Cayley transform (1 - ad/2)^-1 (1 + ad/2) of `step`, equal to third order.
-
-    It turns by 2 atan(t/2) for an angle t, about the same axis. The implicit midpoint rule in body axes keeps quadratic
-    invariants, and with this transform p+ = Ad* p for the momentum p of a free body: energy and momentum stay exactly
-    what they are (Lewis & Simo, "Conserving algorithms for the dynamics of Hamiltonian systems on Lie groups",
-    J. Nonlinear Sci. 1994; that 6 x 6 Cayley transforms are in SE(3): Selig, "Cayley maps for SE(3)", 2007).
-    """
-    motion = MOTIONS[kind]
-    linear, angular = _parts(motion, step)
-    square = (angular * angular).sum(-1, keepdim=True)
-    along = (linear * angular).sum(-1, keepdim=True) * angular
-    linear = _arctangent(square) * linear + _advance(square) * along
-    return torch.cat([linear, _arctangent(square) * angular], -1)[..., list(motion.free)]
-
-
-def _stretch(motion: Motion, step: Tensor) -> Tensor:
-    """By how much a step has to be longer for its Cayley transform to carry the centre of mass as far as it is fast.
-
-    2 / (1 + sqrt(1 - t^2)) for a turn of t; turns of almost 1 rad and more are stretched no further.
-    """
-    _, angular = _parts(motion, step)
-    return 2.0 / (1.0 + torch.sqrt((1.0 - (angular * angular).sum(-1, keepdim=True)).clamp_min(0.04)))
+    return total
 
 
 _BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
@@ -385,12 +252,9 @@ def _unit(turn: Tensor) -> Tensor:
     return turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
 
 
-def _parts(motion: Motion, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear and angular velocity (..., 3) of a step in the free directions."""
-    zero = torch.zeros_like(step[..., 0])
-    own = iter(step.unbind(-1))
-    six = torch.stack([next(own) if k in motion.free else zero for k in range(6)], -1)
-    return six[..., :3], six[..., 3:]
+def _parts(step: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear and angular velocity (..., 3)."""
+    return step[..., :3], step[..., 3:]
 
 
 SMALL = 0.05
@@ -399,8 +263,6 @@ _SINE = (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
 _VERSINE = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
 _REST = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
 _COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000)
-_ARCTANGENT = tuple((-0.25) ** n / (2 * n + 1) for n in range(9))
-_ADVANCE = tuple((-0.25) ** n * 2 * n / (2 * n + 1) for n in range(1, 10))
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 
 
@@ -424,12 +286,6 @@ _rest = partial(_smooth, series=_REST, closed=lambda t: (t - t.sin()) / t**3)
 """(t - sin t) / t^3."""
 _cotangent = partial(_smooth, series=_COTANGENT, closed=lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
 """(1 - t/2 cot(t/2)) / t^2."""
-_arctangent = partial(_smooth, series=_ARCTANGENT, closed=lambda t: 2.0 * torch.atan(0.5 * t) / t)
-"""2 atan(t/2) / t."""
-_advance = partial(
-    _smooth, series=_ADVANCE, closed=lambda t: (1.0 / (1.0 + 0.25 * t * t) - 2.0 * torch.atan(0.5 * t) / t) / t**2
-)
-"""(1 / (1 + t^2/4) - 2 atan(t/2) / t) / t^2: how much less a screw advances than it turns."""
 
 
 def _arc(sine_square: Tensor, cosine: Tensor) -> Tensor:

@@ -1,15 +1,8 @@
-"""MJCF, MuJoCo's robot files, as URDF text, rotor inertias and closed loops.
+"""MJCF, MuJoCo's robot files: read by MuJoCo's own compiler, and written.
 
-MuJoCo's own compiler reads the file: what it says is what MuJoCo simulates, with masses inferred from shapes, default
-classes and included files. Every body of the compiled model becomes a link of the same name, whose frame is the body's.
-Several joints of one body are a chain of links without mass. Positions q are MuJoCo's `qpos`, also where a joint has a
-`ref`; but quaternions are x, y, z, w here and w, x, y, z there, and the linear velocity of a free body has the axes of
-the body here and of the world there.
-
-What changes accelerations and has no place in a robot (tendons, gains of actuators ...) is noted by name.
-
-A robot is written with bodies of the names of its links, also of those without mass, so that every frame keeps its
-name. MuJoCo moves no body without mass: of a chain of joints between such links, all go to the link at its end.
+Every body becomes a link of its name and frame; several joints of one body are a chain of links without mass. What
+changes accelerations and has no place in a robot is noted by name. MuJoCo moves no body without mass: when written, of
+a chain of joints between such links all go to the link at its end.
 """
 
 import math
@@ -23,15 +16,15 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.errors import MalformedMjcf, NonPhysicalInertia, RobotModelError, UnreadableRobotFile, required_extra
-from forcegp.robots.inertia import inverse, physical_objection, rotation_of_z_onto, transform
+from forcegp.errors import MalformedMjcf, RobotModelError, UnreadableRobotFile, required_extra
+from forcegp.robots.arguments import Problems
+from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
-from forcegp.robots.manifold import MOTIONS
+from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.mjcf_model import WORLD, CompiledModel, LoopDescription, Translation
-from forcegp.robots.problems import Problems
 from forcegp.robots.structure import RobotStructure
-from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml, well_formed
-from forcegp.robots.urdf_file import IN_THE_FILE, nearest_inertia, read_text
+from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml
+from forcegp.robots.urdf_file import read_text
 
 DEEPEST = 300
 """Levels of elements: MuJoCo's reader calls itself for each."""
@@ -46,11 +39,10 @@ def is_mjcf(text: str) -> bool:
     return re.sub(r"<!--.*?-->|<\?.*?\?>|\ufeff", "", text, flags=re.DOTALL).lstrip().startswith("<mujoco")
 
 
-def translate(text: str, path: Path | None, nearest: bool, for_system: bool, problems: Problems) -> Translation:
-    """The robot of MJCF text; ``path`` is its file, if there is one: others lie beside it.
+def translate(text: str, path: Path | None, for_system: bool, problems: Problems) -> Translation:
+    """The robot of MJCF text beside its file; notes what is left out.
 
-    ``problems`` collects impossible inertias, replaced where ``nearest`` is asked for, and what is left out; closed
-    loops are, unless ``for_system``. Raises MalformedMjcf, MissingExtra, and the errors of XML text.
+    Raises MalformedMjcf, MissingExtra, errors of XML.
     """
     included: dict[str, bytes] = {}
     _require_bounded(text, [] if path is None else [path.parent], problems.source, included)
@@ -65,7 +57,6 @@ def translate(text: str, path: Path | None, nearest: bool, for_system: bool, pro
             spec = made.MjSpec.from_string(text, include=included)
             spec.modelfiledir = "" if path is None else str(path.parent)
         needed = _without_appearance(made, spec)
-        _repair(spec, nearest, problems)
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             model = spec.compile()
@@ -83,7 +74,7 @@ def translate(text: str, path: Path | None, nearest: bool, for_system: bool, pro
 
 def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:
     """Refuse files that exhaust memory or stack of MuJoCo's reader; ``included`` receives the files that they name."""
-    root = parse_xml(well_formed(text), source)
+    root = parse_xml(text, source)
     count, deepest = 0.0, 0
     stack = [(root, 1, 1.0)]
     while stack:
@@ -157,35 +148,9 @@ def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
     )
 
 
-def _repair(spec: Any, nearest: bool, problems: Problems) -> None:
-    """Replace inertias that no body has: MuJoCo's compiler stops at the first. They are problems or notes."""
-    for body in spec.bodies if not spec.compiler.balanceinertia else ():
-        if not body.explicitinertial or not body.mass > 0.0:
-            continue
-        full, inertia = body.fullinertia, np.diag(body.inertia)
-        if np.isfinite(full[0]):
-            xx, yy, zz, xy, xz, yz = full
-            inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        objection = physical_objection(body.mass, np.zeros(3), inertia)
-        if objection is None or not np.isfinite(inertia).all():
-            continue
-        new = nearest_inertia(inertia)
-        if np.isfinite(full[0]):
-            body.fullinertia = [*new.diagonal(), new[0, 1], new[0, 2], new[1, 2]]
-        else:
-            body.inertia = new.diagonal()
-        seen = f"{problems.source}: no physical body has the inertia of body {body.name!r}: {objection}"
-        if nearest:
-            what = "an inertia that no body has is replaced by the nearest one that a body has"
-            problems.note(what, f"body {body.name!r}: {objection}")
-        else:
-            advice = f"{IN_THE_FILE}, or take the nearest inertia that a body has."
-            problems.errors.append(NonPhysicalInertia(seen, advice, {"inertias": "nearest"}))
-
-
 SMALLEST = 2e-15
 """kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
-KINDS = {"floating": "free", "spherical": "ball", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
+KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
 class _Axis(NamedTuple):
@@ -224,8 +189,8 @@ class MjcfWriter:
         """The whole file."""
         robot, root = self.robot, next(iter(self.robot.layout.links))
         named = {joint.name for joint in robot.description.joints}
-        if BASE in self.groups and self.groups[BASE].kind == robot.base and BASE not in named:
-            self._chain(free_joint(BASE, robot.base, OUTSIDE, root), np.eye(4), 2)
+        if BASE in self.groups and BASE not in named:
+            self._chain(free_joint(BASE, OUTSIDE, root), np.eye(4), 2)
         elif root == "world" and not self._mass(root):
             self.lines += [f"    {site}" for site in self.sites.get(root, ())]
             self._below(root, 2)
@@ -276,7 +241,7 @@ class MjcfWriter:
         joints = self._axes(joint)
         while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
             below = self._next(joint.child)
-            if len(below) != 1 or joint.type in ("floating", "spherical"):
+            if len(below) != 1 or joint.type == "floating":
                 raise RobotModelError(
                     f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
                     "two joints of one degree of freedom; give it a mass."
@@ -314,16 +279,10 @@ class MjcfWriter:
         ]
 
     def _axes(self, joint: Joint) -> list[_Axis]:
-        """A joint as MuJoCo's; a planar one is two slides and a hinge."""
-        if joint.type == "planar":
-            parts = (("x", "slide", (1.0, 0.0, 0.0)), ("y", "slide", (0.0, 1.0, 0.0)), ("rz", "hinge", (0.0, 0.0, 1.0)))
-            pose = transform(rotation_of_z_onto(joint.axis), np.zeros(3))
-            return [_Axis(self._attributes(joint, f"{joint.name}.{x}", kind), pose, axis) for x, kind, axis in parts]
-        kind = KINDS[joint.type]
-        name = joint.name
-        first = f"{name}.{MOTIONS[joint.type].velocities[-1]}" if joint.type in MOTIONS else name
-        axis = None if joint.type in MOTIONS else joint.axis
-        return [_Axis(self._attributes(joint, name, kind, first), np.eye(4), axis)]
+        """A joint as MuJoCo's."""
+        free, name = joint.type == "floating", joint.name
+        rotor = f"{name}.{VELOCITIES[-1]}" if free else name
+        return [_Axis(self._attributes(joint, name, KINDS[joint.type], rotor), np.eye(4), None if free else joint.axis)]
 
     def _attributes(self, joint: Joint, name: str, kind: str, rotor: str | None = None) -> str:
         given = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}

@@ -7,13 +7,14 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from forcegp.errors import UnsupportedJoint
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
-from forcegp.robots.manifold import MOTIONS
-from forcegp.robots.problems import Problems
+from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_parts
 
-KINDS = {0: "floating", 1: "spherical", 2: "prismatic", 3: "revolute"}
+KINDS = {0: "floating", 2: "prismatic", 3: "revolute"}
 """Of MuJoCo's joints (mjtJoint) in URDF."""
 WORLD = "world"
 
@@ -30,10 +31,7 @@ class LoopDescription:
 
 @dataclass(frozen=True)
 class Motor:
-    """What one unit of an actuator's input does: joint forces by joint, or a wrench on a link.
-
-    The wrench is a force [N] and a torque [Nm] about the origin of the link, in its axes.
-    """
+    """Joint forces by joint, or a wrench (N, Nm) about the origin of a link, of one unit of an actuator's input."""
 
     name: str
     column: dict[str, float]
@@ -51,7 +49,7 @@ class Translation:
     locked: dict[str, float]
     loops: tuple[LoopDescription, ...] = ()
     motors: tuple[Motor, ...] = ()
-    """All, if some act at sites of bodies or turn a ball joint."""
+    """All, if some act at sites of bodies."""
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Stiffness (Nm/rad or N/m) and position at rest of joints that turn or slide."""
 
@@ -71,8 +69,9 @@ class CompiledModel:
         taken: set[str] = set()
         self.joints = []
         for k in range(model.njnt):
-            kind = ("free", "ball", "slide", "hinge")[model.jnt_type[k]]
-            body = self.bodies[model.jnt_bodyid[k]]
+            kind, body = ("free", "ball", "slide", "hinge")[model.jnt_type[k]], self.bodies[model.jnt_bodyid[k]]
+            if kind == "ball":
+                raise UnsupportedJoint(f"{problems.source}: body {body!r} has a ball joint; give it three hinges.")
             self.joints.append(self._named(model.joint(k).name or f"{body}_{kind}", taken))
         self.taken_joints = taken
 
@@ -94,7 +93,9 @@ class CompiledModel:
         gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)
         text = "\n".join([f"<robot name={quoteattr(self.name)}>", *self.elements, "</robot>\n"])
         locked = {self.joints[joint]: value for joint, value in self.locked.items()}
-        springs = self._springs() if self.for_system else {}
+        model, sprung = self.model, [k for k in range(self.model.njnt) if self.for_system and self._is_sprung(k)]
+        rest = {k: float(model.qpos_spring[model.jnt_qposadr[k]]) for k in sprung}
+        springs = {self.joints[k]: (float(model.jnt_stiffness[k]), rest[k]) for k in sprung}
         return Translation(text, gravity, self._rotor_inertias(), locked, loops, motors, springs)
 
     @staticmethod
@@ -208,11 +209,7 @@ class CompiledModel:
         return not any(kinds)
 
     def _motors(self) -> tuple[Motor, ...]:
-        """All motors, where some act at sites of bodies that move or turn a ball joint; at sites as wrenches.
-
-        Of an actuator with a law of its own, such as a servo, the input is the force on its joint, under the joint's
-        name. What drives no single joint, such as a tendon, is left out.
-        """
+        """All motors, where some act at sites; of a servo the input is its joint force."""
         model, found, taken, needed = self.model, [], set[str](), False
         for k in range(model.nu):
             gear, gain = model.actuator_gear[k], float(model.actuator_gainprm[k][0])
@@ -238,22 +235,14 @@ class CompiledModel:
                 torque = gain * pose[:3, :3] @ gear[3:] + np.cross(pose[:3, 3], force)
                 link, wrench, column, needed = self.bodies[body], (*force.tolist(), *torque.tolist()), {}, True
                 if model.jnt_type[first] == 0:
-                    names = [f"{self.joints[first]}.{each}" for each in MOTIONS["floating"].velocities]
+                    names = [f"{self.joints[first]}.{each}" for each in VELOCITIES]
                     link, wrench, column = "", (), dict(zip(names, wrench, strict=True))
-            elif motor and joints and self._turns_ball(k):  # about axes of the body, as its velocity
-                names = [f"{self.joints[joints[0]]}.{each}" for each in MOTIONS["spherical"].velocities]
-                column, needed = dict(zip(names, (gain * float(x) for x in gear[:3]), strict=True)), True
             elif joints or at_site:
                 return ()
             else:
                 continue
             found.append(Motor(self._named(name, taken), column, link, wrench))
         return tuple(found) if needed else ()
-
-    def _turns_ball(self, k: int) -> bool:
-        model = self.model
-        by_joint = model.actuator_trntype[k] == int(self.mujoco.mjtTrn.mjTRN_JOINT)
-        return bool(by_joint and model.jnt_type[model.actuator_trnid[k][0]] == 1)
 
     def _couple(self) -> None:
         """Linear couplings of two joints, and joints that one holds."""
@@ -275,14 +264,6 @@ class CompiledModel:
 
     def _equality(self, k: int) -> str:
         return self.model.equality(k).name or f"equality {k}"
-
-    def _springs(self) -> dict[str, tuple[float, float]]:
-        model, found = self.model, {}
-        for joint in range(model.njnt):
-            if self._is_sprung(joint):
-                rest = model.qpos_spring[model.jnt_qposadr[joint]]
-                found[self.joints[joint]] = float(model.jnt_stiffness[joint]), float(rest)
-        return found
 
     def _is_sprung(self, joint: int) -> bool:
         """Whether it has a linear spring, and one coordinate of its own."""
@@ -344,7 +325,7 @@ class CompiledModel:
         out = {}
         for joint in range(model.njnt):
             kind, dof = KINDS[model.jnt_type[joint]], model.jnt_dofadr[joint]
-            names = [f"{self.joints[joint]}.{each}" for each in MOTIONS[kind].velocities] if kind in MOTIONS else [""]
+            names = [f"{self.joints[joint]}.{each}" for each in VELOCITIES] if kind == "floating" else [""]
             for step, name in enumerate(names):
                 out[name or self.joints[joint]] = found[dof + step]
             if kind == "floating" and found[dof]:
@@ -372,8 +353,6 @@ class CompiledModel:
                 self._lose("springs", where)
             if _any(model, "dof_dampingpoly", dof):
                 self._lose("damping that is not linear", where)
-            if model.jnt_limited[joint] and KINDS[model.jnt_type[joint]] == "spherical":
-                self._lose("ranges of ball joints", where)
         names("body", (("compensation of gravity", k) for k in np.flatnonzero(model.body_gravcomp)))
         names("body", (("motions from outside (mocap)", k) for k in np.flatnonzero(model.body_mocapid >= 0)))
         names("tendon", (("tendons", k) for k in range(model.ntendon)))
@@ -381,8 +360,7 @@ class CompiledModel:
             if not self._is_motor(k):
                 self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
             elif not (motors and model.actuator_trntype[k] == site) and not any(
-                k in self._actuators_of(joint) and (model.jnt_type[joint] >= 2 or (motors and self._turns_ball(k)))
-                for joint in range(model.njnt)
+                k in self._actuators_of(joint) and model.jnt_type[joint] >= 2 for joint in range(model.njnt)
             ):
                 self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")
         if model.nflex:

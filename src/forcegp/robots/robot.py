@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import RobotFileWarning, UnstatedBase, usable_arguments
+from forcegp.errors import RobotFileWarning, usable_arguments
 from forcegp.robots.arguments import (
     JointValues,
     Positions,
+    Problems,
     Vector,
     armature_values,
     broadcast_batch,
@@ -28,15 +29,13 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import BaseChoice, check_base, check_choice, lay_out
+from forcegp.robots.manifold import TURN
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
-from forcegp.robots.problems import Problems
-from forcegp.robots.structure import RigidBodyDynamics, RobotStructure
-from forcegp.robots.tree import bodies_without_inertia, compile_tree
-from forcegp.robots.urdf import parse_urdf, well_formed
+from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
+from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import (
     InertiaChoice,
-    before_the_end,
     read_armature,
     read_robot_file,
     read_text,
@@ -44,7 +43,7 @@ from forcegp.robots.urdf_file import (
     replace_inertial,
     with_chosen_inertias,
     with_comment,
-    with_root,
+    with_note,
     write_robot_file,
     write_text,
 )
@@ -54,19 +53,14 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot(RobotStructure, RigidBodyDynamics):
-    """A tree of joints on a base that is fixed, floating or planar. Make one with :meth:`from_urdf`.
+    """A tree of joints on a base that is fixed or moves. Make one with :meth:`from_urdf`.
 
-    A joint that mimics another has no coordinate: it moves with that one, whose damping and friction include its own.
-    Limits of position, velocity and effort are those of the joints with a coordinate.
+    ``q, v, a, tau`` are float64 tensors (..., nv), batches broadcast, in rad or m, per s, per s^2, and Nm or N, in the
+    order of :attr:`joint_names`: depth first, branches in file order. On a base that moves q has `nq` entries,
+    :attr:`position_names` (:mod:`forcegp.robots.manifold`). A joint that mimics another has no coordinate: limits are
+    those of the joints with one, whose damping and friction include those that follow.
 
-    Joint positions, velocities, accelerations and forces ``q, v, a, tau`` are float64 tensors (..., nv) with any
-    leading batch dimensions, in rad or m, per s, per s^2, and Nm or N, in the order of :attr:`joint_names`: depth
-    first, branches in file order. On a base that moves, q has other entries than v (:mod:`forcegp.robots.manifold`):
-    `nq` of them, called :attr:`position_names`; :meth:`integrate` and :meth:`difference` add and subtract. Batch
-    dimensions of all arguments broadcast.
-
-    Wrong shapes, dtypes and devices raise :class:`~forcegp.errors.InvalidInput`; unknown names raise subclasses of
-    :class:`~forcegp.errors.UnknownName`.
+    InvalidInput for wrong shapes, dtypes and devices; subclasses of UnknownName for unknown names.
     """
 
     @classmethod
@@ -76,9 +70,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
     ) -> "Robot":
         """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
-        ``armature`` and ``options`` are those of :meth:`from_urdf_text`; without, rotor inertias are what
-        :meth:`to_urdf` wrote beside the file. Raises what that raises, and :class:`~forcegp.errors.MissingExtra` for a
-        .xacro file without the package xacro.
+        ``options`` are those of :meth:`from_urdf_text`, and so are errors; ``armature`` is by default what
+        :meth:`to_urdf` wrote beside the file. MissingExtra for a .xacro file without the package.
         """
         text, armature = read_robot_file(path), read_armature(path) if armature is None else armature
         return cls.from_urdf_text(text, source=str(path), armature=armature, **options)
@@ -95,42 +88,29 @@ class Robot(RobotStructure, RigidBodyDynamics):
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
-        root: str | None = None,
     ) -> "Robot":
         """Read URDF text; ``source`` is what error messages call it.
 
-        Parameters: ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia seen at the joint, kg m^2 or kg), one per
-        joint or by joint name, by default 0; ``locked`` maps joint names to positions at which movable joints become
-        fixed; ``inertias`` of "nearest" replaces one that no body has by the nearest possible; ``base`` says how the
-        root is held, "fixed", "floating", "planar" or "spherical", which files of robots that do not look bolted to the
-        world are asked; ``root`` names a link that the file does not define, "world" for example, to be the root. A
-        RobotFileWarning names what was ignored or repaired.
+        ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia at the joint, kg m^2 or kg), one per joint or by joint
+        name; ``locked`` joints and their positions; ``inertias`` of "nearest" replaces impossible ones; ``base`` says
+        how the root is held, which files of robots that do not look bolted are asked. A RobotFileWarning names what was
+        ignored or repaired.
 
-        Raises a subclass of :class:`~forcegp.errors.RobotModelError` that names the file, all links and joints
-        that are wrong, and the arguments under which it is taken, where there are some (its ``remedy``).
+        Raises a subclass of RobotModelError with all that is wrong, and the arguments that mend it (its ``remedy``).
         """
-        text = well_formed(text.lstrip())
-        text = text if root is None else with_root(text, root)
-        given = {"locked": locked, "inertias": inertias, "base": base, "root": root}
-        return cls._made(text, Problems(source, given), gravity, armature)
+        given = {"locked": locked, "inertias": inertias, "base": base}
+        return cls._made(text.lstrip(), Problems(source, given), gravity, armature)
 
     @classmethod
     @usable_arguments("Robot.from_mjcf")
     def from_mjcf(cls, path: str | Path, **options: Any) -> "Robot":
         """Read an MJCF file by MuJoCo's own compiler: masses may follow from shapes, and files may include others.
 
-        Every body is a link of that name, whose frame is the body's; joints follow in MuJoCo's order, with armature,
-        damping, dry friction and limits, and named sites are links without mass. An equality of two joints that is
-        linear is a mimic joint. Meshes are needed only where a mass follows from them. q is MuJoCo's `qpos`, but
-        quaternions are x, y, z, w, and the linear velocity of a free body has the axes of the body.
-
-        Parameters are those of :meth:`from_urdf_text`, without ``root``: ``gravity`` (default: the file's),
-        ``armature`` (default: the file's), ``locked``, ``inertias`` and ``base`` (default: as in the file). A
-        RobotFileWarning names what acts in MuJoCo and not here: springs, tendons, gains of actuators, closed loops
-        (which :meth:`Model.from_mjcf <forcegp.Model.from_mjcf>` has) and others.
-
-        Raises what :meth:`from_urdf_text` raises, :class:`~forcegp.errors.MalformedMjcf` with MuJoCo's reason, and
-        :class:`~forcegp.errors.MissingExtra` without the package mujoco.
+        Bodies, and named sites, are links; joints follow in MuJoCo's order, with armature, damping, dry friction and
+        limits; a linear equality of two is a mimic joint. q is `qpos` with quaternions x, y, z, w; the linear velocity
+        of a free body is in its axes. Parameters and errors are those of :meth:`from_urdf_text`, by default as in the
+        file; MalformedMjcf has MuJoCo's reason. A RobotFileWarning names what acts in MuJoCo only (`Model.from_mjcf`
+        has springs and closed loops).
         """
         return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
 
@@ -163,7 +143,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """The robot of MJCF text, and what a model takes from it, which is noted as left out unless ``for_system``."""
         given = {"locked": locked, "inertias": inertias, "base": base}
         problems = Problems(source, given, "Robot.from_mjcf")
-        found = translate(text, path, inertias == "nearest", for_system, problems)
+        found = translate(text, path, for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
         return cls._made(found.urdf, problems, gravity, armature, found.armature), found
@@ -172,31 +152,21 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def _made(
         cls,
         text: str,
-        found: Problems,
+        problems: Problems,
         gravity: Vector,
         armature: Vector | Mapping[str, float | int] | None,
         beside: Mapping[str, float] | None = None,
         *,
         quiet: bool = False,
     ) -> "Robot":
-        """The robot of URDF text; `found` has the arguments and what is wrong already, `beside` what a file adds."""
-        base, inertias = found.given["base"], found.given["inertias"]
+        """The robot of URDF text; `problems` has the arguments and what is wrong already, `beside` what a file adds."""
+        base, inertias = problems.given["base"], problems.given["inertias"]
         check_choice(base)
-        locked = locked_positions(found.given["locked"] or {})
-        named = found.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
-        named = {name: value for name, value in named.items() if value}
+        locked = locked_positions(problems.given["locked"] or {})
+        named = problems.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
+        problems.given = {name: value for name, value in named.items() if value}
         numbers = finite_vector("gravity", gravity, 3), armature, beside or {}, locked, inertias
-
-        def read(held: BaseChoice | None) -> tuple[Robot | None, Problems]:
-            problems = Problems(found.source, named, found.reader)
-            problems.errors, problems.notes = [*found.errors], {what: [*where] for what, where in found.notes.items()}
-            return cls._read(text, problems, held, *numbers), problems
-
-        robot, problems = read(base)
-        asked = [error for error in problems.errors if isinstance(error, UnstatedBase)]
-        if asked:  # what else is wrong depends on the answer: a base that moves needs an inertia
-            _, others = read("floating")
-            problems.errors = [*others.errors, *asked]
+        robot = cls._read(text, problems, base, *numbers)
         problems.raise_all()
         assert robot is not None, "a problem was collected otherwise"
         if not quiet:
@@ -232,7 +202,6 @@ class Robot(RobotStructure, RigidBodyDynamics):
             without = bodies_without_inertia(description, layout, tree, problems.broken)
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
-            problems.offer_no_standstill([*robot.single_joint_names, *(group.name for group in layout.groups)])
             check_base(description, layout.standing, problems)
             return robot
         return None
@@ -247,8 +216,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
     @classmethod
     def _again(cls, text: str, source: str, gravity: Any, armature: Any, locked: Any, base: BaseChoice) -> "Robot":
         """Of a text that was warned of before."""
-        given = {"locked": locked, "inertias": "strict", "base": base, "root": None}
-        return cls._made(well_formed(text.lstrip()), Problems(source, given), gravity, armature, quiet=True)
+        given = {"locked": locked, "inertias": "strict", "base": base}
+        return cls._made(text.lstrip(), Problems(source, given), gravity, armature, quiet=True)
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
@@ -265,10 +234,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
     def with_link(self, name: str, mass: float, center_of_mass: Vector, inertia: Any) -> "Robot":
-        """A robot whose URDF gives a moving link this mass (kg), centre (3,) of mass (m) and inertia (3, 3).
+        """A robot whose moving link has this mass (kg), centre (3,) (m) and inertia (3, 3) about it (kg m^2).
 
-        The inertia is about the centre of mass, in the axes of the link frame, in kg m^2. Raises UnknownLink,
-        InvalidInput for a link that is fixed in the world, and NonPhysicalInertia for what no body has.
+        Axes are those of the link. Raises UnknownLink, InvalidInput for a fixed link, NonPhysicalInertia for what no
+        body has.
         """
         self.layout.require_moving(name, self.name)
         center = finite_vector("center_of_mass", center_of_mass, 3)
@@ -298,10 +267,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def with_joint_dynamics(self, damping: Tensor | None, friction: Tensor | None) -> "Robot":
-        """A robot whose URDF has <dynamics damping friction> (nv,) of every joint; None leaves what is there.
-
-        That of a joint that others mimic includes theirs, which become 0.
-        """
+        """A robot whose URDF has this damping and friction (nv,) of every joint; None: as they are."""
         text, layout = self.urdf_text, self.layout
         free = {body for group in layout.groups for body in range(group.bodies.start, group.bodies.stop)}
         for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
@@ -314,14 +280,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     def with_note(self, note: str) -> "Robot":
         """The same robot, whose URDF text ends with this comment."""
-        return self.with_text(before_the_end(self.urdf_text, f"<!-- {note.replace('--', '- -')} -->\n"))
+        return self.with_text(with_note(self.urdf_text, note))
 
     def to_urdf(self, path: str | Path | None = None) -> str:
-        """The URDF text with the current inertials; written to ``path`` (temporary file, then renamed) if given.
-
-        Rotor inertias stand in a comment and, beside ``path``, in a file that :meth:`from_urdf` reads back; a
-        RobotFileWarning says so.
-        """
+        """The URDF text, written to ``path`` if given, and rotor inertias beside it, with a RobotFileWarning."""
         armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True))
         source = self.source if path is None else Path(path).name
         text = with_comment(self.urdf_text, armature, source=source, stacklevel=3)
@@ -331,13 +293,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     @usable_arguments("Robot.to_mjcf")
     def to_mjcf(self, path: str | Path | None = None, loops: Sequence[LoopDescription] = ()) -> str:
-        """MJCF text, for MuJoCo, with rotor inertias, damping and dry friction; written to ``path`` if given.
+        """MJCF text with armature, damping, friction, motors and ``loops``; written to ``path`` if given.
 
-        Every link is a body without shape, and every joint of one degree of freedom has a motor. A planar base becomes
-        two slides and a hinge; MuJoCo has no limits of velocity. ``loops`` are closed by equalities. A RobotFileWarning
-        names frames that move without mass, which are left out.
-
-        Raises :class:`~forcegp.errors.RobotModelError` for what MuJoCo cannot hold, such as a last link without mass.
+        A RobotFileWarning names frames that move without mass, which are left out. Raises RobotModelError for what
+        MuJoCo cannot hold, such as a last link without mass.
         """
         writer = MjcfWriter(self, loops)
         text = writer.text()
@@ -374,7 +333,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return self.space.neutral().to(self.device)
 
     def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
-        """q with quaternions, and pairs of cos and sin, divided by their lengths. Raises InvalidInput for length 0."""
+        """q with quaternions divided by their lengths. Raises InvalidInput for length 0."""
         unit = self.space.normalized(checked_tensor("q", q, self.nq, f"positions of {self.name}", self.device))
         self.space.check(unit)
         return unit
@@ -390,29 +349,29 @@ class Robot(RobotStructure, RigidBodyDynamics):
         share = torch.rand(rows, self.nv, dtype=torch.float64, generator=generator)
         q = self.space.integrate(self.space.neutral(), lower + share * (upper - lower))
         for group in self.layout.groups:  # directions of Gaussian vectors are uniform
-            turn = torch.randn(
-                rows, len(group.motion.positions[group.motion.turn]), dtype=torch.float64, generator=generator
-            )
-            q[:, group.places][:, group.motion.turn] = turn
+            q[:, group.places][:, TURN] = torch.randn(rows, 4, dtype=torch.float64, generator=generator)
         return self.space.normalized(q).to(self.device)
 
     @override
     def _dynamics(self, function: str, *arguments: Tensor) -> Any:
-        return getattr(self.kinematics(*arguments[:2]), function)(*arguments[2:])
+        q, *others = arguments
+        if len(others) == 2 and len({getattr(x, "shape", ())[:-1] for x in arguments}) > 1:
+            names = "q", "v", "tau" if function == "forward_dynamics" else "a"
+            given = {name: self.checked_input(name, x) for name, x in zip(names, arguments, strict=True)}
+            batch = broadcast_batch({name: x.shape[:-1] for name, x in given.items()})
+            q, *others = (x.expand(*batch, -1) for x in given.values())
+        return getattr(self.kinematics(q, *others[:1]), function)(*others[1:])
 
     def frame_pose(self, q: Float[Tensor, "*batch nq"], frame: str) -> Float[Tensor, "*batch 4 4"]:
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
         return self.kinematics(q).frame_pose(frame)
 
     def frame_jacobian(self, q: Positions, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
-        """Jacobian (..., 6, nv) of a ``point`` (..., 3) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
+        """Jacobian (..., 6, nv) of a ``point`` (3,) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
 
     def frame_bias_acceleration(
         self, q: Positions, v: JointValues, frame: str, point: Vector | None = None
     ) -> Float[Tensor, "... 6"]:
-        """Acceleration ``Jdot v`` (..., 6) of a ``point`` fixed in ``frame``, classical, without gravity.
-
-        Rows [linear; angular], world axes, in m/s^2 and rad/s^2: what the point does at zero joint acceleration.
-        """
+        """Jdot v (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], world axes, without gravity."""
         return self.kinematics(q, v).frame_bias_acceleration(frame, point)

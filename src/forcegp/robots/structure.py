@@ -1,7 +1,8 @@
-"""What a robot is, without its algorithms: joints, links, frames, inertias, checks of inputs."""
+"""What a robot is, without its algorithms: joints, links, frames, and the constants of its bodies as tensors."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,179 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownFrame, UnknownJoint, UnknownLink, require_known
-from forcegp.robots.arguments import JointValues, Positions, checked_tensor
-from forcegp.robots.layout import WORLD, BaseChoice, Layout
-from forcegp.robots.manifold import ConfigurationSpace, pose
-from forcegp.robots.tree import Tree
+from forcegp.errors import (
+    InvalidInput,
+    MissingInertia,
+    NonPhysicalInertia,
+    RobotModelError,
+    UnknownFrame,
+    UnknownJoint,
+    UnknownLink,
+    require_known,
+)
+from forcegp.robots.arguments import JointValues, Positions, checked_tensor, usable_device
+from forcegp.robots.inertia import axis_inertia_vanishes, pseudo_inertia, skew, turns_with_inertia
+from forcegp.robots.layout import BASE, WORLD, BaseChoice, Layout
+from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
 from forcegp.summary import Summary, listed
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Joints of equal depth, whose poses are computed in one operation."""
+
+    joints: Tensor | slice
+    parents: Tensor | None  # positions in the previous level; None where that is the whole level, in order
+
+    def to(self, device: torch.device) -> "Level":
+        """The same level with its indices on another device."""
+        joints = self.joints if isinstance(self.joints, slice) else self.joints.to(device)
+        return Level(joints, None if self.parents is None else self.parents.to(device))
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """Constants of a tree with n bodies, on one device. Index i is body i and the joint that moves it."""
+
+    groups: tuple[Group, ...]
+    positions: Tensor | None  # (nv,) entry of q of each joint of one degree of freedom; None where that is i
+    rest: Tensor  # (n, 4, 4, 1) and the next three: local transform = rest + sin q sine + cos q cosine + q slide
+    sine: Tensor
+    cosine: Tensor
+    slide: Tensor
+    levels: tuple[Level, ...]
+    order: Tensor | None  # joint i's position when the levels are laid end to end; None where that is i
+    revolute: Tensor  # (n, 1, 1): 1 for revolute and continuous joints, 0 for prismatic ones
+    all_revolute: bool
+    descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i, and is not empty
+    ancestors: Tensor  # its transpose, empty bodies included
+    is_above: Tensor  # (n, n, 1): the same the other way round, as truth values
+    related: Tensor  # (n, n, 1): 1 where one of the two joints moves the other
+    velocity_sum: Tensor  # (n, n): 2 ancestors - own joint, body velocity plus that of the parent body
+    twist_basis: Tensor  # (12, 6): [w; v] -> [[w]x, v], row by row
+    inertias: Tensor  # (n, 4, 4, 1): pseudo-inertias of the bodies, their links merged
+    gravity: Tensor  # (3,)
+    fall: Tensor  # (3, 4, 1): the acceleration T'' T^-1 of free fall
+    armature: Tensor  # (nv,)
+    coupling: Tensor  # (n, nv): G, the velocity of each body's joint per unit of those with a coordinate
+    shift: Tensor  # (n, 1): g, their positions at q = 0
+    is_chain: bool
+    has_armature: bool
+    coupled: bool  # whether some joint mimics another; else G is the identity and g is zero
+
+    def to(self, device: torch.device | str) -> "Tree":
+        """The same constants on another device. Raises InvalidInput for one that is not there."""
+        device = usable_device(device)
+        moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **moved, levels=tuple(level.to(device) for level in self.levels))
+
+    def equals(self, other: "Tree") -> bool:
+        """Whether both move alike to 1e-9, whatever their URDFs look like."""
+        if self.coupling.shape != other.coupling.shape or self.groups != other.groups:
+            return False
+        constants = ("rest", "sine", "cosine", "slide", "descendants", "inertias", "gravity", "armature", "coupling")
+        return all(
+            torch.allclose(getattr(self, name), getattr(other, name).to(self.rest.device), rtol=1e-9, atol=1e-12)
+            for name in (*constants, "shift")
+        )
+
+
+def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray, armature: np.ndarray) -> Tree:
+    """Batched constants for :mod:`forcegp.robots.kinematics`, on the CPU."""
+    n = len(layout.bodies)
+    revolute = np.array([joint.type != "prismatic" for joint in layout.bodies])
+    rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
+    own, positions = np.eye(n), np.arange(len(layout.joints))
+    for group in layout.groups:
+        own[group.bodies, group.bodies] = 1.0
+        positions[group.rows] = group.place
+        positions[group.rows.stop :] += group.extra
+    moves = own.copy()  # [i, j] = 1 where body j is moved by joint i
+    for i, (parent, origin) in enumerate(zip(layout.parents, layout.origins, strict=True)):
+        x, y, z, translation = origin.T
+        if own[i].sum() > 1.0:  # moved by `Group`
+            rest[i] = origin
+        elif revolute[i]:  # origin @ Rz(q)
+            rest[i].T[2:] = z, translation
+            sine[i].T[:2] = y, -x
+            cosine[i].T[:2] = x, y
+        else:  # origin @ translation by q along z
+            rest[i] = origin
+            slide[i].T[3] = z
+        if parent != WORLD:
+            moves[:, i] += moves[:, parent]
+    descendants = moves.copy()
+    descendants[:, list(layout.empty)] = 0.0
+    twist_basis = np.zeros((6, 3, 4))
+    for k, axis in enumerate(np.eye(3)):
+        twist_basis[k, :, :3] = skew(axis)
+        twist_basis[3 + k, :, 3] = axis
+    inertias = np.zeros((n, 4, 4))
+    for name in layout.moving:
+        placement, inertial = layout.links[name], description.links[name]
+        if inertial is not None:
+            local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
+            inertias[placement.body] += placement.offset @ local @ placement.offset.T
+    fall = np.zeros((3, 4))
+    fall[:, 3] = gravity
+    coupling = np.zeros((n, len(layout.joints)))
+    for body, drive in enumerate(layout.drives):
+        coupling[body, drive.joint] = drive.multiplier
+    levels, order = _levels(layout.parents)
+
+    constants: dict[str, Any] = {
+        "rest": rest[..., None],
+        "sine": sine[..., None],
+        "cosine": cosine[..., None],
+        "slide": slide[..., None],
+        "revolute": revolute[:, None, None],
+        "descendants": descendants,
+        "ancestors": moves.T,
+        "related": np.maximum(moves, moves.T)[..., None],
+        "velocity_sum": 2.0 * moves.T - own,
+        "twist_basis": twist_basis.reshape(6, 12).T,
+        "inertias": inertias[..., None],
+        "gravity": gravity,
+        "fall": fall[..., None],
+        "armature": armature,
+        "coupling": coupling,
+        "shift": [[drive.offset] for drive in layout.drives],
+    }
+    return Tree(
+        groups=layout.groups,
+        positions=torch.as_tensor(positions) if layout.groups else None,
+        levels=levels,
+        order=order,
+        all_revolute=bool(revolute.all()),
+        is_above=torch.tensor(moves[..., None]) > 0,
+        coupled=layout.coupled,
+        is_chain=bool(constants["related"].all()),
+        has_armature=bool(armature.any()),
+        **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},
+    )
+
+
+def _levels(parents: tuple[int, ...]) -> tuple[tuple[Level, ...], Tensor | None]:
+    depth: list[int] = []
+    for parent in parents:
+        depth.append(0 if parent == WORLD else depth[parent] + 1)
+    members = [[i for i, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
+    levels = []
+    for level, joints in enumerate(members):
+        above = [members[level - 1].index(parents[i]) for i in joints] if level else None
+        whole = above is None or above == list(range(len(members[level - 1])))
+        contiguous = joints == list(range(joints[0], joints[-1] + 1))
+        levels.append(
+            Level(
+                slice(joints[0], joints[-1] + 1) if contiguous else torch.tensor(joints),
+                None if whole else torch.tensor(above),
+            )
+        )
+    laid = [i for joints in members for i in joints]
+    order = None if laid == sorted(laid) else torch.tensor(np.argsort(laid))
+    return tuple(levels), order
+
 
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
 DOWN = ("down_x", "down_y", "down_z")
@@ -52,10 +219,7 @@ class RigidBodyDynamics(ABC):
         return self._dynamics("inverse_dynamics", q, v, a)
 
     def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
-        """Accelerations (..., nv) under the joint forces ``tau``: ``M^-1 (tau - bias)``.
-
-        Raises :class:`~forcegp.errors.NumericalError` where the mass matrix is not positive definite.
-        """
+        """Accelerations (..., nv) ``M^-1 (tau - bias)``. Raises NumericalError where M is not positive definite."""
         return self._dynamics("forward_dynamics", q, v, tau)
 
 
@@ -138,27 +302,19 @@ class RobotStructure(Summary):
     @property
     def posture_names(self) -> tuple[str, ...]:
         """Names of the entries of :meth:`posture`."""
-        parts = {"floating": (*DOWN, "height"), "spherical": DOWN, "planar": ()}
-        names = [f"{group.name}.{part}" for group in self.layout.groups for part in parts[group.kind]]
+        names = [f"{group.name}.{part}" for group in self.layout.groups for part in (*DOWN, "height")]
         return (*names, *self.single_joint_names)
 
     def posture(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch postures"]:
-        """What of q forces may depend on: q itself on a fixed base.
-
-        Of a base that moves, the direction of gravity in its axes and its height in m along gravity: neither where it
-        stands nor where it looks changes a force.
-        """
+        """What forces may depend on of q; of a base that moves, gravity in its axes and its height in m."""
         if not self.layout.groups:
             return q
         strength = torch.linalg.vector_norm(self.tree.gravity)
         down = self.tree.gravity / strength if bool(strength > 0.0) else q.new_tensor([0.0, 0.0, -1.0])
         parts: list[Tensor] = []
         for group in self.layout.groups:
-            rotation, origin = pose(group.kind, q[..., group.places])
-            if group.kind != "planar":
-                parts.append((rotation.mT @ down[:, None])[..., 0])
-            if group.kind == "floating":
-                parts.append(-(origin @ down)[..., None])
+            rotation, origin = pose(q[..., group.places])
+            parts += [(rotation.mT @ down[:, None])[..., 0], -(origin @ down)[..., None]]
         return torch.cat([*parts, self.space.singles(q)], -1)
 
     @property
@@ -238,6 +394,44 @@ class RobotStructure(Summary):
         if self.layout.groups:
             group = self.layout.groups[0]
             raise InvalidInput(
-                f"{what} need a base that is fixed; {self.name} has the {group.kind} joint {group.name!r}. Fitting, "
+                f"{what} need a base that is fixed; {self.name} has the floating joint {group.name!r}. Fitting, "
                 "prediction, identification, predictors and `posterior.rollout` work without."
             )
+
+
+def bodies_without_inertia(
+    description: RobotDescription, layout: Layout, tree: "Tree", broken: Set[str]
+) -> list[tuple[int, RobotModelError]]:
+    """Bodies that resist their joint neither by inertia nor by armature, as coordinate and error."""
+    pseudo, found = tree.inertias[..., 0].numpy(), []
+    whole = {group.bodies.stop - 1: group for group in layout.groups}
+    carried: list[list[str]] = [[] for _ in layout.bodies]
+    for name, placement in layout.links.items():
+        if placement.body != WORLD and name != layout.bodies[placement.body].child:
+            carried[placement.body].append(name)
+    for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
+        if body in layout.empty:
+            continue
+        own = layout.joints[drive.joint].name == joint.name and float(tree.armature[drive.joint]) > 0.0
+        if own or not broken.isdisjoint((joint.child, *carried[body])):
+            continue
+        others = f" and the links fixed to it ({', '.join(map(repr, carried[body]))})" if carried[body] else ""
+        name = whole[body].name if body in whole else joint.name
+        link, remedy = f"{description.source}: link {joint.child!r}{others}", {"locked": {name: 0.0}}
+        if name == BASE and body in whole:
+            remedy = {"base": "fixed"}
+        if pseudo[body, 3, 3] == 0.0:
+            seen = f"{link} moves with joint {name!r} but has no mass, and nor has what it carries"
+            advice = "; add an <inertial> element, make the joint fixed, or lock it."
+            found.append((drive.joint, MissingInertia(seen, advice, remedy)))
+        elif body in whole and not turns_with_inertia(pseudo[body]):
+            seen = f"{link} turns with joint {name!r} but has no rotational inertia about some axis"
+            found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))
+        elif body not in whole and joint.type != "prismatic" and axis_inertia_vanishes(pseudo[body]):
+            seen = f"{link} turns with joint {name!r} but has no rotational inertia about its axis"
+            advice = (
+                ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "
+                "inertia of its rotor (`armature`, in kg m^2), or lock it."
+            )
+            found.append((drive.joint, NonPhysicalInertia(seen, advice, remedy)))
+    return found

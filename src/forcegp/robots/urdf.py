@@ -1,9 +1,4 @@
-"""Strict URDF reader: XML text -> plain description. Everything that could be silently wrong is an error.
-
-Format: http://wiki.ros.org/urdf/XML. Defaults are those of the format (origin: identity, axis: x); a missing
-``<limit>`` means no limit. Visual, collision, transmission, sensor and simulator elements are ignored (and kept when
-written back). Problems are collected (:mod:`forcegp.robots.problems`), so that one report names all of them.
-"""
+"""URDF text -> plain description (http://wiki.ros.org/urdf/XML). What could be silently wrong is a collected error."""
 
 import difflib
 import math
@@ -22,47 +17,20 @@ from forcegp.errors import (
     UnsafeXml,
     UnsupportedJoint,
 )
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
-from forcegp.robots.problems import Problems
 
 MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
-TAG = re.compile(r"""<[A-Za-z_](?:[^<>"']|"[^"<]*"|'[^'<]*')*>""")
-VALUE = re.compile(r"""("[^"]*"|'[^']*')""")
 DEFINITIONS = ("}arg", "}property", "}macro")
 """Elements of xacro that add nothing by themselves."""
 
 
-def well_formed(text: str) -> str:
-    """The text, or where it is no XML, what other readers of robot files make of it.
-
-    Comments may hold anything, and attributes need no space between them.
-    """
-    if text.count("<") > MOST_TAGS:
-        return text  # refused where it is read
-    try:
-        SafeElementTree.fromstring(_with_prefixes(text.lstrip()))
-    except (ParseError, UnicodeError):
-        return TAG.sub(lambda tag: VALUE.sub(r"\1 ", tag[0]), without_comments(text))
-    except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
-        pass  # refused where it is read
-    return text
-
-
-def without_comments(text: str) -> str:
-    """The text with every comment cut but for its lines, so that errors name the place; in linear time."""
-    parts, place = [], 0
-    while (start := text.find("<!--", place)) >= 0 and (end := text.find("-->", start + 4)) >= 0:
-        parts += [text[place:start], "\n" * text.count("\n", start, end)]
-        place = end + 3
-    return "".join([*parts, text[place:]])
-
-
 def parse_xml(text: str, source: str) -> Element:
     """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
-    text = _with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
+    text = with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
     if text.count("<") > MOST_TAGS:
         raise MalformedUrdf(f"{source}: holds more than {MOST_TAGS} tags; give the URDF file of one robot.")
     if not text:
@@ -78,7 +46,7 @@ def parse_xml(text: str, source: str) -> Element:
         raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.") from None
 
 
-def _with_prefixes(text: str) -> str:
+def with_prefixes(text: str) -> str:
     """The text with declarations for prefixes such as ``drake:``, which readers of URDF do not ask for."""
     used = set(re.findall(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]", text)) - {"xml", "xmlns"}
     declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(used) if f"xmlns:{prefix}" not in text)
@@ -91,10 +59,7 @@ def numbers(values: Iterable[float]) -> str:
 
 
 def refuse_xacro(root: Element, source: str) -> None:
-    """Macros, and expressions in what is read; those inside of <gazebo>, <sensor> or <visual> change no dynamics.
-
-    Nor do definitions that an expanded file still holds.
-    """
+    """Refuse macros, and expressions in what is read; not in <gazebo> or <visual>, nor definitions."""
     owners = [owner for owner in root if owner.tag in ("link", "joint")]
     read = [*owners, *(inner for owner in owners for part in owner if part.tag in MECHANICS for inner in part.iter())]
     left = DEFINITIONS if root.find("link") is not None else ()
@@ -114,17 +79,11 @@ def refuse_xacro(root: Element, source: str) -> None:
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
 MOVABLE = ("revolute", "continuous", "prismatic")
-FREE = ("floating", "planar", "spherical")
-"""Joints of several degrees of freedom; the format has no spherical ones, which MJCF calls ball."""
-ENDS = ("parent", "child")
 
 
 @dataclass(frozen=True)
 class InertialDescription:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), both in the axes of the link frame.
-
-    An inertia that the file does not give is NaN.
-    """
+    """Mass (kg), centre of mass (m), inertia about it (kg m^2; NaN if not given), in the axes of the link frame."""
 
     mass: float
     center_of_mass: np.ndarray
@@ -145,7 +104,7 @@ class Joint:
     """One ``<joint>``. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
 
     name: str
-    type: str  # 'revolute' | 'continuous' | 'prismatic', of a file also 'fixed' and those of `FREE`
+    type: str  # 'revolute' | 'continuous' | 'prismatic', of a file also 'fixed' and 'floating'
     parent: str
     child: str
     axis: tuple[float, float, float]  # unit vector in the joint frame
@@ -159,10 +118,10 @@ class Joint:
     mimics: Mimic | None
 
 
-def free_joint(name: str, kind: str, parent: str, child: str) -> Joint:
-    """A joint without limits and friction, at the origin of its parent; one that is planar moves along x and y."""
+def free_joint(name: str, parent: str, child: str) -> Joint:
+    """A floating joint without limits and friction, at the origin of its parent."""
     limits = (-math.inf, math.inf, math.inf, math.inf)
-    return Joint(name, kind, parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
+    return Joint(name, "floating", parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
 
 
 @dataclass(frozen=True)
@@ -192,18 +151,13 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     links: dict[str, InertialDescription | None] = dict.fromkeys(named)
     for link, part in named.items():
         with problems.collected(link):
-            links[link] = _inertial(part, _Place(f"link {link!r}", source, problems))
+            links[link] = _inertial(_Part(part, f"link {link!r}", problems))
     if not links:
         raise MalformedUrdf(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
-    root = _undefined_root(element, set(links))
-    if root is not None:
-        links = {root: None} | links
-        seen = f"{source}: the link {root!r} is a parent, and the file does not define it"
-        problems.errors.append(MalformedUrdf(seen, ". It can be the root, fixed in the world.", {"root": root}))
     joints = []
     for joint, part in parts.items():
         with problems.collected():
-            joints.append(_joint(part, joint, links, _Place(f"joint {joint!r}", source, problems)))
+            joints.append(_joint(_Part(part, f"joint {joint!r}", problems), joint, links))
     return RobotDescription(name, source, links, tuple(joints), len(joints) == len(parts))
 
 
@@ -221,196 +175,154 @@ def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
     return found
 
 
-def _undefined_root(element: Element, links: set[str]) -> str | None:
-    """The one parent that the file does not define, if everything hangs on it."""
-    parents, children = ({part.get("link", "") for part in element.iterfind(f"joint/{end}")} for end in ENDS)
-    undefined = (parents | children) - links
-    return None if len(undefined) != 1 or undefined & children or links - children else undefined.pop()
-
-
 @dataclass(frozen=True)
-class _Place:
-    """Who is speaking in an error message."""
+class _Part:
+    """An element of a link or joint, None where it is not there; in error messages, whose it is."""
 
+    element: Element | None
     owner: str
-    source: str
     problems: Problems
 
     def __str__(self) -> str:
-        return f"{self.source}: {self.owner}"
+        return f"{self.problems.source}: {self.owner}"
+
+    def child(self, tag: str, needed: bool = False) -> "_Part":
+        children = [] if self.element is None else self.element.findall(tag)
+        if len(children) > 1:  # as in other readers
+            self.problems.note(f"the first of several <{tag}> counts", self.owner)
+        if needed and not children:
+            raise MalformedUrdf(f"{self}: <{self.element.tag}> has no <{tag}>; add it.")  # type: ignore[union-attr]
+        return _Part(children[0] if children else None, self.owner, self.problems)
+
+    def get(self, attribute: str) -> str | None:
+        return None if self.element is None else self.element.get(attribute)
+
+    def text(self, attribute: str) -> str:
+        value = self.get(attribute)
+        if value is None:
+            tag = "" if self.element is None else self.element.tag
+            raise MalformedUrdf(f"{self}: <{tag}> has no attribute {attribute!r}; add it.")
+        return value
+
+    def parsed(self, text: str, what: str) -> float:
+        try:
+            if "_" in text or not text.isascii():  # Python reads 1_000 and digits of every script, the format does not
+                raise ValueError
+            return float(text)
+        except ValueError:
+            raise InvalidNumber(f"{self}: {what} is {text!r}, not a number; write it like 0.5 or 1e-3.") from None
+
+    def number(self, attribute: str, default: float, negative: str = "") -> float:
+        """A number that may be absent and infinite, but not NaN; `negative` is what one below 0 is taken as."""
+        if (text := self.get(attribute)) is None or self.element is None:
+            return default
+        what = f"<{self.element.tag}> {attribute}"
+        value = self.parsed(text, what)
+        if math.isnan(value) or (default == 0.0 and negative and math.isinf(value)):
+            raise InvalidNumber(f"{self}: {what} is {'NaN' if math.isnan(value) else 'inf'}; give a finite number.")
+        if negative and value < 0.0:
+            self.problems.note(f"a negative {what} is taken as {negative}", self.owner)
+            return default
+        return value
+
+    def vector(self, attribute: str, default: tuple[float, ...]) -> np.ndarray:
+        if (text := self.get(attribute)) is None or self.element is None:
+            return np.array(default, dtype=np.float64)
+        words, what = text.split(), f"<{self.element.tag}> {attribute}"
+        if len(words) != len(default):
+            raise InvalidNumber(f"{self}: {what} holds {len(words)} numbers ({' '.join(words)!r}), not {len(default)}.")
+        return np.array([self.parsed(word, what) for word in words])
+
+    def origin(self) -> np.ndarray:
+        """The pose (4, 4) of its <origin>."""
+        at = self.child("origin")
+        xyz, rpy = (at.vector(name, (0.0, 0.0, 0.0)) for name in ("xyz", "rpy"))
+        if not np.isfinite(rpy).all():
+            raise InvalidNumber(f"{self}: <origin> rpy {rpy.tolist()} is not finite; give angles in rad.")
+        if not (np.abs(xyz) < FARTHEST).all():
+            raise InvalidNumber(f"{self}: <origin> xyz {xyz.tolist()} is not finite or far; give metres.")
+        return transform(rotation_from_rpy(rpy), xyz)
 
 
-def _attribute(element: Element, attribute: str, place: _Place) -> str:
-    value = element.get(attribute)
-    if value is None:
-        raise MalformedUrdf(f"{place}: <{element.tag}> has no attribute {attribute!r}; add it.")
-    return value
-
-
-def _child(element: Element, tag: str, place: _Place) -> Element:
-    child = _optional_child(element, tag, place)
-    if child is None:
-        raise MalformedUrdf(f"{place}: <{element.tag}> has no <{tag}>; add it.")
-    return child
-
-
-def _optional_child(element: Element, tag: str, place: _Place) -> Element | None:
-    children = element.findall(tag)
-    if len(children) > 1:  # as in other readers
-        place.problems.note(f"the first of several <{tag}> counts", place.owner)
-    return children[0] if children else None
-
-
-def _number(text: str, what: str, place: _Place) -> float:
-    try:
-        if "_" in text or not text.isascii():  # Python reads 1_000 and digits of every script, the format does not
-            raise ValueError
-        return float(text)
-    except ValueError:
-        raise InvalidNumber(f"{place}: {what} is {text!r}, not a number; write it like 0.5 or 1e-3.") from None
-
-
-def _scalar(element: Element | None, attribute: str, default: float, place: _Place) -> float:
-    """A number that may be absent and may be infinite, but not NaN."""
-    if element is None or attribute not in element.attrib:
-        return default
-    what = f"<{element.tag}> {attribute}"
-    value = _number(element.attrib[attribute], what, place)
-    if math.isnan(value):
-        raise InvalidNumber(f"{place}: {what} is NaN; give a number.")
-    return value
-
-
-def _loss(element: Element | None, attribute: str, place: _Place) -> float:
-    """Damping or dry friction: a finite number >= 0 that may be absent; a negative one is none."""
-    value = _non_negative(element, attribute, 0.0, place, "none")
-    if math.isinf(value):
-        raise InvalidNumber(f"{place}: <dynamics> {attribute} is inf; give a finite number >= 0, or leave it out.")
-    return value
-
-
-def _non_negative(element: Element | None, attribute: str, default: float, place: _Place, none: str) -> float:
-    value = _scalar(element, attribute, default, place)
-    if element is not None and value < 0.0:
-        place.problems.note(f"a negative <{element.tag}> {attribute} is taken as {none}", place.owner)
-        return default
-    return value
-
-
-def _vector(element: Element | None, attribute: str, default: tuple[float, ...], place: _Place) -> np.ndarray:
-    if element is None or attribute not in element.attrib:
-        return np.array(default, dtype=np.float64)
-    words = element.attrib[attribute].split()
-    what = f"<{element.tag}> {attribute}"
-    if len(words) != len(default):
-        raise InvalidNumber(f"{place}: {what} holds {len(words)} numbers ({' '.join(words)!r}), not {len(default)}.")
-    return np.array([_number(word, what, place) for word in words])
-
-
-def _origin(element: Element | None, place: _Place) -> np.ndarray:
-    xyz = _vector(element, "xyz", (0.0, 0.0, 0.0), place)
-    rpy = _vector(element, "rpy", (0.0, 0.0, 0.0), place)
-    if not np.isfinite(rpy).all():
-        raise InvalidNumber(f"{place}: <origin> rpy {rpy.tolist()} is not finite; give angles in rad.")
-    if not (np.abs(xyz) < FARTHEST).all():
-        raise InvalidNumber(f"{place}: <origin> xyz {xyz.tolist()} is not finite or far; give metres.")
-    return transform(rotation_from_rpy(rpy), xyz)
-
-
-def _inertial(link: Element, place: _Place) -> InertialDescription | None:
-    element = _optional_child(link, "inertial", place)
-    if element is None:
+def _inertial(link: _Part) -> InertialDescription | None:
+    element = link.child("inertial")
+    text = element.child("mass").get("value")
+    if element.element is None:
         return None
-    mass_element = _optional_child(element, "mass", place)
-    if mass_element is None or "value" not in mass_element.attrib:  # as in other readers
-        place.problems.note("an <inertial> without mass is left out", place.owner)
+    if text is None:  # as in other readers
+        link.problems.note("an <inertial> without mass is left out", link.owner)
         return None
-    mass = _number(mass_element.attrib["value"], "<mass> value", place)
+    mass = link.parsed(text, "<mass> value")
     if 0.0 < mass < LIGHTEST:
-        raise InvalidNumber(f"{place}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
-    entries = _optional_child(element, "inertia", place)
-    products = [] if entries is None else [key for key in ("ixy", "ixz", "iyz") if key not in entries.attrib]
-    if products:
-        place.problems.note("a product of inertia that is not given is 0", place.owner)
-    given = {} if entries is None else {key: "0" for key in products} | entries.attrib
-
-    def entry(key: str) -> float:
-        if entries is None:  # a mere frame has none
-            return np.nan if mass else 0.0
-        text = given[key] if key in given else _attribute(entries, key, place)
-        return _number(text, f"<inertia> {key}", place)
-
-    ixx, ixy, ixz, iyy, iyz, izz = map(entry, ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
-    origin = _origin(_optional_child(element, "origin", place), place)
-    rotation = origin[:3, :3]
-    about_center = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-    if not np.array_equal(rotation, np.eye(3)):
-        about_center = rotation @ about_center @ rotation.T
-    return InertialDescription(mass, origin[:3, 3], 0.5 * (about_center + about_center.T))
+        raise InvalidNumber(f"{link}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
+    entries = element.child("inertia")
+    if entries.element is None:  # a mere frame has none
+        moments = np.full((3, 3), np.nan if mass else 0.0)
+    else:
+        if any(entries.get(key) is None for key in ("ixy", "ixz", "iyz")):
+            link.problems.note("a product of inertia that is not given is 0", link.owner)
+        moments = np.zeros((3, 3))
+        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+            i, j = ("xyz".index(axis) for axis in key[1:])
+            given = entries.text(key) if i == j else entries.get(key) or "0"
+            moments[i, j] = moments[j, i] = link.parsed(given, f"<inertia> {key}")
+    origin = element.origin()
+    if not np.array_equal(origin[:3, :3], np.eye(3)):
+        moments = origin[:3, :3] @ moments @ origin[:3, :3].T
+    return InertialDescription(mass, origin[:3, 3], 0.5 * (moments + moments.T))
 
 
-def _joint(element: Element, name: str, links: dict[str, InertialDescription | None], place: _Place) -> Joint:
-    kind = _attribute(element, "type", place)
-    kinds = (*MOVABLE, "fixed", *FREE)
+def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -> Joint:
+    kind, kinds = at.text("type"), (*MOVABLE, "fixed", "floating")
     if kind not in kinds:
         close = difflib.get_close_matches(kind, kinds, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise UnsupportedJoint(f"{place} has the unknown type {kind!r}; allowed: {', '.join(kinds)}.{hint}")
+        raise UnsupportedJoint(f"{at} has the unknown type {kind!r}; allowed: {', '.join(kinds)}.{hint}")
     ends = {}
-    for end in ENDS:
-        ends[end] = _attribute(_child(element, end, place), "link", place)
+    for end in ("parent", "child"):
+        ends[end] = at.child(end, needed=True).text("link")
         if ends[end] not in links:
             close = difflib.get_close_matches(ends[end], links, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
             raise MalformedUrdf(
-                f"{place} names the {end} link {ends[end]!r}, which the file does not define{hint}",
+                f"{at} names the {end} link {ends[end]!r}, which the file does not define{hint}",
                 f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
-    origin = _origin(_optional_child(element, "origin", place), place)
-    axis_element = _optional_child(element, "axis", place)
-    if kind == "planar" and axis_element is None:  # x by the format: a base that moves up the wall
-        place.problems.note("a planar joint without <axis> moves along x and y", place.owner)
-    axis = _vector(axis_element, "xyz", (0.0, 0.0, 1.0) if kind == "planar" else (1.0, 0.0, 0.0), place)
-    length, directed = float(np.linalg.norm(axis)), kind in (*MOVABLE, "planar")
+    origin, axis = at.origin(), at.child("axis").vector("xyz", (1.0, 0.0, 0.0))
+    length, directed = float(np.linalg.norm(axis)), kind in MOVABLE
     if directed and not (math.isfinite(length) and length > 0.0):
-        held = (place.problems.given.get("locked") or {}).get(name)
-        if held != 0.0:
-            seen = f"{place}: <axis> {axis.tolist()} has no direction"
+        if (at.problems.given.get("locked") or {}).get(name) != 0.0:
+            seen = f"{at}: <axis> {axis.tolist()} has no direction"
             advice = "; give a non-zero, finite vector, or lock the joint."
-            place.problems.errors.append(InvalidNumber(seen, advice, {"locked": {name: 0.0}}))
+            at.problems.errors.append(InvalidNumber(seen, advice, {"locked": {name: 0.0}}))
         directed = False
-    unit = tuple((axis / length).tolist()) if directed else (1.0, 0.0, 0.0)
-    limit = _optional_child(element, "limit", place)
+    limit, dynamics, mimic = (at.child(tag) for tag in ("limit", "dynamics", "mimic"))
     lower, upper = -math.inf, math.inf
-    if limit is not None and kind in ("revolute", "prismatic") and ("lower" in limit.attrib or "upper" in limit.attrib):
-        # the format's default for the one that is left out is 0
-        lower, upper = (_scalar(limit, side, 0.0, place) for side in ("lower", "upper"))
+    if kind in ("revolute", "prismatic") and (limit.get("lower"), limit.get("upper")) != (None, None):
+        lower, upper = (limit.number(side, 0.0) for side in ("lower", "upper"))  # the format's default is 0
         if lower > upper:
-            place.problems.note("a lower limit above the upper one is taken as no limit", place.owner)
+            at.problems.note("a lower limit above the upper one is taken as no limit", at.owner)
             lower, upper = -math.inf, math.inf
-    dynamics = _optional_child(element, "dynamics", place)
-    mimic = _optional_child(element, "mimic", place)
-    if mimic is not None and kind == "fixed":
-        place.problems.note("the <mimic> of a fixed joint is ignored", place.owner)
+    mimics = None
+    if mimic.element is not None and kind == "fixed":
+        at.problems.note("the <mimic> of a fixed joint is ignored", at.owner)
+    elif mimic.element is not None:
+        ratio = mimic.number("multiplier", 1.0), mimic.number("offset", 0.0)
+        if not np.isfinite(ratio).all():
+            raise InvalidNumber(f"{at}: <mimic> holds numbers that are not finite; correct multiplier and offset.")
+        mimics = Mimic(mimic.text("joint"), *ratio)
     return Joint(
         name=name,
         type=kind,
         parent=ends["parent"],
         child=ends["child"],
         origin=origin,
-        axis=unit,
+        axis=tuple((axis / length).tolist()) if directed else (1.0, 0.0, 0.0),
         lower=lower,
         upper=upper,
-        velocity_limit=_non_negative(limit, "velocity", math.inf, place, "no limit"),
-        effort_limit=_non_negative(limit, "effort", math.inf, place, "no limit"),
-        damping=_loss(dynamics, "damping", place),
-        friction=_loss(dynamics, "friction", place),
-        mimics=None if mimic is None or kind == "fixed" else _mimic(mimic, place),
+        velocity_limit=limit.number("velocity", math.inf, "no limit"),
+        effort_limit=limit.number("effort", math.inf, "no limit"),
+        damping=dynamics.number("damping", 0.0, "none"),
+        friction=dynamics.number("friction", 0.0, "none"),
+        mimics=mimics,
     )
-
-
-def _mimic(element: Element, place: _Place) -> Mimic:
-    numbers = [_scalar(element, name, default, place) for name, default in (("multiplier", 1.0), ("offset", 0.0))]
-    if not np.isfinite(numbers).all():
-        raise InvalidNumber(f"{place}: <mimic> holds numbers that are not finite; correct multiplier and offset.")
-    return Mimic(_attribute(element, "joint", place), *numbers)

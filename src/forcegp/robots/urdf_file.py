@@ -1,24 +1,14 @@
-"""URDF files: read and written in the encoding that they declare; inertials and friction replaced in the text.
+"""URDF files in the encoding that they declare; inertials, friction and impossible inertias replaced in the text."""
 
-Published URDFs break the triangle inequality at times (rounded numbers, unconstrained identification). With the second
-moments ``Sigma = tr(I)/2 1 - I`` about the centre of mass a body has the inertia I if and only if Sigma is positive
-semi-definite (:mod:`forcegp.robots.inertia`). The nearest one minimises ``|I' - I|_F``. Both matrices have the same
-axes and ``|dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2`` for changes s of the eigenvalues of Sigma, so it is a projection in
-three variables.
-"""
-
-import contextlib
 import json
-import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
-from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from defusedxml import minidom
 from jaxtyping import Float
 
 from forcegp.atomic_files import write_bytes, write_json
@@ -34,12 +24,11 @@ from forcegp.errors import (
     UnreadableRobotFile,
     required_extra,
 )
+from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
-from forcegp.robots.problems import Problems
-from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, without_comments
+from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
 
-UNREADABLE = "\ufffd"
 HEAVIEST = 1e9
 """kg and kg m^2, of one link: far from where products of inertias overflow."""
 LARGEST_FILE = 16 << 20
@@ -72,9 +61,6 @@ def read_text(path: str | Path) -> str:
     try:
         return data.decode(encoding)
     except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
-        with contextlib.suppress(ValueError, LookupError):  # comments are written in any language
-            if UNREADABLE not in (text := without_comments(data.decode(encoding, errors="replace"))):
-                return text
         raise UnreadableRobotFile(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'
@@ -100,100 +86,46 @@ def write_text(text: str, path: Path) -> None:
 def replace_inertial(
     text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
 ) -> str:
-    """URDF text with the ``<inertial>`` element of ``link`` replaced or added, with digits that read back exactly.
-
-    ``mass`` in kg, ``center_of_mass`` (3,) in m and ``inertia`` (3, 3) about it in kg m^2, axes of the link frame.
-    """
-    data = text.encode("utf-8")
-    parts = [f"  {part}".encode() for part in inertial_parts(mass, center_of_mass, inertia)]
-    element = [b"<inertial>", *parts, b"</inertial>"]
-    head, inertial = _find(data, "link", link, "inertial", UnknownLink(f"{source}: no link {link!r} in the URDF text."))
-    if inertial is None:
-        return _with_child(data, head, b"link", element)
-    first, last = inertial
-    return (data[:first] + _line_start(data, first).join(element) + data[last:]).decode("utf-8")
+    """URDF text with the ``<inertial>`` (kg, m, kg m^2, link axes) of ``link`` replaced or added, read back exactly."""
+    document, owner = _found(text, "link", link, UnknownLink(f"{source}: no link {link!r} in the URDF text."))
+    parts = "".join(inertial_parts(mass, center_of_mass, inertia))
+    new = minidom.parseString(f"<inertial>{parts}</inertial>").documentElement
+    old = _child(owner, "inertial")
+    owner.replaceChild(new, old) if old else owner.appendChild(new)
+    return _written(document)
 
 
 def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
-    """URDF text with attributes of the ``<dynamics>`` element of ``joint`` replaced or added ('damping', 'friction').
-
-    Attributes that are not named stay, with digits that read back exactly.
-    """
-    data = text.encode("utf-8")
-    unknown = UnknownJoint(f"{source}: no joint {joint!r} in the URDF text.")
-    head, dynamics = _find(data, "joint", joint, "dynamics", unknown)
-    if dynamics is None:
-        attributes = " ".join(f'{name}="{value!r}"' for name, value in values.items())
-        return _with_child(data, head, b"joint", [f"<dynamics {attributes}/>".encode()])
-    first, last = dynamics
-    element = data[first:last].decode("utf-8")
+    """URDF text with attributes ('damping', 'friction') of the ``<dynamics>`` of ``joint`` replaced or added."""
+    document, owner = _found(text, "joint", joint, UnknownJoint(f"{source}: no joint {joint!r} in the URDF text."))
+    dynamics = _child(owner, "dynamics") or owner.appendChild(document.createElement("dynamics"))
     for name, value in values.items():
-        written = f' {name}="{value!r}"'
-        element, found = re.subn(rf"\s{name}\s*=\s*(\"[^\"]*\"|'[^']*')", written, element, count=1)
-        element = element if found else element.replace("<dynamics", f"<dynamics{written}", 1)
-    return (data[:first] + element.encode() + data[last:]).decode("utf-8")
+        dynamics.setAttribute(name, repr(value))
+    return _written(document)
 
 
-REST_OF_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
+def with_note(text: str, note: str) -> str:
+    """URDF text with a comment before its last tag."""
+    document: Any = minidom.parseString(with_prefixes(text))
+    document.documentElement.appendChild(document.createComment(f" {note.replace('--', '- -')} "))
+    return _written(document)
 
 
-def _find(
-    data: bytes, kind: str, name: str, part: str, unknown: UnknownName
-) -> tuple[tuple[int, int], tuple[int, int] | None]:
-    """Byte offsets (first, one past last) of an element's start tag, and of the element ``part`` directly in it.
-
-    Raises ``unknown`` where there is no such element.
-    """
-    parser = expat.ParserCreate("utf-8")
-    depth = 0
-    inside = False
-    found: list[int] = []
-    child: list[int] = []
-
-    def after_tag(position: int) -> int:
-        tag = REST_OF_TAG.match(data, position)
-        assert tag is not None, "the text is well-formed"
-        return tag.end()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, inside
-        position = parser.CurrentByteIndex
-        depth += 1
-        if depth == 2 and tag == kind and attributes.get("name") == name:
-            inside = True
-            found.extend((position, after_tag(position)))
-        elif inside and depth == 3 and tag == part:
-            child.append(position)
-
-    def end(tag: str) -> None:
-        nonlocal depth, inside
-        if inside and depth == 3 and tag == part:
-            child.append(after_tag(parser.CurrentByteIndex))
-        inside = inside and depth > 2
-        depth -= 1
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.Parse(data, True)
-    if not found:
-        raise unknown
-    return (found[0], found[1]), ((child[0], child[1]) if child else None)
+def _found(text: str, kind: str, name: str, unknown: UnknownName) -> tuple[Any, Any]:
+    """The document, and one of the elements directly in its root; raises ``unknown``."""
+    document: Any = minidom.parseString(with_prefixes(text))
+    for element in document.documentElement.childNodes:
+        if element.nodeName == kind and element.getAttribute("name") == name:
+            return document, element
+    raise unknown
 
 
-def _with_child(data: bytes, head: tuple[int, int], kind: bytes, lines: Sequence[bytes]) -> str:
-    """The text with one more element, of these lines, in the element whose start tag has the offsets ``head``."""
-    line_start, head_end = _line_start(data, head[0]), head[1]
-    element = b"".join(line_start + b"  " + line for line in lines)
-    before, after = data[:head_end], data[head_end:]
-    if before.endswith(b"/>"):  # <link name="tool"/> has no inside yet
-        before, after = before[:-2].rstrip() + b">", line_start + b"</" + kind + b">" + after
-    return (before + element + after).decode("utf-8")
+def _child(owner: Any, tag: str) -> Any:
+    return next((part for part in owner.childNodes if part.nodeName == tag), None)
 
 
-def _line_start(data: bytes, position: int) -> bytes:
-    """The end of a line of this text, and the indentation of the line of that offset."""
-    line = data[data.rfind(b"\n", 0, position) + 1 : position]
-    return (b"\r\n" if b"\r\n" in data else b"\n") + (b"" if line.strip() else line)
+def _written(document: Any) -> str:
+    return "".join(node.toxml() for node in document.childNodes) + "\n"
 
 
 def inertial_parts(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> list[str]:
@@ -212,9 +144,9 @@ MARGIN = 1e-3
 
 
 def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The nearest inertia about the centre of mass (kg m^2) that a body of positive thickness can have.
+    """The nearest inertia I (kg m^2), in |I' - I|_F, of a body whose second moments are at least `MARGIN` of their sum.
 
-    Second moments are at least `MARGIN` of the sum of those that were positive.
+    A projection in three variables: |dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2 for changes s of the second moments.
     """
     moments, axes = np.linalg.eigh(inertia)
     second = 0.5 * moments.sum() - moments
@@ -234,11 +166,9 @@ def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def with_chosen_inertias(
     choice: str, text: str, description: RobotDescription, layout: Layout, problems: Problems
 ) -> tuple[str, RobotDescription]:
-    """URDF text and its description with possible inertias for impossible ones of moving links; every other byte stays.
+    """URDF text and description with possible inertias for impossible ones of moving links; every other byte stays.
 
-    With "strict" `problems` collects these links, and the text stays. With "nearest" it notes them, with the relative
-    change; a link without mass loses its inertia. What the inertia alone cannot mend (a negative mass) is collected in
-    both cases. Raises InvalidInput for another choice.
+    With "strict" `problems` collects these links, with "nearest" it notes them. Raises InvalidInput for another choice.
     """
     if choice not in get_args(InertiaChoice):
         raise InvalidInput(f"inertias is {choice!r}; give one of {', '.join(get_args(InertiaChoice))}.")
@@ -293,25 +223,11 @@ IN_THE_FILE = (
 )
 
 
-def with_root(text: str, root: str) -> str:
-    """URDF text that defines the link ``root``, which it does not name as one."""
-    return before_the_end(text, f"<link name={quoteattr(root)}/>\n")
-
-
-def before_the_end(text: str, added: str) -> str:
-    """URDF text with more before its last tag, a comment for example."""
-    end = text.rindex("</robot")
-    return f"{text[:end]}{added}{text[end:]}"
-
-
-COMMENT = "<!-- rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json -->\n"
+COMMENT = "rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json"
 
 
 def read_robot_file(path: str | Path) -> str:
-    """URDF text of a file, whose macros are expanded where it is called .xacro.
-
-    Raises UnreadableRobotFile, MissingExtra without the package xacro, and MalformedUrdf where it fails.
-    """
+    """URDF text of a file, .xacro expanded. Raises UnreadableRobotFile, MissingExtra, MalformedUrdf."""
     text = read_text(path)
     if Path(path).suffix != ".xacro":
         return text
@@ -354,7 +270,7 @@ def with_comment(text: str, armature: Mapping[str, float], *, source: str, stack
         RobotFileWarning,
         stacklevel=stacklevel,
     )
-    return text if COMMENT in text else before_the_end(text, COMMENT)
+    return text if COMMENT in text else with_note(text, COMMENT)
 
 
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:
