@@ -73,7 +73,7 @@ on simulated recordings of `kuka-surface`. Two episodes of 60 s are learned from
 
 `identified` is the rival: bodies, viscous and Coulomb friction of all training rows. Where the tool slides with an
 unmeasured friction, nothing can be identified, so it is missing there. The noise of the acceleration is
-.1 rad/s², so a perfect model has an MAE of .0798. “Noise-free” is the error against the true acceleration, and errors
+.1 rad/s², so a perfect model has an MAE of about .079 on these rows. “Noise-free” is the error against the true acceleration, and errors
 of the normal force are relative to its root mean square. Medians over seeds come with the least and the largest value.
 A seed is a choice of training points; functions of one or two inputs learn from all rows.
 """  # noqa: E501  # one line of the page each

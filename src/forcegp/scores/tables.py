@@ -17,11 +17,11 @@ def median_and_range(values: Iterable[float | None]) -> dict[str, Any] | None:
 
 
 def formatted(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
-    """`.0831 (.0825–.0847)` of a median with its range, `.0831` of a number, a dash of nothing."""
+    """`.0831 (.0825–.0847)` of a median with its range, `.0831` where that is one number, a dash of nothing."""
     if not isinstance(value, Mapping):
         return number(value, digits)
     middle, low, high = (number(value[name], digits) for name in ("median", "min", "max"))
-    return middle if len(value["values"]) == 1 else f"{middle} ({low}–{high})"
+    return middle if low == high else f"{middle} ({low}–{high})"
 
 
 def number(value: float | None, digits: int = 4) -> str:
