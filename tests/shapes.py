@@ -38,7 +38,7 @@ def checked(definition: Any) -> Any:
     """The function or class whose calls are checked."""
     if not inspect.isclass(definition):
         return checked_function(definition)
-    if dataclasses.is_dataclass(definition) and "__init__" in vars(definition):
+    if {"__dataclass_fields__", "__init__"} <= vars(definition).keys():
         definition.__init__ = checked_constructor(definition, definition.__init__)
     return definition
 

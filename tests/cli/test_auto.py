@@ -154,6 +154,7 @@ def _stopped(*_):
     raise InvalidInput("reached")
 
 
+@pytest.mark.usefixtures("unchecked")  # its dataset is none
 def test_a_model_that_is_worse_than_none_is_not_trusted():
     """Where all motions diverge and accelerations are wrong by more than they vary."""
     dataset = SimpleNamespace(units={"q": "rad"})

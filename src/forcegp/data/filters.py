@@ -19,7 +19,7 @@ from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 Signal = Literal["q", "v", "u", "a"]
-Values = Float[np.ndarray, "rows columns"]
+Values = Float[np.ndarray, "rows *columns"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
 PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`Filter.memory`)

@@ -108,7 +108,7 @@ def import_recordings(
         for number, rows in recording.stretches:
             for places, seen, remedy in recording.jumps:  # which derivatives would take for motion
                 for row in places[(places > rows[0]) & (places <= rows[-1])][:1]:
-                    where = f"{recording.source.place(row)} ({recording.time[row]:.6g} s from the start)"
+                    where = f"{recording.source.place(int(row))} ({recording.time[row]:.6g} s from the start)"
                     raise DatasetError(f"{recording.told['name']}: {seen} at {where}; {remedy}")
             piece = recording.rows(rows, step)
             count, stamp = len(piece["time"]), recording.begin + float(recording.time[rows[0]])

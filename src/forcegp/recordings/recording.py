@@ -30,12 +30,12 @@ class Recording:
 
     told: dict[str, Any]
     source: Source
-    signals: Mapping[str, Float[np.ndarray, "rows entries"]]
+    signals: Mapping[str, Float[np.ndarray, "rows _"]]
     time: Float[np.ndarray, " rows"]
     begin: float
     jumps: tuple[Jumps, ...]
     layout: Layout
-    stretches: tuple[tuple[int, Int[np.ndarray, " rows"]], ...]
+    stretches: tuple[tuple[int, Int[np.ndarray, " _"]], ...]
     step: float
     worst: float
 
