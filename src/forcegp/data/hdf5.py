@@ -86,7 +86,7 @@ class _Reader:
     path: Path
     file: h5py.File
 
-    def require(self, fits: bool, problem: str) -> None:
+    def require(self, fits: bool | np.bool_, problem: str) -> None:
         if not fits:
             raise FileFormatError(f"{self.path}{problem}")
 

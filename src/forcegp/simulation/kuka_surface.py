@@ -112,7 +112,7 @@ class DryFriction:
     breakaway_velocity: float
     smoothing: float
 
-    def level(self, speed: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    def level(self, speed: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch"] | float:
         """mu at tangential speeds [m/s]."""
         return self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.breakaway_velocity) ** 2))
 
