@@ -113,7 +113,7 @@ def test_a_kept_program_is_loaded_again_unless_others_may_change_it(tmp_path):
         load_library("x", "a", write, folder=tmp_path / "kept")
     broken = tmp_path / "broken.so"
     broken.write_text("no library")
-    with pytest.raises(CompilerError, match="cannot be loaded .*delete it, and it is compiled anew"):
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*delete it, and it is compiled anew"):
         opened_library(broken)
 
 
