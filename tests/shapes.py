@@ -78,10 +78,11 @@ def checked_constructor(kind: type, construct: Callable[..., None]) -> Callable[
 
     @functools.cache
     def hints() -> dict[str, Any]:
-        """Of the fields, without those that a class of another library brings."""
+        """Of the fields, without those that a class of another library brings, or that are computed when asked for."""
         package, found = kind.__module__.split(".")[0], get_type_hints(kind, include_extras=True)
         bases = [base for base in kind.__mro__ if base.__module__.split(".")[0] == package]
         own = {name for base in bases for name in inspect.get_annotations(base)}
+        own -= {name for name in own if isinstance(inspect.getattr_static(kind, name, None), functools.cached_property)}
         return {field.name: found[field.name] for field in dataclasses.fields(kind) if field.name in own}
 
     @functools.wraps(construct)

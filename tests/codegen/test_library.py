@@ -1,13 +1,26 @@
 """What all machine code shares: compilers, and tensors that carry no derivatives which the code would lose."""
 
 import ctypes
+import os
+import stat
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch.autograd import forward_ad
 
-from forcegp.codegen.library import COMMANDS, PACKAGES, code_digest, compile_library, require_plain
+from forcegp.codegen.library import (
+    COMMANDS,
+    PACKAGES,
+    code_digest,
+    compile_library,
+    load_library,
+    opened_library,
+    own_file,
+    own_folder,
+    require_plain,
+)
 from forcegp.errors import CompilerError, InvalidInput
 
 SOURCE = "double twice(double x) { return x + x; }"
@@ -81,3 +94,69 @@ def test_kept_programs_are_made_again_where_a_text_has_changed(kind, monkeypatch
     before, read = code_digest.__wrapped__(), Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + (b"/**/" if path.suffix == kind else b""))
     assert code_digest.__wrapped__() != before
+
+
+def test_a_kept_program_is_loaded_again_unless_others_may_change_it(tmp_path):
+    written = []
+
+    def write(lanes):
+        written.append(lanes)
+        return f"int evaluate(void) {{ return {len(written)}; }}"
+
+    found = [load_library("x", key, write, folder=tmp_path / "kept").evaluate() for key in ("a", "a", "b")]
+    assert found == [1, 1, 2]
+    assert len(written) == 2
+    for path in (tmp_path / "kept").iterdir():
+        assert stat.S_IMODE(path.stat().st_mode) == 0o700
+        path.chmod(0o770)
+    with pytest.raises(CompilerError, match=r"can be written to by others than you, .*chmod go-w"):
+        load_library("x", "a", write, folder=tmp_path / "kept")
+    broken = tmp_path / "broken.so"
+    broken.write_text("no library")
+    with pytest.raises(CompilerError, match=r"cannot be loaded .*delete it, and it is compiled anew"):
+        opened_library(broken)
+
+
+@pytest.mark.parametrize(
+    ("parent", "own", "refused"),
+    [
+        (0o700, 0o700, False),
+        (0o1777, 0o700, False),  # only owners exchange what is there
+        (0o777, 0o700, True),
+        (0o770, 0o700, True),
+        (0o700, 0o770, True),
+        (0o700, 0o702, True),
+        (0o700, 0o1777, True),
+    ],
+)
+def test_folders_that_others_may_write_to_are_refused(tmp_path, parent, own, refused):
+    folder = tmp_path / "parent" / "own"
+    folder.mkdir(parents=True)
+    folder.chmod(own)
+    folder.parent.chmod(parent)
+    link = tmp_path / "link"
+    link.symlink_to(folder)
+    for path in (folder, link):
+        if refused:
+            with pytest.raises(CompilerError, match="can be written to by others"):
+                own_folder(path)
+        else:
+            assert own_folder(path) == folder.resolve()
+
+
+def test_folders_are_made_for_the_user_alone_where_they_can_be(tmp_path):
+    folder = own_folder(tmp_path / "new" / "kept")
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (folder, folder.parent)] == [0o700, 0o700]
+    (tmp_path / "file").touch()
+    with pytest.raises(CompilerError, match=r"cannot be made \(File exists\); choose another folder"):
+        own_folder(tmp_path / "file")
+
+
+@pytest.mark.parametrize(("owner", "refused"), [(os.getuid(), False), (0, False), (os.getuid() + 1, True)])
+def test_what_belongs_to_another_user_is_refused(tmp_path, monkeypatch, owner, refused):
+    monkeypatch.setattr(Path, "stat", lambda _: SimpleNamespace(st_uid=owner, st_mode=0o100700))
+    if refused:
+        with pytest.raises(CompilerError, match="belongs to another user"):
+            own_file(tmp_path)
+    else:
+        own_file(tmp_path)

@@ -67,3 +67,24 @@ def test_a_root_is_found_where_no_eigenvalues_are(monkeypatch):
     x, found = find_roots(lambda x: x + 0.5 * torch.tanh(x.roll(1, -1)) - 1.0, torch.zeros(2, 3).double())
     assert found.all()
     torch.testing.assert_close(x + 0.5 * torch.tanh(x.roll(1, -1)), torch.ones(2, 3).double())
+
+
+def test_without_eigenvalues_the_bound_is_theirs_where_the_jacobian_is_symmetric(monkeypatch):
+    """A smallest slope of .05 is raised to .1, so the error halves with every step, either way."""
+    A = torch.tensor([[0.525, 0.475], [0.475, 0.525]], dtype=torch.float64)  # of eigenvalues .05 and 1
+    calls = []
+
+    def residual(x):
+        calls[-1] += 1
+        return x @ A - torch.tensor([0.05, -0.05], dtype=torch.float64)
+
+    def fails(_):
+        raise torch.linalg.LinAlgError("the algorithm failed to converge")
+
+    for eigenvalues in (torch.linalg.eigvals, fails):
+        monkeypatch.setattr(torch.linalg, "eigvals", eigenvalues)
+        calls.append(0)
+        x, found = find_roots(residual, torch.zeros(1, 2).double())
+        assert found.all()
+        torch.testing.assert_close(x, torch.tensor([[1.0, -1.0]]).double())
+    assert calls[0] == calls[1] > 20

@@ -105,6 +105,11 @@ def test_a_model_without_unknown_forces_has_nothing_to_draw(data, start):
     torch.testing.assert_close(rollout.samples.q, rollout.q.expand(2, -1, -1, -1), rtol=1e-12, atol=1e-12)
 
 
+def test_without_samples_there_are_no_quantiles(posterior, start):
+    with pytest.raises(InvalidInput, match=r"has 0 samples, 1 are needed; ask for rollout\(\.\.\., samples=20\)"):
+        posterior.rollout(*start, DT).quantiles()
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

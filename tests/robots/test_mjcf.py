@@ -131,6 +131,14 @@ def test_a_joint_that_an_equality_holds_is_locked():
     assert robot.joint_names == ("k",)
 
 
+def test_a_joint_that_follows_the_first_one_is_not_locked():
+    text = HINGE.format("", BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>', "")
+    coupled = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0 0 0"/></equality></mujoco>'
+    robot = Robot.from_mjcf_text(text.replace("</mujoco>", coupled))
+    assert not robot.locked
+    assert robot.joint_names == ("j",)
+
+
 def test_rotor_inertias_of_actuators_count():
     text = HINGE.format('armature=".3"', BALL, '<actuator><motor joint="j" gear="3" armature=".2"/></actuator>')
     assert Robot.from_mjcf_text(text).armature.item() == pytest.approx(0.3 + 9 * 0.2)

@@ -120,7 +120,7 @@ class ParameterSpace:
         each = [np.full_like(term.size, 1.0 if term.logarithm else np.inf) for term in self.terms]
         return self._joined(np.full(self.bodies.size, self.bodies.longest_step), each)
 
-    def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
+    def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
         of_bodies, of_terms = self.split(x)
         distance, jacobian = self.bodies.distance(of_bodies)

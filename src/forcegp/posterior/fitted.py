@@ -171,7 +171,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         slopes: Float[np.ndarray, "n k"],
         white: Float[np.ndarray, "N k+1"],
         stretches: Sequence[np.ndarray],
-        prior: Float[np.ndarray, "k k"],
+        prior: Float[np.ndarray, "entries k"],
         **more: Any,
     ) -> "Estimates":
         """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
@@ -203,7 +203,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         values: Float[np.ndarray, " n"],
         slopes: Float[np.ndarray, "n k"],
         inverse: Float[np.ndarray, "k k"],
-        prior: Float[np.ndarray, "k k"],
+        prior: Float[np.ndarray, "entries k"],
         covariance: Float[np.ndarray, "k k"] | None = None,
         **more: Any,
     ) -> "Estimates":

@@ -269,7 +269,7 @@ class UnrolledKinematics:
 def _pose(q: Any) -> tuple[Scalars, Scalars]:
     """Rotation (3, 3) and translation (3,) of a floating joint, by the code of the robot's."""
     example = torch.tensor(NEUTRAL, dtype=torch.float64)
-    _, (rotation, origin) = trace(pose, [example], q[0].graph, q)
+    _, (rotation, origin) = trace(pose, [example], q[0].graph, list(q))
     return expressions(q[0].graph, rotation), expressions(q[0].graph, origin)
 
 
