@@ -3,7 +3,6 @@
 from xml.etree import ElementTree
 
 import pytest
-import torch
 from tests.posterior.arm import arm_data, arm_model
 from tests.posterior.raw_log import motion
 
@@ -84,43 +83,3 @@ def test_a_prediction_of_means_shows_itself(shown, data):
     for name in ("std", "variance"):
         with pytest.raises(ForceGPError, match="call predict"):
             getattr(prediction, name)
-
-
-@pytest.mark.parametrize(
-    ("index", "rows"),
-    [
-        (3, 3),
-        (-1, 19),
-        (slice(2, 5), slice(2, 5)),
-        ([4, 1], [4, 1]),
-        (torch.arange(20) < 2, slice(2)),
-        (..., slice(20)),
-    ],
-)
-def test_a_prediction_of_some_states(shown, index, rows):
-    whole = shown["Prediction"]
-    part = whole[index]
-    assert type(part) is type(whole)
-    for name in ("mean", "covariance", "noise_covariance", "std"):
-        assert torch.equal(getattr(part, name), getattr(whole, name)[rows])
-    for name in ("multiplier", "contact_force", "unknown_force"):
-        assert torch.equal(getattr(part, name).mean, getattr(whole, name).mean[rows])
-        assert torch.equal(getattr(part, name).std, getattr(whole, name).std[rows])
-
-
-def test_batches_of_several_dimensions_and_single_states(shown, data):
-    posterior = shown["Posterior"]
-    q, v, u = (x.reshape(4, 5, 3) for x in (data.q, data.v, data.u))
-    whole = posterior.predict(q, v, u)
-    assert torch.equal(whole[1, 2].mean, whole.mean[1, 2])
-    assert torch.equal(whole[:, 2].covariance, whole.covariance[:, 2])
-    assert torch.equal(whole[..., 2].mean, whole.mean[:, 2])  # never an entry of the acceleration
-    single = posterior.predict(data.q[0], data.v[0], data.u[0])
-    assert torch.equal(single[...].mean, single.mean)
-
-
-def test_states_that_are_not_there(shown):
-    for index in (20, (1, 1), "mean", 1.5):
-        with pytest.raises(ForceGPError, match="no states"):
-            shown["Prediction"][index]
-    assert len(list(shown["Prediction"])) == 20  # a loop ends

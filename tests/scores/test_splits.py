@@ -19,8 +19,7 @@ def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Da
     values = {name: generator.normal(size=(rows, 1)) for name in "qvua"}
     episode = np.repeat(np.arange(episodes), rows // episodes)
     time = np.concatenate([np.cumsum(generator.uniform(0.005, 0.03, rows // episodes)) for _ in range(episodes)])
-    units = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2", "time": "s"}
-    return Dataset(**{**values, "time": time, "episode": episode, "joint_names": ("j",), "units": units, **changes})
+    return Dataset(**{**values, "time": time, "episode": episode, "joint_names": ("j",), **changes})
 
 
 @settings(max_examples=30, deadline=None)
