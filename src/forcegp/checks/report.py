@@ -278,8 +278,9 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         (one_way, turned, "Record motion to and fro."),
     ):
         if joints:
-            about = {"joints": tuple(joints), "numbers": {"joints": motions}}
-            yield look(about="excitation", what=f"{listed(joints)} {what}", do=remedy, **about)
+            numbers = {"joints": motions}
+            said = f"{listed(joints)} {what}"
+            yield look(about="excitation", what=said, do=remedy, joints=tuple(joints), numbers=numbers)
     yield from _held(inputs, still)
     yield from _base_parameters(inputs)
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from typing_extensions import override
 
-import forcegp.mechanics
+import forcegp
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset, is_dataset
 from forcegp.data.filters import JITTER
