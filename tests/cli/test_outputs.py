@@ -113,6 +113,7 @@ def test_two_commands_do_not_write_to_one_place(folder, no_work, monkeypatch, ca
 
 def test_locks_of_another_user_are_not_used(folder, no_work, monkeypatch, capfd):
     mine = os.getuid()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
     monkeypatch.setattr(os, "getuid", lambda: mine + 1)
     assert "belongs to another user; set TMPDIR" in refused(filled("fit", "new"), capfd)
 

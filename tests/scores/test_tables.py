@@ -94,6 +94,16 @@ def test_the_model_to_take_stands_with_what_it_was_compared_with(scores):
     assert {row[2] for row in winner_table(few)[1]} == {"–"}, "nothing else was scored"
 
 
+def test_much_better_on_too_little_time_is_not_sure(scores):
+    """A third better in both stretches of one seed, by amounts that differ so much that no interval shows it."""
+    hard = {name: [{**run(0, 1.0), "stretches": {"force": values}}] for name, values in
+            (("ls", [4.0, 0.01]), ("gp", [0.04, 0.0099]))}  # fmt: skip
+    few = Scores(models=scores.models, runs={**hard, "urdf": []}, joint_names=("a", "b"), units=UNITS)
+    (row,) = [row for row in winner_table(few)[1] if row[0].startswith("force")]
+    assert row[1] == "gp"
+    assert row[-1] == "better, not sure"
+
+
 def test_the_page_holds_all_of_it(scores):
     text = page(scores, [("errors", "Errors by joint.")])
     assert "| ls | 0.4400 (0.4000–0.4800) |" in text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import getpass
 import hashlib
 import json
 import os
@@ -217,9 +216,10 @@ class Command(ABC):
         from filelock import FileLock, Timeout  # which --help does without
 
         # not beside the outputs: a lock would stay there, and the folder may not exist yet
-        place = Path(tempfile.gettempdir(), f"forcegp-locks-{getpass.getuser()}")
+        user = os.getuid() if hasattr(os, "getuid") else None  # Windows has a folder for each user
+        place = Path(tempfile.gettempdir(), f"forcegp-locks-{user}")
         place.mkdir(mode=0o700, exist_ok=True)
-        if hasattr(os, "getuid") and place.lstat().st_uid != os.getuid():
+        if user is not None and place.lstat().st_uid != user:
             raise InvalidInput(f"{place} belongs to another user; set TMPDIR to a folder of your own.")
         with contextlib.ExitStack() as locks:
             for path in self.outputs:

@@ -1,7 +1,7 @@
 """Straight-line arithmetic on scalars: what every program that is made at run time is written from.
 
-A `Graph` holds each operation once, and none that constants decide. Derivatives (`codegen.graph`) are nodes of
-the same graph (Griewank & Walther, "Evaluating Derivatives", 2008, ch. 3 and 4).
+A `Graph` holds each operation once, and none that constants decide. Derivatives are nodes of the same graph (Griewank &
+Walther, "Evaluating Derivatives", 2008, ch. 3 and 4).
 """
 
 import math

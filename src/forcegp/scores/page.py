@@ -163,7 +163,9 @@ def winner_table(scores: Scores) -> tuple[list[str], list[list[str]]]:
     for criterion, each in scores.winners.items():
         pair, sign = each.difference, "−" if criterion == "density" else "/"
         compared = "–" if pair is None else f"{pair.challenger} {sign} {pair.baseline}"
-        outcome = "–" if pair is None else "better, not sure" if "sure" in each.why else pair.outcome
+        outcome = "–" if pair is None else pair.outcome
+        if pair is not None and pair.favours_challenger and outcome != "better":
+            outcome = "better, not sure"
         rows.append([CRITERIA[criterion], each.model, compared, _difference(pair).replace("**", ""), outcome])
     return ["by", "take", "compared", "difference (95 % interval)", "shown"], rows
 
