@@ -8,8 +8,7 @@ the 240 rows of it (noise of 0.1 rad/s^2) go to `posterior.update(rows, horizon=
 
 All rivals see the same rows of the same motion: "never updated"; "refit": from scratch at every full minute, to all
 rows of the last minute (hyper-parameters from 100 of them, as many inducing points); "no forgetting": the same updates
-with an infinite horizon; "budget": `posterior.update(rows, budget=100)` of the exact posterior of the first 100 rows,
-by 20 rows, the farthest of every 10 s. Error: root mean square over all joints of the predicted torque and
+with an infinite horizon. Error: root mean square over all joints of the predicted torque and
 acceleration, against the noise-free ones of the simulation, on every fifth second from the second minute on, before its
 rows are learned. CPU: process time of update and refresh over the number of rows. Coverage: of the noise-free
 acceleration by 95 % intervals. Five seeds, medians.
@@ -42,7 +41,6 @@ from benchmarks.tracking import (
 )
 from forcegp import ComputedTorque, Dataset, JointFriction, Model, fit
 from forcegp.control import PDGravity
-from forcegp.data import farthest_rows
 from forcegp.inference import Inducing
 from forcegp.posterior import Posterior
 
@@ -50,7 +48,7 @@ SECONDS, LOST = 600, 0.3
 HORIZON = 2.0 * SECONDS / LOST**2
 """Under which a force changes by 30 % of its prior standard deviation within ten minutes."""
 ENGINE = Inducing(points=60, refine=0)
-BUDGET, EVERY, FEW, EVALUATED = 100, 10, 20, 5
+EVALUATED = 5
 
 
 class Plant:
@@ -104,11 +102,11 @@ class Plant:
         return float(torque.square().mean()), float(away.square().mean()), float(within.double().mean())
 
 
-def first_model(plant: Plant, seed: int) -> tuple[Posterior, Posterior]:
-    """Of all rows of a motion by inducing points, and of 100 of them, exact."""
+def first_model(plant: Plant, seed: int) -> Posterior:
+    """Of all rows of a motion by inducing points."""
     motion = followed(plant.robot, excitation(seed), PDGravity(plant.arm, **GAINS), 20.0)
     log = plant.rows(motion["q"], motion["v"], motion["u"][:-1], -100.0, seed)
-    return fitted(log, seed), fit(plant.model.with_forces(JointFriction()), farthest_rows(log, 100), restarts=1)
+    return fitted(log, seed)
 
 
 def fitted(log: Dataset, seed: int) -> Posterior:
@@ -124,9 +122,9 @@ def merged(parts: list[Dataset]) -> Dataset:
 def drifted(seed: int, seconds: int = SECONDS, horizons: tuple[float, ...] = ()) -> dict[str, tuple[float, ...]]:
     """Name -> error of torque and acceleration, coverage, and CPU ms per row (0 where nothing is learned)."""
     plant, reference = Plant(), task_of(seed)
-    first, few = first_model(plant, seed)
+    first = first_model(plant, seed)
     online = {"online": HORIZON, "no forgetting": math.inf} | {f"horizon {h:g}": h for h in horizons}
-    models = dict.fromkeys(["never updated", "refit", *online], first) | {"budget": few}
+    models = dict.fromkeys(["never updated", "refit", *online], first)
     predictors = {name: first.predictor(covariance="none") for name in online}
     control = ComputedTorque(predictors["online"], **GAINS)
     sums, spent, count = {name: np.zeros(3) for name in models}, dict.fromkeys(models, 0.0), 0
@@ -145,10 +143,6 @@ def drifted(seed: int, seconds: int = SECONDS, horizons: tuple[float, ...] = ())
             predictors[name] = predictors[name].refreshed(models[name])
             spent[name] += 1e3 * (time.process_time() - begin)
         control.model = predictors["online"]
-        if second % EVERY == EVERY - 1:
-            some, begin = farthest_rows(merged(minute[-EVERY:]), FEW), time.process_time()
-            models["budget"] = models["budget"].update(some, budget=BUDGET)
-            spent["budget"] += 1e3 * (time.process_time() - begin) * RATE * EVERY / FEW
         if second % 60 == 59:
             begin = time.process_time()
             models["refit"] = fitted(merged(minute), seed)

@@ -1,7 +1,7 @@
 """The pictures of docs/how-to/forces.md: what every prior learns from few points, beside the truth.
 
 python -m benchmarks.force_pictures                          all of them, into docs/how-to/forces
-python -m benchmarks.force_pictures joint-friction friction-map   these
+python -m benchmarks.force_pictures joint-friction contact-friction   these
 python -m benchmarks.force_pictures --out elsewhere
 
 The KUKA of `forcegp simulate kuka-surface`. Where that scenario has no such force, the states of a recording keep their
@@ -24,7 +24,6 @@ from threadpoolctl import threadpool_limits
 from forcegp import ContactFriction, Dataset, JointFriction, KukaSurfaceConfig, fit, simulate_kuka_surface
 from forcegp.forces import Unknown
 from forcegp.forces.contact_friction import ExpectedFriction
-from forcegp.mechanics import surface_axes
 from forcegp.scores import friction_curves_figure, normal_force_figure, save_figure
 from forcegp.scores.figures.style import (
     KNOWN_PHYSICS,
@@ -38,8 +37,6 @@ from forcegp.scores.figures.style import (
 BAND = 1.959963984540054
 NOISE = 0.1
 """rad/s^2"""
-TOOL = "lbr_iiwa_link_7"
-F64 = torch.float64
 
 Law = Callable[[torch.Tensor], torch.Tensor]
 
@@ -63,25 +60,6 @@ def fitted(data: Dataset, prior: Unknown | tuple[Unknown, ...], points: int) -> 
     assert data.model is not None
     model = data.model.with_forces(*(prior if isinstance(prior, tuple) else (prior,)))
     return fit(model, data, points=points, restarts=1)
-
-
-def across_the_strip() -> tuple[torch.Tensor, torch.Tensor]:
-    """Places x (201, 1) across the strip, and the points (201, 3) on the plane at y = 0.5 m."""
-    x = torch.linspace(-0.5, 0.5, 201, dtype=F64)
-    return x[:, None], torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.055)], -1)
-
-
-def roughness(x: torch.Tensor) -> torch.Tensor:
-    """Viscous coefficient in N/(m/s), four times as much on a strip."""
-    return 1.0 + 3.0 * ((x > 0.0) & (x < 0.25)).to(x)
-
-
-def plane_of(posterior: Any) -> tuple[torch.Tensor, np.ndarray]:
-    """The two tangents (3, 2) of the plane, of which the first is x, and where the tool was in x."""
-    dynamics = posterior.likelihood.dynamics
-    tool = dynamics.state.kinematics.frame_pose(TOOL)
-    points = tool[:, :3, 3] + 0.1 * tool[:, :3, 2]
-    return surface_axes(dynamics.normals[:1, 0, :])[0, :, :2], points[:, 0].numpy()
 
 
 def visited(posterior: Any, latent: int, feature: int = 0) -> np.ndarray:
@@ -124,9 +102,9 @@ def joint_friction() -> Any:
 
 
 def contact_friction() -> Any:
-    """Isotropic, two axes, and in proportion to the normal force."""
-    figure = new_figure(11.0, 3.4)
-    one, two, three = figure.subplots(1, 3)
+    """A force, and in proportion to the normal force."""
+    figure = new_figure(9.0, 3.4)
+    one, three = figure.subplots(1, 2)
 
     def stribeck(level: float) -> Law:
         return lambda v: torch.tanh(v / 0.05) * level * (1.0 + 0.6 * torch.exp(-((v / 0.15) ** 2)))
@@ -134,14 +112,7 @@ def contact_friction() -> Any:
     isotropic = ContactFriction()
     posterior = fitted(with_force(recording(1), isotropic, stribeck(4.0)), isotropic, 100)
     draw_curve(one, posterior.curve("sliding"), stribeck(4.0), visited(posterior, 0))
-    quiet(one, title="axes=isotropic: one curve, 100 points", x="sliding speed [m/s]", y="force [N]")
-
-    grain = ContactFriction(axes="two-axis")
-    posterior = fitted(with_force(recording(1), grain, stribeck(4.0), stribeck(2.0)), grain, 100)
-    for name, level in (("tangent-1", 4.0), ("tangent-2", 2.0)):
-        draw_curve(two, posterior.curve(name), stribeck(level))
-        two.annotate(name, (0.5, level), (0.6, level - 1.0), fontsize=NORMAL, color=TRUTH)
-    quiet(two, title="axes=two-axis: a grain, 100 points", x="velocity along the tangent [m/s]", y="force [N]")
+    quiet(one, title="a force, 100 points", x="sliding speed [m/s]", y="force [N]")
 
     data = recording(1, friction="stribeck")
     config = KukaSurfaceConfig(friction="stribeck")
@@ -159,7 +130,7 @@ def contact_friction() -> Any:
     )
     three.set_ylim(0.0, 0.55)
     quiet(three, title="load=true: a coefficient, 60 points", x="sliding speed [m/s]", y="friction / normal force")
-    return finish(figure, one, two, three)
+    return finish(figure, one, three)
 
 
 def friction_curves() -> Any:
@@ -175,33 +146,9 @@ def normal_force() -> Any:
     return normal_force_figure(posterior, recording(2, friction="stribeck"))
 
 
-def friction_map() -> Any:
-    """Viscous friction with a rough strip, under two kernels."""
-    rough = with_force(recording(1), ContactFriction(viscous=True, inputs=("position",)), roughness)
-    figure = new_figure(7.5, 3.2)
-    grid = figure.subplots(1, 2)
-    x, place = across_the_strip()
-    for axes, kernel in zip(grid, ("squared-exponential", "matern-3/2"), strict=True):
-        posterior = fitted(rough, ContactFriction(viscous=True, inputs=("position",), kernel=kernel), 100)
-        tangents, visited_x = plane_of(posterior)
-        curve = posterior.curve("sliding", place @ tangents)
-        draw_curve(axes, _Line(x, curve.mean, curve.std), roughness, visited_x)
-        axes.set_ylim(0.0, 6.0)
-        quiet(axes, title=f"{kernel}, 100 points", x="position x [m]", y="coefficient [N/(m/s)]")
-    return finish(figure, *grid)
-
-
-class _Line:
-    """What `draw_curve` needs of a curve."""
-
-    def __init__(self, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> None:
-        self.features, self.mean, self.std = features, mean, std
-
-
 PICTURES: dict[str, Callable[[], Any]] = {
     "joint-friction": joint_friction,
     "contact-friction": contact_friction,
-    "friction-map": friction_map,
     "friction-curves": friction_curves,
     "normal-force": normal_force,
 }

@@ -29,8 +29,7 @@ from gpytorch.kernels import Kernel, ScaleKernel
 from threadpoolctl import threadpool_limits
 
 from forcegp.forces import ToolForces
-from forcegp.forces.basic_kernels import squared_exponential_kernel
-from forcegp.forces.kernels import kernel_of
+from forcegp.forces.kernels import kernel_of, squared_exponential
 from forcegp.inference.cholesky import factorize
 from forcegp.inference.dense_kernels import taken_apart
 from forcegp.inference.likelihood import INNER, deflated_covariance, negative_log_likelihood
@@ -59,7 +58,7 @@ class Problem:
             self.kernels = [kernel_of(ToolForces().kernel, TANGENTS, 1.0 + axis) for axis in range(TANGENTS)]
         else:
             self.W, self.features = self.H, self.inputs
-            self.kernels = [squared_exponential_kernel(INPUTS, 4.0, 1.0 + joint) for joint in range(JOINTS)]
+            self.kernels = [squared_exponential(INPUTS, 1.0 + joint) for joint in range(JOINTS)]
         self.log_noise = torch.full((JOINTS,), math.log(0.1), dtype=torch.float64, requires_grad=True)
         self.parameters = [parameter for kernel in self.kernels for parameter in kernel.parameters()] + [self.log_noise]
 

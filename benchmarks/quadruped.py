@@ -18,7 +18,7 @@ from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
 def fits(train: Dataset) -> dict[str, Posterior]:
-    trunk = RigidBodies({"trunk": Body(0.01, ("mass", "center_of_mass"))})
+    trunk = RigidBodies({"trunk": Body(0.01)})
     laws = train.model.with_forces(trunk, Viscous(), Coulomb())
     return {
         "laws": fit(laws, train, rows=200),

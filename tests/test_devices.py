@@ -178,7 +178,7 @@ def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path)
         for integrator in integrators:
             motion = there.rollout(test.q[0], test.v[0], test.u[:1], 0.001, integrator=integrator, samples=2)
             assert isinstance(motion.q, PretendTensor)
-        updated = there.update(data.rows(slice(10, 14)), budget=12)
+        updated = there.update(data.rows(slice(10, 14)))
         assert isinstance(updated.latent.system.factor.lower, PretendTensor)
         assert there.negative_log_likelihood == pytest.approx(posterior.negative_log_likelihood)
         save_posterior(there, tmp_path / "model")
@@ -249,7 +249,7 @@ def test_a_fit_on_a_real_device_is_that_on_the_cpu(device):
     )
     motions = [p.rollout(test.q[0], test.v[0], test.u, 0.001, samples=2).q.cpu() for p in (there, expected)]
     torch.testing.assert_close(*motions, rtol=1e-7, atol=1e-9)
-    grown = [p.update(arm_data(5, seed=8), budget=42).predict(*states_).mean.cpu() for p in (there, expected)]
+    grown = [p.update(arm_data(5, seed=8)).predict(*states_).mean.cpu() for p in (there, expected)]
     torch.testing.assert_close(*grown, rtol=1e-6, atol=1e-8)
 
 

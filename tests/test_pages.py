@@ -139,7 +139,7 @@ def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "incremental.md").read_text(encoding="utf-8")
     printed = [run_example(code, tmp_path) for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
-    assert [text.splitlines()[-1] for text in printed] == ["70 40", "True True"]
+    assert [text.splitlines()[-1] for text in printed] == ["100 40", "True True"]
 
 
 def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):

@@ -20,13 +20,12 @@ LEVELS: tuple[Level, ...] = ("ok", "look", "wrong")
 class Doubt:
     """One thing that was looked at.
 
-    level: ok, nothing to do; look, a person should judge; wrong, results would be wrong.
-    about: what was looked at, in a few words, the same for all logs and models.
-    what: what was seen, with joint, row, time and numbers.
-    do: what to do about it, beside the `command`; empty if nothing.
+    level: ok; look, a person should judge; wrong, results would be wrong. about: what was looked at, the same words for
+        all.
+    what: what was seen, with joint, row, time and numbers. do: what to do about it, beside the `command`.
     joints: names of the joints concerned; numbers: the numbers of `what`, for programs.
-    correction: what an import has to state about the columns, for `ColumnMapping.corrected_by`: unit, sign and order by
-    signal, for all joints or one each, in the order of the joints; orientation of q and axes of v and a.
+    correction: what an import has to state, for `ColumnMapping.corrected_by`: unit, sign and order by signal,
+    orientation of q and axes of v and a.
     """
 
     level: Level

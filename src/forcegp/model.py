@@ -14,11 +14,10 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.forces import Actuation, Force, Law, Payload, RigidBodies, Rotor, Thrusters, Viscous
-from forcegp.forces.actuation import forces_of_file, forces_of_mjcf
+from forcegp.forces.actuation import FADES, OBSERVED, ObservedWrench, forces_of_file, forces_of_mjcf
 from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
-from forcegp.forces.thrusters import FADES, OBSERVED, ObservedWrench
 from forcegp.mechanics import LoopClosure
 from forcegp.mechanics.constraints import closing, contact_from_dict, contact_to_dict, described
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
@@ -40,16 +39,13 @@ CONSISTENCY_TOLERANCE = 1e-6
 class Model(Summary):
     """What is known of a robot, with priors on what is not: M a = Q_K + Q_U + A^T lambda, A a = b.
 
-    Parameters
-    ----------
     robot: its kinematics and inertia.
     contacts: points that stay on surfaces; also what `fixed_point` and `fixed_frame` give, several each.
-    forces: everything that acts. Laws add up to the known force Q_K, unknown ones to Q_U, whose functions `forcegp.fit`
-        learns; it estimates the coefficients that laws leave open, too. None stands for what the robot's file states:
-        actuation, rigid bodies, and joint damping, dry friction and springs where it has them. Without `RigidBodies`
-        the unknown forces carry gravity and actuation as well.
-    noise: of the measured acceleration, a `Noise` or just its standard deviation. None takes what a log states, and is
-        learned where it states none.
+    forces: everything that acts: laws add up to Q_K, unknown ones to Q_U. None: what the robot's file states
+        (actuation, rigid bodies, damping, dry friction, springs). Without `RigidBodies` unknown forces carry gravity
+        and actuation.
+    noise: of the measured acceleration, a `Noise` or its standard deviation. None takes what a log states, or learns
+        it.
     baumgarte: stabilisation, if the motion has it.
 
     Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
@@ -293,10 +289,9 @@ class Model(Summary):
         u: Float[Tensor, "*#batch nu"],
         bodies: Float[Tensor, "bodies 10"] | None = None,
     ) -> ConstrainedDynamics:
-        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass.
+        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable.
 
-        Differentiable in all arguments. `bodies` are standard parameters of the bodies in the place of the robot's
-        (`Kinematics.torque_regressor`). Contact points are kinematic: no inertial parameter moves them.
+        `bodies` are standard parameters in the place of the robot's; no inertial parameter moves contact points.
         """
         state = self.state(q, v, u, bodies)
         Q_K = torch.zeros_like(state.v)

@@ -21,15 +21,11 @@ class Noise:
     Each is one number or one per joint; None for `acceleration` takes what the dataset states. With `learn` they are
     start values of the optimisation, else they stay fixed; the hyperprior of a learned one is log-normal around its
     start value, with a factor of e as one standard deviation. The covariance of one row is
-
-        diag((acceleration factor)^2) + H diag(force^2) H^T,
-
-    where the factor is 1, or, for data that state the noise of every row, that noise over its root mean square: then
-    `acceleration` is the level, and which rows are noisier is as stated.
+    diag(acceleration^2) + H diag(force^2) H^T.
 
     With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions count that their u
-    is as noisy, and shrink accelerations that only its noise explains (`shrunk`). Leave it False
-    where u is a command, as in model-predictive control.
+    is as noisy, and shrink accelerations that only its noise explains (`shrunk`). Leave it False where u is a command,
+    as in model-predictive control.
     """
 
     acceleration: float | tuple[float, ...] | None = 0.1
@@ -69,16 +65,10 @@ class Noise:
 
     @staticmethod
     def covariance(
-        parameters: Mapping[str, Tensor],
-        H: Float[Tensor, "*batch nv nv"],
-        factors: Float[Tensor, "*batch nv"] | None = None,
-    ) -> Float[Tensor, "#N nv"] | Float[Tensor, "N nv nv"]:
-        """Variances (1 or N, nv) of the rows, or their covariances (N, nv, nv) when there is force-level noise.
-
-        `factors` (N, nv) multiply the standard deviations of the acceleration.
-        """
-        acceleration = (2.0 * parameters[ACCELERATION]).exp()
-        acceleration = acceleration[None] if factors is None else acceleration * factors.square()
+        parameters: Mapping[str, Tensor], H: Float[Tensor, "*batch nv nv"]
+    ) -> Float[Tensor, "1 nv"] | Float[Tensor, "N nv nv"]:
+        """Variances (1, nv) of all rows, or their covariances (N, nv, nv) when there is force-level noise."""
+        acceleration = (2.0 * parameters[ACCELERATION]).exp()[None]
         if FORCE not in parameters:
             return acceleration
         force = (2.0 * parameters[FORCE]).exp()

@@ -9,7 +9,6 @@ import torch
 from tests.cli.one_line import assert_refused
 from tests.fit.test_motion_fit import line, recording
 from tests.posterior.arm import URDF, arm_data
-from tests.posterior.raw_log import motion
 
 from forcegp import Dataset, JointFriction, Model, Robot, Viscous, load_posterior
 from forcegp.evidence import motion_residuals
@@ -22,12 +21,11 @@ QUICK = ("--points", 12, "--iterations", 5, "--restarts", 1)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """pendulum.h5 and test.h5 with dry friction of 0.4 Nm and viscous friction of 0.2 Nms; raw.h5; arm.h5."""
+    """pendulum.h5 and test.h5 with dry friction of 0.4 Nm and viscous friction of 0.2 Nms; arm.h5."""
     place = tmp_path_factory.mktemp("fit")
     for name, seed, seconds in (("pendulum", 1, 10.0), ("test", 2, 3.0)):
         data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=seconds, seed=seed, noise=0.05))
         data.rows(slice(None, None, 4)).save(place / f"{name}.h5")
-    motion().save(place / "raw.h5")
     arm_data(40, seed=0).save(place / "arm.h5")
     friction = '<dynamics damping="0.2" friction="0.4"/></joint>'
     (place / "damped.urdf").write_text(URDF.replace("</joint>", friction, 1))
@@ -127,17 +125,6 @@ def test_models_by_name(forcegp, folder, forces, description):
     assert (model["scores"]["constraint"]["mae"]["all"]["median"] > 1e-6) == black_box
 
 
-def test_a_raw_log_teaches_without_accelerations(forcegp, folder):
-    words = ("fit", "raw.h5", "--forces", "gp:joint-friction", "--evidence", "windows:.1", *QUICK)
-    done = forcegp(*words, "--out", "windows", folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert "12 windows of 6 nodes" in " ".join(done.stdout.split())
-    posterior = load_posterior(folder / "windows")
-    assert posterior.settings["observe"]["seconds"] == 0.1
-    scored = forcegp("score", "windows", "raw.h5", folder=folder)
-    assert scored.returncode == 0, scored.stderr
-
-
 def test_motions_refine_what_was_found(forcegp, folder):
     """A cart with friction of 3 Ns/m and 4 N, whose model has 1 and 1."""
     recording(line, 1, seconds=4.0).save(folder / "cart.h5")
@@ -170,7 +157,6 @@ WRONG = [
     ("--forces gp:joint --evidence torques", "functions are learned from accelerations"),
     ("--forces viscous --evidence acceleration", "did you mean 'accelerations'?"),
     ("--evidence torques,accelerations --forces viscous", "the same rows twice"),
-    ("--evidence windows:-1", "Windows seconds is -1.0; it must be positive"),
     ("--evidence motions:0", "Motions seconds is 0.0; give the length of windows in s"),
     ("--evidence torques:loud", "Torques noisy is 'loud'"),
     ("--forces gp:independent --evidence motions:1", "motions refine physics, and gp:independent has none"),

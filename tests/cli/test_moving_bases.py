@@ -10,8 +10,7 @@ from tests.fit.test_identified_moving_bases import FEET, recorded
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.evidence.bodies import with_bodies
-from forcegp.evidence.identifiability import body_pseudo_inertias, carrying
+from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
 from forcegp.forces import Coulomb
 from forcegp.model import Model
 from forcegp.simulation.quadrotor import simulate_quadrotor

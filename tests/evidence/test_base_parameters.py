@@ -8,7 +8,7 @@ from tests.robots.robot_models import TREE
 
 from forcegp.errors import InvalidInput
 from forcegp.evidence import BaseParameters, base_parameters, standard_parameters, torque_regressor
-from forcegp.evidence.identifiability import excitation
+from forcegp.evidence.bodies import excitation
 from forcegp.robots import Robot
 
 

@@ -6,8 +6,15 @@ from tests.posterior.arm import URDF
 from tests.robots.robot_models import TREE
 
 from forcegp.errors import NonPhysicalInertia
-from forcegp.evidence.bodies import Bodies, thickened, upper_cholesky, with_bodies
-from forcegp.evidence.identifiability import body_pseudo_inertias, carrying, standard_parameters
+from forcegp.evidence.bodies import (
+    Bodies,
+    body_pseudo_inertias,
+    carrying,
+    standard_parameters,
+    thickened,
+    upper_cholesky,
+    with_bodies,
+)
 from forcegp.forces import Body
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia_of_standard

@@ -8,7 +8,7 @@ from forcegp.data import Dataset
 from forcegp.errors import DataWarning
 from forcegp.evidence import Torques
 from forcegp.fit import fit
-from forcegp.fit.equations import possible_links
+from forcegp.fit.payload_link import possible_links
 from forcegp.forces import Actuation, Payload, RigidBodies, Thrusters, Viscous
 from forcegp.model import Model
 from forcegp.robots import Robot

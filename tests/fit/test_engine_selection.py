@@ -11,8 +11,6 @@ from tests.posterior.arm import arm_data
 from forcegp import JointForces, JointFriction, load_posterior, save_posterior
 from forcegp import fit as fit_model
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput, NotEnoughMemory, NumericalWarning
-from forcegp.fit import refinement
-from forcegp.forces import JointAccelerations
 from forcegp.inference import Exact, Inducing, OptimizerOptions, ProblemSize, choose_engine
 from forcegp.inference import memory as memory_module
 
@@ -119,18 +117,6 @@ def test_unknown_engines(data, given, message):
         fit(data, given)
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Inducing(points=0),
-        lambda: Inducing(refine=-1),
-    ],
-)
-def test_settings_are_checked(make):
-    with pytest.raises(InvalidInput, match="must be"):
-        make()
-
-
 def test_learning_points_are_checked(data):
     with pytest.raises(InvalidInput, match="learning_points is 1"):
         fit(data, learning_points=1)
@@ -162,14 +148,6 @@ def test_too_few_inducing_points_are_said(data):
     assert "refined" not in posterior.settings
 
 
-def test_the_time_of_refining_is_added(data, monkeypatch):
-    posterior = fit(data, Inducing(points=60, refine=0))
-    found = replace(posterior.result, parameters={}, cpu_seconds=3.0)
-    monkeypatch.setattr(refinement, "minimize_objective", lambda *_: found)
-    again = refinement.refined(replace(posterior, engine=Inducing(points=60)), True)
-    assert again.result.cpu_seconds == posterior.result.cpu_seconds + 3.0
-
-
 def test_far_rows_beyond_the_learning_rows_are_said(data):
     lifted = replace(data, q=np.where(np.arange(60)[:, None] < 50, data.q + 0.3, data.q))
     near = lifted.rows(np.arange(59, -1, -1))  # the ten near ones first
@@ -192,13 +170,3 @@ def test_many_rows_of_many_features_take_inducing_points():
     chosen = choose_engine(ProblemSize(60_000, 7, 6, 7, 21), torch.device("cpu"))
     assert chosen.engine == Inducing(points=1000, refine=0)
     assert chosen.reason.startswith("inducing: the exact covariance of 60000 rows needs")
-
-
-def test_a_description_names_what_is_learned(data):
-    def described(prior):
-        return fit(data, prior=prior, points=10).description
-
-    assert described(JointAccelerations()).startswith("unconstrained accelerations, ")
-    assert described(()) == "analytical model"
-    assert described(None).endswith(" mean")
-    assert "unconstrained" not in described(None)

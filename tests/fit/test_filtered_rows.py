@@ -94,8 +94,3 @@ def test_all_rows_are_taken_where_no_number_is_given():
         posterior = fit(model, filtered(), restarts=1, options=QUICK, learning_points=25)
     assert posterior.settings["points"] == 480
     assert posterior.settings["learning_points"] == 25
-
-
-def test_stated_noise_is_taken_as_it_is():
-    posterior = fit(arm_model(0).with_forces(JointForces(), noise=0.5), filtered(), points=40, restarts=1)
-    assert posterior.settings["learning_points"] == 40

@@ -1,16 +1,16 @@
 """What no log tells apart is named before anything is searched for."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.forces.law_conformance import STILL, log_of
+from tests.forces.law_conformance import log_of
 from tests.posterior.arm import arm_model
 
-from forcegp import Accelerations, Torques, fit
+from forcegp import Accelerations, fit
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, InvalidInput
-from forcegp.forces import FORCES, Coulomb, JointForces, JointFriction, Normal, Offset, Payload, Spring, Viscous
+from forcegp.forces import Coulomb, JointForces, Offset, Payload, Viscous
 from forcegp.inference import OptimizerOptions
 
 QUICK = {"restarts": 1, "points": 20, "options": OptimizerOptions(iterations=3)}
@@ -21,46 +21,12 @@ def log():
     return log_of(arm_model(0).with_forces(Viscous(0.3), Coulomb(0.2, 0.2)))
 
 
-@pytest.mark.parametrize(
-    ("law", "unknown", "named"),
-    [
-        (Viscous(), JointFriction(), "gp:joint-friction can be what viscous is"),
-        (Coulomb(), JointFriction(), "gp:joint-friction can be what coulomb is"),
-        (Offset(), JointFriction(), "gp:joint-friction can be what offset is"),
-        (Spring(), JointForces(("q",)), "gp:joint-forces can be what spring is"),
-    ],
-    ids=lambda each: getattr(each, "title", None),
-)
-def test_a_law_that_an_unknown_force_can_be_is_named(log, law, unknown, named):
-    with pytest.warns(DataWarning, match=f"{named}.* leave gp:.* out"):
-        fit(arm_model(0).with_forces(law, unknown, noise=STILL), log, Accelerations(), **QUICK)
-
-
-@pytest.mark.parametrize(("law", "unknown"), [(Spring(), JointFriction()), (Viscous(), JointFriction(("bend",)))])
-def test_no_word_where_it_is_another_force(log, law, unknown, recwarn):
-    known = law if isinstance(law, Spring) else Viscous(Normal([0.1, 0.1, 0.1], [1.0, 1.0, 0.0]))
-    fit(arm_model(0).with_forces(known, unknown, noise=STILL), log, Accelerations(), **QUICK)
-    assert not [each for each in recwarn if "can be what" in str(each.message)]
-
-
 def test_the_same_law_twice_and_two_payloads(log):
     model = arm_model(0)
     with pytest.raises(InvalidInput, match="'viscous' twice"):
         fit(replace(model, forces=(*model.forces, Viscous(), Viscous())), log)
     with pytest.raises(InvalidInput, match="two payloads on one body"):
         fit(model.with_forces(Payload("hand"), Payload("hand")), log)
-
-
-def test_laws_that_are_the_same_in_these_rows(log, monkeypatch):
-    @dataclass(frozen=True, eq=False)
-    class Damper(Viscous):
-        """Another name for the same."""
-
-    monkeypatch.setitem(FORCES, "damper", Damper)
-    with pytest.warns(
-        DataWarning, match=r"viscous.pan and damper.pan, viscous.lift and damper.lift.* are the same force in every row"
-    ):
-        fit(arm_model(0).with_forces(Viscous(), Damper()), log, Torques())
 
 
 def test_an_offset_that_can_carry_the_weight_on_a_contact():
@@ -73,9 +39,8 @@ def test_an_offset_that_can_carry_the_weight_on_a_contact():
 
 def test_a_number_that_no_row_shows(log):
     still = replace(log, v=log.v * [1.0, 0.0, 1.0])
-    with pytest.warns(DataWarning, match="no row shows viscous.lift, so each stays at its prior"):
-        found = fit(arm_model(0).with_forces(Viscous()), still)
-    assert found.parameters["viscous.lift"].decided_by == "prior"
+    found = fit(arm_model(0).with_forces(Viscous()), still).parameters["viscous.lift"]
+    assert (found.decided_by, found.why) == ("prior", "no row shows it")
 
 
 def test_rows_that_are_equal_count_once(log):

@@ -21,8 +21,7 @@ from forcegp.evidence import (
     standard_parameters,
     torque_regressor,
 )
-from forcegp.evidence.bodies import with_bodies
-from forcegp.evidence.identifiability import body_pseudo_inertias, carrying
+from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
 from forcegp.evidence.least_squares import weighted_least_squares
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
@@ -246,21 +245,6 @@ def test_noise_of_accelerations_takes_no_mass_away(walker):
     found = identified(noisy)
     assert found.parameters.evidence == str(Torques("both"))
     assert found.parameters.total_mass[0] == pytest.approx(mass, rel=0.02)
-
-
-@pytest.mark.parametrize("likelihood", ["acceleration", "both"])
-@pytest.mark.nightly
-def test_a_row_in_ten_may_be_wrong(walker, likelihood):
-    """Neither the masses nor the levels of noise are those of outliers."""
-    truth = replace(walker, forces=(*walker.forces, *FRICTION))
-    log, rng = recorded(truth, 400, noise=0.05), np.random.default_rng(0)
-    wrong = 100.0 * rng.normal(size=log.a.shape) * (rng.random((len(log), 1)) < 0.1)
-    evidence = replace(EVIDENCE[likelihood], robust=True)
-    found = identified(replace(log, a=log.a + wrong), walker, (*OPEN, Rotor()), evidence)
-    assert found.parameters.total_mass[0] == pytest.approx(
-        standard_parameters(walker.robot)[::10].sum().item(), rel=0.005
-    )
-    np.testing.assert_allclose(found.model.noise.acceleration[:6], 0.05, rtol=0.6)
 
 
 def test_a_drone_without_joints(walker):

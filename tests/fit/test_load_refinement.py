@@ -17,7 +17,6 @@ from forcegp.fit.search import Search
 from forcegp.forces import ContactFriction, JointFriction
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
-from forcegp.posterior import load_posterior, save_posterior
 
 COULOMB, SLOWLY = 0.35, 0.1  # coefficient, and the speed (m/s) below which it falls to zero
 OPTIONS = OptimizerOptions(iterations=60)
@@ -92,16 +91,6 @@ def fits():
     return first_fit(model, data), fit(model, data, restarts=1, options=OPTIONS)
 
 
-def test_the_data_are_as_they_say():
-    """Accelerations and multipliers of Gauss' principle under the friction that they themselves make."""
-    data = sliding_data(60, 0)
-    dynamics = data.model.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u)))
-    Q_U = torch.tensor(data.truth["Q_U"])
-    torch.testing.assert_close(dynamics.acceleration(Q_U), torch.tensor(data.truth["a"]), rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(dynamics.multiplier(Q_U), torch.tensor(data.truth["lambda"]), rtol=1e-9, atol=1e-9)
-    assert bool(((Q_U * torch.tensor(data.v)).sum(-1) <= 0.0).all())
-
-
 def test_the_refined_fit_is_nearer_to_the_truth(fits):
     nominal, refined = (errors(posterior, sliding_data(80, 7)) for posterior in fits)
     assert refined["acceleration"] < 0.1 * nominal["acceleration"]
@@ -143,14 +132,6 @@ def test_beyond_the_visited_speeds_it_expects_what_the_curve_says():
     error = (expected[0].expected.sliding(speeds) - curve)[speeds > fastest].abs().max()
     assert float(error) < 0.02
     assert float(curve.std()) > 1e-3  # it is no constant, which any continuation would meet
-
-
-def test_the_refined_fit_comes_back_from_a_folder(fits, tmp_path):
-    refined, test = fits[1], sliding_data(5, 8)
-    save_posterior(refined, tmp_path / "run")
-    again = load_posterior(tmp_path / "run")
-    assert again.model.unknown_forces == refined.model.unknown_forces
-    assert torch.equal(again.predict(test.q, test.v, test.u).mean, refined.predict(test.q, test.v, test.u).mean)
 
 
 def test_joint_friction_beside_it_counts_for_the_normal_force():

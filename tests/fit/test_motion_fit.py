@@ -11,7 +11,7 @@ from tests.posterior.arm import arm_data, arm_model
 from forcegp import Dataset, JointFriction, Model, Robot, load_posterior, save_posterior
 from forcegp.data.views import all_motions, recorded_motions
 from forcegp.errors import DataWarning, InvalidInput, NumericalError
-from forcegp.evidence import Motions, Torques, Windows
+from forcegp.evidence import Motions, Torques
 from forcegp.fit import fit as fit_model
 from forcegp.fit.motion_fit import MotionFit
 from forcegp.fit.motion_unknowns import Unknowns
@@ -242,18 +242,11 @@ def test_a_model_without_motions_near_the_recorded_ones_is_refused(along_the_law
         refined(posterior, along_the_law, 1.0)
 
 
-def test_a_model_without_open_numbers_stays_as_it_is():
-    found = fit_model(slide(3.0, 4.0), recording(line, 1, 2.0), Torques())
-    assert not found.parameters
-    assert found.description == "analytical model"
-
-
-@pytest.mark.parametrize("evidence", [Motions(0.5), Windows(0.2, nodes=4)], ids=str)
-def test_a_recording_that_is_there_twice_counts_once(evidence):
+def test_a_recording_that_is_there_twice_counts_once():
     log = recording(line, 1, 2.0)
     columns = {name: np.concatenate([getattr(log, name)] * 2) for name in ("q", "v", "u", "a", "time")}
     twice = Dataset(**columns, episode=np.repeat([0, 1], len(log)), model=log.model, noise_std=log.noise_std)
-    model = slide(1.0, 1.0) if isinstance(evidence, Motions) else slide(1.0, 1.0).with_forces(JointForces(("v",)))
+    model, evidence = slide(1.0, 1.0), Motions(0.5)
     with pytest.warns(DataWarning, match="200 of 400 rows equal another one and count once"):
         found = fit_model(model, twice, evidence, restarts=1)
     alone = fit_model(model, log, evidence, restarts=1)

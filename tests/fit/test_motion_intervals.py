@@ -13,7 +13,7 @@ from forcegp.data.views import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated as with_intervals
 from forcegp.posterior.fitted import DEVIATIONS, MotionIntervals
-from forcegp.scores.motions import inside_interval, interval_about
+from forcegp.scores.motions import inside_interval
 
 HORIZONS = (0.1, 0.25, 0.5)
 
@@ -136,25 +136,3 @@ def test_where_the_base_moves_samples_spread_as_steps(floating):
     low, high = replace(drawn, intervals=widths).interval()
     torch.testing.assert_close(high, DEVIATIONS * steps.std(0))
     torch.testing.assert_close(low, -high)
-
-
-def test_bands_about_the_start_turn_with_the_base(floating):
-    """By finite differences of the way from there."""
-    fitted, log = floating
-    rms = 0.1 * np.ones((1, 2, 7))
-    widths = MotionIntervals(np.array([0.2]), rms, np.ones((2, 1, 2, 7)))
-    rollout = replace(fitted.rollout(log.q[:1], log.v[:1], log.u[None, :20], 0.01), intervals=widths)
-    robot, start, (_, high) = log.model.robot, rollout.q[:, :1].expand_as(rollout.q), rollout.interval()
-    below, above = interval_about(rollout, start)
-    way, small = robot.difference(start, rollout.q), 1e-6 * torch.eye(7, dtype=torch.float64)[:, None, None]
-    moved = [robot.difference(start, robot.integrate(rollout.q, side * small)) for side in (1, -1)]
-    half = (((moved[0] - moved[1]) / 2e-6 * high.movedim(-1, 0)[..., None]) ** 2).sum(0).sqrt()
-    torch.testing.assert_close(above, way + half, rtol=1e-7, atol=1e-9)
-    torch.testing.assert_close(below, way - half, rtol=1e-7, atol=1e-9)
-
-
-def test_a_turn_of_the_world_changes_no_width(floating):
-    fitted, log = floating
-    one, other = (with_intervals(fitted, rows, (0.1, 0.2)).motion_intervals for rows in (log, floating_arm.turned(log)))
-    np.testing.assert_allclose(other.rms, one.rms, rtol=1e-6)
-    np.testing.assert_allclose(other.factors, one.factors, rtol=1e-6)

@@ -1,9 +1,18 @@
 """Levels of noise that residuals were drawn with are found again, and whiten them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+import torch
+from tests.posterior.arm import arm_data, arm_model
 
+from forcegp.errors import InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
+from forcegp.fit import fit
+from forcegp.forces import JointForces
+from forcegp.inference import OptimizerOptions
+from forcegp.noise import Noise
 
 ACCELERATION, FORCE = np.array([0.5, 2.0]), np.array([0.3, 0.1])
 
@@ -48,3 +57,22 @@ def test_whitened_residuals_are_white():
     residual, M = drawn(4000, ACCELERATION, FORCE)
     white = (NoiseLevels(ACCELERATION, FORCE).whitening(np.linalg.inv(M)) @ residual[..., None])[..., 0]
     np.testing.assert_allclose(np.cov(white.T), np.eye(2), atol=0.08)
+
+
+def test_noise_of_forces_is_learned_beside_that_of_accelerations():
+    data = arm_data(150, 6, arm_model(0))  # without contacts, for those hide what the forces do along their normal
+    generator = np.random.default_rng(6)
+    H = data.model.dynamics(*map(torch.tensor, (data.q, data.v, data.u))).H.numpy()
+    moved = 0.02 * generator.normal(size=data.a.shape) + (H @ generator.normal(0.0, 0.3, (150, 3, 1)))[..., 0]
+    noisy = dataclasses.replace(data, a=data.truth["a"] + moved, noise_std=np.full(3, 0.02))
+    model = data.model.with_forces(JointForces(), noise=Noise(None, 0.1, learn=True))
+    fitted = fit(model, noisy, restarts=1, options=OptimizerOptions(iterations=25))
+    learned = fitted.hyperparameters["noise.log_force"].exp()
+    assert bool(((learned > 0.15) & (learned < 0.6)).all())
+    assert bool((fitted.noise_std < 0.2).all())
+
+
+def test_a_noise_that_only_data_can_tell_is_none_without_them():
+    with pytest.raises(InvalidInput, match="from the dataset of a fit"):
+        Noise(None).parameters(3)
+    assert Noise.from_dict(Noise(None, 0.1).to_dict()) == Noise(None, 0.1)

@@ -8,10 +8,9 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import Accelerations, Windows, fit
+from forcegp import Accelerations, fit
 from forcegp.evidence import TrainingData
-from forcegp.evidence.bodies import with_bodies
-from forcegp.evidence.identifiability import body_pseudo_inertias, carrying
+from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
 from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.joint import Slopes, Whitening, with_free_numbers
@@ -73,9 +72,9 @@ def test_a_load_on_a_walker_beside_unknown_friction():
     assert found.parameters["payload.mass"].value == pytest.approx(2.0, abs=0.1)
 
 
-def likelihood_of(model, data, points=12, windows=None):
+def likelihood_of(model, data, points=12):
     """With the noise of the data, and a space about a hand that is wrong."""
-    rows = windows.windows(data, None) if windows else data.rows(slice(points))
+    rows = data.rows(slice(points))
     model = replace(model, noise=Noise(tuple(data.noise_std)))
     typical = typical_sizes(model, [data])
     space = ParameterSpace(model, typical)
@@ -105,7 +104,7 @@ def test_numbers_are_free_as_in_dense_least_squares(forces):
     columns = Slopes(likelihood.training, space).at(space.start).flatten(0, 1)
     white = torch.linalg.solve_triangular(torch.linalg.cholesky(S), columns, upper=False)
     terms = likelihood.terms(parameters)
-    found = Whitening.of(terms, None, likelihood.kernels.matrices(parameters, terms.features))
+    found = Whitening.of(terms, likelihood.kernels.matrices(parameters, terms.features))
     ours = found(columns.unflatten(0, terms.residual.shape))
     assert torch.allclose(ours.mT @ ours, white.mT @ white, rtol=1e-8)
 
@@ -125,16 +124,3 @@ def test_numbers_are_free_as_in_dense_least_squares(forces):
     step = 1e-5 * torch.ones_like(slope)
     ends = [float(free(likelihood.kernels, parameters | {name: parameters[name] + sign * step})) for sign in (1, -1)]
     assert float(slope.sum()) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5)
-
-
-def test_windows_are_whitened_as_their_likelihood_does():
-    data = arm_data(60, 3, arm_model(0))
-    likelihood, space = likelihood_of(data.model.with_forces(Viscous(), JointForces()), data, windows=Windows(0.1))
-    parameters = likelihood.kernels.initial_parameters() | likelihood.split_noise[1]
-    terms = likelihood.terms(parameters)
-    matrices = likelihood.kernels.matrices(parameters, terms.features)
-    white = Whitening.of(terms, likelihood.training.weights, matrices)(terms.residual[..., None])
-    still = likelihood.of_terms(terms._replace(residual=torch.zeros_like(terms.residual)), matrices)
-    whole = likelihood.of_terms(terms, matrices)
-    assert 0.5 * float(white.square().sum()) == pytest.approx(float(whole - still), rel=1e-8)
-    assert space.size == 3

@@ -11,7 +11,7 @@ from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions, minimize_objective
 from forcegp.model import Model
 
-UNTIL_CONVERGED = OptimizerOptions(memory=20)
+UNTIL_CONVERGED = OptimizerOptions()
 """The search as it was: few steps remembered, and all starts to the end."""
 
 

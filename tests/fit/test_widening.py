@@ -9,7 +9,8 @@ from scipy.stats import norm
 from tests.posterior.arm import NOISE, arm_data
 
 from forcegp.data import Dataset
-from forcegp.fit import fit, widening
+from forcegp.fit import fit
+from forcegp.fit import search as widening
 from forcegp.forces import JointFriction
 from forcegp.inference import ExactPosterior, OptimizerOptions
 from forcegp.inference.pathwise import draw_functions
@@ -130,19 +131,6 @@ def test_everything_with_a_spread_is_widened_and_no_mean_moves(fitted):
         torch.testing.assert_close(predicted, factor**2 * expected)
 
 
-@pytest.mark.parametrize("kernel", ["squared-exponential", "friction"])
-def test_drawn_functions_are_as_far_from_the_mean(kernel):
-    data = arm_data(12, 0)
-    posterior = fit(
-        data.model.with_forces(JointFriction(kernel=kernel)), data, restarts=1, options=OptimizerOptions(iterations=3)
-    )
-    z = [torch.linspace(-2.0, 2.0, 5).double()[:, None] for _ in posterior.latent_names]
-    each = [x.expand(7, 5, 1) for x in z]
-    mean = posterior.latent.mean(z)
-    plain, wide = (draw_functions(posterior.latent, 7, 3, factor)(each) - mean for factor in (1.0, 1.7))
-    torch.testing.assert_close(wide, 1.7 * plain, atol=1e-9, rtol=1e-7)
-
-
 def test_the_covariance_between_states_is_that_of_dense_conditioning(fitted):
     posterior, data = fitted
     latent = posterior.latent
@@ -163,10 +151,3 @@ def test_the_covariance_between_states_is_that_of_dense_conditioning(fitted):
         prior[4 * c : 4 * c + 4, 4 * c : 4 * c + 4] = kernel(z[c], z[c]).to_dense()
     expected = prior - cross @ torch.linalg.solve(S, cross.mT)
     torch.testing.assert_close(found.reshape(12, 12), expected.detach(), atol=1e-8, rtol=1e-6)
-
-
-def test_without_latents_there_is_nothing_to_widen():
-    data = arm_data(12, 0)
-    posterior = fit(data.model, data)
-    assert posterior.widening == 1.0
-    assert "widening" not in posterior.settings

@@ -18,7 +18,6 @@ from forcegp.forces import (
     UnknownForces,
     force_from_dict,
     force_to_dict,
-    parse_forces,
 )
 from forcegp.forces.contact_friction import SMALLEST_SHARE, ExpectedFriction, TabulatedCurve, refined_loads
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
@@ -135,23 +134,11 @@ def test_the_normal_force_solves_the_equations_with_friction_in_them(surface):
     assert float((nominal - expected).abs().max()) > 0.02 * float(expected.max())
 
 
-def test_a_number_is_a_coefficient_at_all_speeds():
-    dynamics = rows_of("sphere")
-    coefficients = torch.full((12,), 0.1, dtype=torch.float64)
-    nothing = torch.zeros_like(dynamics.state.v)
-    solved = [coupled_multiplier(dynamics, coefficients, nothing, row) for row in range(12)]
-    expected = torch.tensor(solved, dtype=torch.float64).abs()
-    for prior in (ContactFriction(load=True, expected=0.1), *parse_forces("gp:load-friction:expected=0.1")):
-        found = prior.point_force(dynamics)[..., 0].norm(dim=-1)
-        torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
-
-
 def test_no_friction_leaves_the_nominal_force():
     dynamics = rows_of("any-sphere")
-    for axes in ("isotropic", "two-axis"):
-        nominal = ContactFriction(axes=axes, load=True).direction(dynamics)
-        none = ContactFriction(axes=axes, load=True, expected=0.0).direction(dynamics)
-        torch.testing.assert_close(none, nominal, rtol=1e-12, atol=1e-12)
+    nominal = ContactFriction(load=True).direction(dynamics)
+    none = ContactFriction(load=True, expected=0.0).direction(dynamics)
+    torch.testing.assert_close(none, nominal, rtol=1e-12, atol=1e-12)
 
 
 def test_jamming_stays_finite():
@@ -230,9 +217,6 @@ class TestRefinedLoads:
         [
             ContactFriction(),
             ContactFriction(load=True, expected=0.3),
-            ContactFriction(load=True, axes="two-axis"),
-            ContactFriction(load=True, viscous=True),
-            ContactFriction(load=True, inputs=("velocity", "position")),
             UnknownForces((JointFriction(), ContactFriction(load=True, expected=0.0))),
         ],
     )

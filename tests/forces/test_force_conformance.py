@@ -14,7 +14,6 @@ from forcegp.forces import (
     JointForces,
     JointFriction,
     JointPositionForces,
-    PeriodicJointForces,
     ToolForces,
 )
 from forcegp.forces.contact_friction import ExpectedFriction, TabulatedCurve
@@ -30,8 +29,8 @@ class TestJointForces(UnknownConformance):
     prior = JointForces()
 
 
-class TestJointForcesOnAngles(UnknownConformance):
-    prior = JointForces(("q", "v"), kernel="matern-5/2", angles="sin-cos")
+class TestJointForcesOfState(UnknownConformance):
+    prior = JointForces(("q", "v"), kernel="matern-5/2")
 
 
 class TestJointAccelerations(UnknownConformance):
@@ -61,18 +60,18 @@ class TestToolForces(UnknownConformance):
     acts_at = TIP
 
 
-class TestToolForcesAndTorquesOnASurface(UnknownConformance):
-    prior = ToolForces(torque=True, inputs=("velocity", "angular-velocity", "position"), kernel="matern-3/2")
+class TestToolForcesOfThePlace(UnknownConformance):
+    prior = ToolForces(inputs=("velocity", "position"), kernel="matern-3/2")
     acts_at = TIP
 
 
 class TestToolForcesAlongTheWorld(UnknownConformance):
-    prior = ToolForces("fore", (0.1, 0.0, -0.1), axes="world", inputs=("position", "u", "load"))
+    prior = ToolForces("fore", (0.1, 0.0, -0.1), axes="world", inputs=("position",))
     acts_at = ("fore", (0.1, 0.0, -0.1))
 
 
 class TestToolForcesAlongTheTool(UnknownConformance):
-    prior = ToolForces(axes="tool", torque=True, inputs=("velocity", "angular-velocity", "q"))
+    prior = ToolForces(axes="tool")
     acts_at = TIP
 
 
@@ -102,21 +101,12 @@ class TestContactFrictionUnderLoadWithJointFriction(UnknownConformance):
     acts_at = TIP
 
 
-class TestContactFrictionOfTwoAxes(UnknownConformance):
-    prior = ContactFriction(axes="two-axis", load=True, kernel="linear")
-    acts_at = TIP
-
-
 class TestJointPositionForces(UnknownConformance):
     prior = JointPositionForces(("lift",), "matern-5/2")
 
 
-class TestPeriodicJointForces(UnknownConformance):
-    prior = PeriodicJointForces()
-
-
-class TestPeriodicJointForcesOfOneJoint(UnknownConformance):
-    prior = PeriodicJointForces(pi / 6, ("lift",))
+class TestJointRipple(UnknownConformance):
+    prior = JointPositionForces(("lift",), period=pi / 6)
 
 
 class TestAirDrag(UnknownConformance):

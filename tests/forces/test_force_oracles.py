@@ -15,11 +15,10 @@ from forcegp.forces import (
     Actuation,
     ContactFriction,
     Coulomb,
-    JointForces,
     JointFriction,
+    JointPositionForces,
     LoadFriction,
     Payload,
-    PeriodicJointForces,
     RigidBodies,
     Stribeck,
     ToolForces,
@@ -89,29 +88,25 @@ class TestPayload:
 class TestToolForces:
     def test_along_the_world_and_the_tool(self, oracle, rows, dynamics):
         pose, J = jacobians(oracle, *rows[:2])
-        world = ToolForces(FRAME, POINT, axes="world", torque=True).direction(dynamics)
-        torch.testing.assert_close(world, J.mT, rtol=1e-10, atol=1e-10)
-        tool = ToolForces(FRAME, POINT, axes="tool", torque=True).direction(dynamics)
+        world = ToolForces(FRAME, POINT, axes="world").direction(dynamics)
+        torch.testing.assert_close(world, J[:, :3].mT, rtol=1e-10, atol=1e-10)
+        tool = ToolForces(FRAME, POINT, axes="tool").direction(dynamics)
         R = pose[:, :3, :3]
-        expected = torch.cat([J[:, :3].mT @ R, J[:, 3:].mT @ R], -1)
-        torch.testing.assert_close(tool, expected, rtol=1e-10, atol=1e-10)
-        at_contact = ToolForces(axes="tool", torque=True).direction(dynamics)
+        torch.testing.assert_close(tool, J[:, :3].mT @ R, rtol=1e-10, atol=1e-10)
+        at_contact = ToolForces(axes="tool").direction(dynamics)
         torch.testing.assert_close(at_contact, tool, rtol=1e-13, atol=1e-13)
 
     def test_features_are_place_and_motion_along_the_axes(self, oracle, rows, dynamics, model):
-        q, v, u = rows
+        q, v, _ = rows
         pose, J = jacobians(oracle, q, v)
-        R, twist = pose[:, :3, :3], (J @ v[..., None])[..., 0]
-        inputs = ("velocity", "angular-velocity", "position", "load", "q", "v", "u")
-        prior = ToolForces(axes="tool", inputs=inputs)
-        load = dynamics.multiplier(torch.zeros_like(q)).abs() * dynamics.normals[:, 0].norm(dim=-1, keepdim=True)
-        turned = [(R.mT @ part[..., None])[..., 0] for part in (twist[:, :3], twist[:, 3:])]
-        expected = torch.cat([*turned, pose[:, :3, 3], load, q, v, u], dim=-1)
+        velocity = (pose[:, :3, :3].mT @ (J[:, :3] @ v[..., None]))[..., 0]
+        prior = ToolForces(axes="tool", inputs=("velocity", "position"))
+        expected = torch.cat([velocity, pose[:, :3, 3]], dim=-1)
         for z in prior.features(dynamics):
             torch.testing.assert_close(z, expected, rtol=1e-10, atol=1e-10)
         names = prior.feature_names(model.robot)[0]
         assert names[0] == "tool velocity along tool-x [m/s]"
-        assert names[6] == "tool position along x [m]"
+        assert names[3] == "tool position along x [m]"
         assert len(names) == expected.shape[-1]
 
     def test_along_a_surface_the_force_is_tangential_to_it(self, oracle, rows, dynamics):
@@ -137,7 +132,7 @@ class TestToolForces:
 
     def test_without_its_contact_it_is_zero(self, model, rows):
         free = model.with_contacts([]).dynamics(*rows)
-        for prior in (ToolForces(torque=True), ToolForces(FRAME, axes="surface"), ContactFriction(axes="two-axis")):
+        for prior in (ToolForces(), ToolForces(FRAME, axes="surface"), ContactFriction()):
             count = len(prior.latent_names(model.robot))
             assert torch.equal(prior.direction(free), torch.zeros(ROWS, model.robot.nv, count).double())
             assert torch.equal(prior.point_force(free), torch.zeros(ROWS, 3, count).double())
@@ -177,8 +172,8 @@ class TestContactFriction:
         force_of_contact = multiplier[:, 0].abs() * scale
         _, force = self.friction(dynamics, ContactFriction(load=True), 0.3)
         torch.testing.assert_close(force.norm(dim=-1), 0.3 * force_of_contact, rtol=1e-8, atol=0.0)
-        plain = ContactFriction(axes="two-axis").direction(dynamics)
-        loaded = ContactFriction(axes="two-axis", load=True).direction(dynamics)
+        plain = ContactFriction().direction(dynamics)
+        loaded = ContactFriction(load=True).direction(dynamics)
         torch.testing.assert_close(loaded, force_of_contact[:, None, None] * plain, rtol=1e-8, atol=1e-12)
 
     def test_isotropic_friction_knows_no_direction(self, model, rows):
@@ -195,31 +190,6 @@ class TestContactFriction:
             torch.testing.assert_close(prior.direction(there), prior.direction(here), rtol=1e-9, atol=1e-9)
             torch.testing.assert_close(prior.features(there)[0], prior.features(here)[0], rtol=1e-9, atol=1e-9)
 
-    def test_two_axes_act_each_along_its_own(self, dynamics, rows):
-        prior = ContactFriction(axes="two-axis")
-        force, (one, two) = -prior.point_force(dynamics), prior.features(dynamics)
-        torch.testing.assert_close(force.mT @ force, torch.eye(2).double().expand(ROWS, 2, 2), rtol=0.0, atol=1e-12)
-        viscous = -(prior.direction(dynamics) @ torch.cat([one, two], -1)[..., None])[..., 0]
-        assert bool(((viscous * rows[1]).sum(-1) > 0.0).all())
-        isotropic = (ContactFriction().direction(dynamics) @ ContactFriction().features(dynamics)[0][..., None])[..., 0]
-        torch.testing.assert_close(-viscous, isotropic, rtol=1e-8, atol=1e-8)
-
-    @pytest.mark.parametrize(
-        "how",
-        [{"viscous": True}, {"viscous": True, "inputs": ("position",)}, {"inputs": ("position",)}],
-        ids=["viscous", "viscous-map", "dry-map"],
-    )
-    def test_two_axes_whose_latents_do_not_know_the_direction_resist_in_all(self, model, rows, how):
-        """Positive coefficients take power, the force turns round with the motion, and equal ones are isotropic."""
-        q, v, u = rows
-        prior = ContactFriction(axes="two-axis", **how)
-        there, back = model.dynamics(q, v, u), model.dynamics(q, -v, u)
-        joint_force, force = self.friction(there, prior, 0.7, 2.5)
-        assert bool(((v * joint_force).sum(-1) < -1e-4).all())
-        torch.testing.assert_close(self.friction(back, prior, 0.7, 2.5)[1], -force, rtol=1e-12, atol=1e-12)
-        one = self.friction(there, ContactFriction(**how), 2.5)
-        torch.testing.assert_close(self.friction(there, prior, 2.5, 2.5), one, rtol=1e-12, atol=1e-12)
-
 
 def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
     prior = JointFriction(("tilt", "slide"))
@@ -233,7 +203,7 @@ def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
 
 def test_periodic_forces_repeat(dynamics):
     """Functions of the kernel at q and at q + k periods are perfectly correlated; in between they are not."""
-    prior = PeriodicJointForces(0.3)
+    prior = JointPositionForces(period=0.3)
     robot = dynamics.state.robot
     z = prior.features(dynamics)
     later = [one + 0.3 * torch.arange(ROWS).double()[:, None] for one in z]
@@ -249,7 +219,7 @@ def test_periodic_forces_repeat(dynamics):
 
 def test_a_periodic_kernel_starts_at_the_median_of_its_prior(dynamics):
     robot = dynamics.state.robot
-    for kernel in PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()):
+    for kernel in JointPositionForces(period=0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()):
         assert kernel.base_kernel.lengthscale.item() == pytest.approx(1.0)
         assert kernel.base_kernel.period_length.item() == pytest.approx(0.3)
 
@@ -258,7 +228,9 @@ def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
     """A unit step of the search, such as a restart takes, is one standard deviation of the prior: 2 %."""
     given = torch.tensor(0.3, dtype=torch.float64)
     robot = dynamics.state.robot
-    kernels = LatentKernels(PeriodicJointForces(0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()))
+    kernels = LatentKernels(
+        JointPositionForces(period=0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double())
+    )
     start = kernels.initial_parameters()
     name = "kernels.1.base_kernel.raw_period_length"
     torch.testing.assert_close(start[name], torch.zeros(1, 1).double(), rtol=0.0, atol=1e-9)
@@ -271,29 +243,6 @@ def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
     torch.testing.assert_close(density - kernels.log_prior(start), torch.tensor(-0.5 * 1.5**2).double())
     density.backward()
     torch.testing.assert_close(moved[name].grad, torch.full((1, 1), -1.5, dtype=torch.float64), rtol=1e-9, atol=0.0)
-
-
-def test_sines_and_cosines_do_not_see_a_full_turn_and_keep_sliding_joints(model, rows):
-    prior = JointForces(("q", "v"), angles="sin-cos")
-    robot = model.robot
-    slides = torch.tensor([joint.type == "prismatic" for joint in robot.joints])
-    assert 0 < int(slides.sum()) < robot.nv
-    q, v, u = rows
-    here = prior.features(model.dynamics(q, v, u))[0]
-    turn = torch.where(slides, 0.0, 2.0 * math.pi * torch.arange(-2.0, robot.nv - 2.0).double())
-    torch.testing.assert_close(prior.features(model.dynamics(q + turn, v, u))[0], here, rtol=0.0, atol=1e-12)
-    shifted = prior.features(model.dynamics(q + 0.1, v, u))[0]
-    assert bool(((shifted - here).abs()[:, : -robot.nv].amax(0) > 1e-3).all())
-    names = prior.feature_names(robot)[0]
-    expected = {
-        **{f"q of {name}": q[:, k] for k, name in enumerate(robot.joint_names) if slides[k]},
-        **{f"sin q of {name}": q[:, k].sin() for k, name in enumerate(robot.joint_names) if not slides[k]},
-        **{f"cos q of {name}": q[:, k].cos() for k, name in enumerate(robot.joint_names) if not slides[k]},
-        **{f"v of {name}": v[:, k] for k, name in enumerate(robot.joint_names)},
-    }
-    found = {name.split(" [")[0]: here[:, k] for k, name in enumerate(names)}
-    assert found.keys() == expected.keys()
-    assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
 def test_dry_friction_of_a_file_goes_where_another_law_of_it_is_added():

@@ -10,7 +10,7 @@ from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from tests.inference.problems import normal
 
 from forcegp.errors import InvalidInput
-from forcegp.forces.kernels import KERNELS, check_kernel, kernel_of
+from forcegp.forces.kernels import KERNELS, checked_kernel, kernel_of, periodic
 from forcegp.inference import LatentKernels
 
 
@@ -28,14 +28,6 @@ class TestMatern32(KernelConformance):
 
 class TestMatern52(KernelConformance):
     expression = "matern-5/2"
-
-
-class TestRationalQuadratic(KernelConformance):
-    expression = "rational-quadratic"
-
-
-class TestPeriodic(KernelConformance):
-    expression = "periodic"
 
 
 class TestConstant(KernelConformance):
@@ -59,14 +51,6 @@ class TestDeviation(KernelConformance):
 
 class TestSum(KernelConformance):
     expression = "linear + squared-exponential + constant"
-
-
-class TestProduct(KernelConformance):
-    expression = "periodic * (constant + linear) * matern-3/2"
-
-
-class TestProductOfScaled(KernelConformance):
-    expression = "squared-exponential * rational-quadratic"
 
 
 def test_every_name_is_tested():
@@ -124,16 +108,12 @@ def test_linear_against_its_formula():
 
 
 def test_periodic_against_its_formula_and_after_a_period():
-    kernel = kernel_of("periodic", 2, 1.3)
-    period, scale = float64([2.0, 3.0]), float64([0.7, 1.9])
-    kernel.base_kernel.period_length = period[None]
-    kernel.base_kernel.lengthscale = scale[None]
-    z = normal(6, 2)
-    sine = torch.sin(math.pi * (z[:, None] - z[None]) / period)
-    expected = 1.3 * torch.exp(-2.0 * (sine.square() / scale).sum(-1))
+    kernel = periodic(1.3, 2.0)
+    kernel.base_kernel.lengthscale = float64([[0.7]])
+    z = normal(6, 1)
+    expected = 1.3 * torch.exp(-2.0 * torch.sin(math.pi * (z - z.mT) / 2.0).square() / 0.7)
     torch.testing.assert_close(matrix(kernel, z), expected, rtol=1e-13, atol=1e-14)
-    later = kernel_cross(kernel, z + period * float64([3.0, -2.0]), z).detach()
-    torch.testing.assert_close(later, expected, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(kernel_cross(kernel, z + 6.0, z).detach(), expected, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +122,6 @@ def test_periodic_against_its_formula_and_after_a_period():
         ("matern-1/2", lambda r: torch.exp(-r)),
         ("matern-3/2", lambda r: (1 + 3**0.5 * r) * torch.exp(-(3**0.5) * r)),
         ("matern-5/2", lambda r: (1 + 5**0.5 * r + 5 / 3 * r.square()) * torch.exp(-(5**0.5) * r)),
-        ("rational-quadratic", lambda r: 1 / (1 + r.square() / 2)),
     ],
 )
 def test_functions_of_the_distance_against_their_formulas(name, formula):
@@ -165,45 +144,25 @@ def test_points_that_nearly_coincide_keep_their_difference(name):
 # ---------------------------------------------------------------- expressions
 
 
-def test_precedence_and_parentheses():
-    z = normal(6, 2)
-    a, b, c = ("squared-exponential", "matern-1/2", "linear")
-    one = {name: matrix(kernel_of(name, 2, 1.0), z) for name in (a, b, c)}
-    bare = {name: one[name] for name in (a, b)}
-    torch.testing.assert_close(matrix(kernel_of(f"{a} + {b} * {c}", 2, 2.0), z), one[a] + bare[b] * one[c])
-    torch.testing.assert_close(matrix(kernel_of(f"({a}+{b})*{c}", 2, 2.0), z), (one[a] + one[b]) * one[c])
-    torch.testing.assert_close(matrix(kernel_of(f" ( ( {c} ) ) ", 2, 1.0), z), one[c])
-    torch.testing.assert_close(matrix(kernel_of(f"{a} + {b} + {c}", 2, 3.0), z), one[a] + one[b] + one[c])
-
-
-def test_a_product_has_one_variance():
-    names = [name for name, _ in kernel_of("squared-exponential * matern-3/2 * matern-1/2", 2, 2.0).named_parameters()]
-    assert [name for name in names if "outputscale" in name] == ["kernels.0.raw_outputscale"]
-    names = [name for name, _ in kernel_of("squared-exponential * linear", 2, 2.0).named_parameters()]
-    assert sorted(name.rpartition(".")[2] for name in names) == ["raw_lengthscale", "raw_variance"]
+def test_terms_add_up():
+    z, names = normal(6, 2), ("squared-exponential", "matern-1/2", "linear")
+    one = [matrix(kernel_of(name, 2, 1.0), z) for name in names]
+    torch.testing.assert_close(matrix(kernel_of(" +".join(names), 2, 3.0), z), sum(one))
 
 
 @pytest.mark.parametrize(
     ("expression", "message"),
     [
-        ("", "ends where a name is expected"),
-        ("linear +", "ends where a name is expected"),
-        ("+ linear", "'\\+' stands where a name is expected"),
-        ("linear * * constant", "'\\*' stands where a name is expected"),
-        ("linear constant", "'constant' is not expected there"),
-        ("linear)", "'\\)' is not expected there"),
-        ("linear * (constant", "parenthesis is not closed"),
-        ("()", "'\\)' stands where a name is expected"),
+        ("linear +", "no kernel '' in 'linear \\+'"),
         ("liner", "no kernel 'liner' in the registry; did you mean 'linear'"),
-        ("constant + perodic", "no kernel 'perodic' in 'constant \\+ perodic'; did you mean 'periodic'"),
+        ("constant + lienar", "no kernel 'lienar' in 'constant \\+ lienar'; did you mean 'linear'"),
         ("matern", "Valid kernels: constant, deviation, friction, linear, matern-1/2"),
     ],
 )
 def test_wrong_expressions_say_what_is_allowed(expression, message):
-    for read in (check_kernel, lambda text: kernel_of(text, 1, 1.0)):
-        with pytest.raises(InvalidInput, match=message) as error:
+    for read in (checked_kernel, lambda text: kernel_of(text, 1, 1.0)):
+        with pytest.raises(InvalidInput, match=message):
             read(expression)
-        assert "rational-quadratic" in str(error.value)
 
 
 def test_a_kernel_of_ones_own(monkeypatch):
@@ -226,8 +185,6 @@ def test_a_kernel_of_ones_own(monkeypatch):
     ("expression", "part", "center", "spread"),
     [
         ("matern-5/2", "base_kernel.raw_lengthscale", 0.5 * math.log(2.0) + 3.0, 2.0),
-        ("rational-quadratic", "base_kernel.raw_alpha", 0.0, 2.0),
-        ("periodic", "base_kernel.raw_period_length", math.log(2.0 * math.pi), 0.5),
         ("linear", "raw_variance", math.log(0.6 / 2), 2.0),
         ("constant", "raw_constant", math.log(0.6), 2.0),
         ("deviation", "raw_outputscale", math.log(0.6e-4), 2.0),

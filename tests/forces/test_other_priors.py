@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data
 
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
@@ -35,13 +35,6 @@ def test_accelerations_are_mixed_by_the_projection_onto_the_constraint(train):
     projector = np.eye(3) - M_inverse @ A.transpose(0, 2, 1) @ np.linalg.inv(A @ M_inverse @ A.transpose(0, 2, 1)) @ A
     assert np.allclose(W.numpy(), projector, atol=1e-12)
     assert np.allclose(projector @ projector, projector, atol=1e-10)
-
-
-def test_without_contacts_the_mixing_is_the_identity():
-    model = arm_model(contacts=0)
-    data = arm_data(10, 3, model)
-    dynamics = model.dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.u)))
-    assert torch.allclose(dynamics.H @ JointAccelerations().direction(dynamics), torch.eye(3).double(), atol=1e-12)
 
 
 def test_a_fit_with_accelerations_obeys_the_constraint_and_can_be_stored(train, test, tmp_path):

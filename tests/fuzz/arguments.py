@@ -266,7 +266,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "update": _call(
         Posterior.update,
         _of_posterior("update", lambda made: made.predict(*STATE)),
-        "budget horizon",
+        "horizon",
         lambda: {"rows": INPUTS.data.rows([9])},
     ),
     "predictor().refreshed": (lambda **k: INPUTS.predictor.refreshed(**k), lambda: {"posterior": INPUTS.posterior}),
@@ -302,9 +302,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda kind, **k: fit(INPUTS.data.model.without_mean().with_forces(kind(**k)), INPUTS.data, **FIT),
         "inputs",
     ),
-    "OptimizerOptions": _call(
-        forcegp.inference.OptimizerOptions, _options, "tolerance gradient_tolerance memory", lambda: {"iterations": 2}
-    ),
+    "OptimizerOptions": _call(forcegp.inference.OptimizerOptions, _options, "tolerance", lambda: {"iterations": 2}),
     "Inducing": _call(forcegp.inference.Inducing, _engine, "tolerance refine", lambda: {"points": 5}),
     "Robot.from_urdf_text": _call(
         Robot.from_urdf_text, _robot_from, "gravity armature locked inertias base", lambda: {"text": URDF}
@@ -386,13 +384,10 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "parse_forces": _call(forces.parse_forces, given=lambda: {"expression": "gp:joint"}),
     "parse_evidence": _call(parse_evidence, given=lambda: {"words": "torques:mean=.4"}),
-    "JointForces": _call(JointForces, _prior, "inputs kernel angles"),
+    "JointForces": _call(JointForces, _prior, "inputs kernel"),
     "JointFriction": _call(forcegp.JointFriction, _prior, "joints kernel"),
-    "PeriodicJointForces": _call(forces.PeriodicJointForces, _prior, "period joints"),
-    "ToolForces": _call(
-        forcegp.ToolForces, _prior, "point axes inputs torque contact kernel", lambda: {"frame": "hand"}
-    ),
-    "ContactFriction": _call(forcegp.ContactFriction, _prior, "contact axes load viscous inputs kernel"),
+    "ToolForces": _call(forcegp.ToolForces, _prior, "point axes inputs contact kernel", lambda: {"frame": "hand"}),
+    "ContactFriction": _call(forcegp.ContactFriction, _prior, "contact load kernel"),
     "Preparation": _call(
         forcegp.data.Preparation,
         lambda kind, **k: kind(**k).apply(INPUTS.free),
@@ -438,13 +433,12 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         given=lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1},
     ),
     "check": _call(forcegp.check, None, "model preparation", lambda: {"dataset": INPUTS.free}),
-    "Torques": _call(forcegp.Torques, names="noisy robust mean"),
+    "Torques": _call(forcegp.Torques, names="noisy mean"),
     "Motions": _call(forcegp.Motions, names="seconds bodies"),
     "split_named": (forcegp.scores.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
     "ColumnMapping": _call(forcegp.recordings.ColumnMapping, names="time q u joints unit sign step headerless"),
     "ImportOptions": _call(forcegp.recordings.ImportOptions, names="gap rate start end"),
-    "Windows": _call(forcegp.Windows, names="seconds nodes signal order"),
-    "Body": _call(forces.Body, names="strength parts"),
+    "Body": _call(forces.Body, names="strength"),
     "load_posterior": _call(forcegp.load_posterior, given=lambda: {"path": INPUTS.folder / "carried"}),
 }
 

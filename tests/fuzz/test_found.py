@@ -182,7 +182,6 @@ WRONG = {
     "Plane": {"normal": torch.tensor([0.0, 0.0, 1.0]).to_sparse()},
     "with_armature": {"armature": torch.ones(2, 3).to_sparse()},
     "Model": {"contacts": torch.tensor(1.0)},
-    "OptimizerOptions": {"memory": 5e-324},
     "fit": {"options": "fast"},
     "fit ": {"start": ["a"]},
     "fit  ": {"engine": np.zeros(3, [("a", "f8")])},
@@ -191,10 +190,8 @@ WRONG = {
     "Torques": {"mean": "x"},
     "Motions": {"seconds": "x"},
     "IndependentAccelerations": {"inputs": np.zeros(3, [("a", "f8")])},
-    "JointForces": {"angles": np.ones(3)},
     "ContactFriction": {"load": np.ones(3)},
     "ToolForces": {"axes": np.ones(3)},
-    "Body": {"parts": forcegp.Plane((0.0, 0.0, 1.0), 0.0)},
     "Baumgarte": {"omega": 1e308},
     "Payload": {"mass": np.ones(3)},
     "parse_forces": {"expression": 5},
@@ -204,7 +201,6 @@ WRONG = {
     "ColumnMapping": {"unit": 5},
     "ImportOptions": {"gap": "x"},
     "KukaSurfaceConfig": {"tool_mass": None},
-    "Windows": {"signal": np.ones(3)},
     "JointFriction": {"joints": torch.tensor(5.0)},
 }
 

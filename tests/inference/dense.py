@@ -57,9 +57,3 @@ def dense_posterior(W, residual, noise, kernel_matrices, cross, prior):
     with_data = torch.einsum("cnj,jdc->ncjd", cross, W).reshape(prior.shape[0], prior.shape[1], count * outputs)
     mean = with_data @ torch.linalg.solve(S, residual.reshape(-1))
     return mean, torch.diag_embed(prior) - with_data @ torch.linalg.solve(S, with_data.mT)
-
-
-def squared_exponential(z, other, lengthscale, outputscale):
-    """From the differences themselves, without any trick."""
-    difference = (z[:, None, :] - other[None, :, :]) / lengthscale
-    return outputscale * torch.exp(-0.5 * difference.square().sum(-1))

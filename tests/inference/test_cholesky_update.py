@@ -1,4 +1,4 @@
-"""Rows appended and left out: against conditioning on all rows at once, and dense Kullback-Leibler divergences."""
+"""Rows appended and left out: against conditioning on all rows at once."""
 
 import pytest
 import torch
@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.inference.problems import Problem, normal, problem
 
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import NumericalError
 from forcegp.inference import ExactPosterior, likelihood
 from forcegp.inference.cholesky import factorize
-from forcegp.inference.cholesky_update import appended, divergences, rows_to_keep, with_only, with_rows
+from forcegp.inference.posterior import appended, with_only, with_rows
 
 
 def rows_of(given_problem: Problem, index) -> Problem:
@@ -85,7 +85,7 @@ def test_the_old_posterior_stays_as_it_was():
     old = condition(rows_of(whole, slice(0, 9)))
     kept = [x.clone() for x in (old.system.factor.lower.tril(), old.system.alpha, old.system.beta, *old.features)]
     add(old, rows_of(whole, slice(9, 12)))
-    rows_to_keep(old, 4)
+    with_only(old, torch.arange(4))
     for before, now in zip(
         kept, (old.system.factor.lower.tril(), old.system.alpha, old.system.beta, *old.features), strict=True
     ):
@@ -105,66 +105,6 @@ def test_new_rows_that_are_not_finite_are_refused():
     more.residual[1, 0] = torch.nan
     with pytest.raises(NumericalError, match="row 1"):
         add(condition(rows_of(whole, slice(0, 2))), more)
-
-
-# ---------------------------------------------------------------- which rows to keep
-
-
-def divergence(given_problem: Problem, row: int) -> float:
-    """KL of the posteriors of all latents at all training points, from that without the row to that with it, dense."""
-    count, outputs, latents = given_problem.W.shape
-    with torch.no_grad():
-        K = torch.block_diag(*given_problem.kernels(given_problem.features))  # latent-major
-    W = torch.zeros(count * outputs, latents * count, dtype=torch.float64)
-    for i in range(count):
-        for c in range(latents):
-            W[i * outputs : (i + 1) * outputs, c * count + i] = given_problem.W[i, :, c]
-    noise = given_problem.noise.expand(count, outputs).reshape(-1)
-
-    def posterior(rows):
-        used = torch.cat([torch.arange(i * outputs, (i + 1) * outputs) for i in rows])
-        gain = K @ W[used].mT @ torch.linalg.inv(W[used] @ K @ W[used].mT + noise[used].diag())
-        return gain @ given_problem.residual.reshape(-1)[used], K - gain @ W[used] @ K
-
-    mean, covariance = posterior(range(count))
-    others, wide = posterior([i for i in range(count) if i != row])
-    normal_of = torch.distributions.MultivariateNormal
-    return float(torch.distributions.kl_divergence(normal_of(mean, covariance), normal_of(others, wide)))
-
-
-def test_what_a_row_is_worth_is_how_far_the_posterior_moves_with_it():
-    given_problem = problem(count=6, outputs=3, constraints=1, seed=4)
-    latent = condition(given_problem)
-    P = torch.linalg.inv(latent.system.factor.lower.tril() @ latent.system.factor.lower.tril().mT)
-    rank = latent.system.deflation.rank
-    blocks = torch.stack([P[i * rank : (i + 1) * rank, i * rank : (i + 1) * rank] for i in range(6)])
-    losses = divergences(blocks, latent.system.alpha)
-    expected = [divergence(given_problem, row) for row in range(6)]
-    assert losses.tolist() == pytest.approx(expected, rel=1e-6)
-
-
-def test_rows_are_left_out_one_after_the_other_where_they_are_worth_least():
-    remaining = list(range(9))
-    given_problem = problem(count=9, outputs=3, constraints=1, seed=5)
-    for budget in (8, 7, 6, 5):
-        part = rows_of(given_problem, remaining)
-        remaining.pop(min(range(len(remaining)), key=lambda k, part=part: divergence(part, k)))
-        assert rows_to_keep(condition(given_problem), budget).tolist() == remaining
-
-
-def test_a_repeated_row_is_the_first_to_go():
-    given_problem = problem(count=6, seed=3)
-    repeated = rows_of(given_problem, [0, 1, 2, 3, 4, 5, 2])
-    assert rows_to_keep(condition(repeated), 6).tolist() in ([0, 1, 2, 3, 4, 5], [0, 1, 3, 4, 5, 6])
-
-
-def test_budgets_at_the_limits():
-    latent = condition(problem(count=4))
-    assert rows_to_keep(latent, 4).tolist() == rows_to_keep(latent, 9).tolist() == [0, 1, 2, 3]
-    assert len(rows_to_keep(latent, 1)) == 1
-    assert rows_to_keep(condition(problem(count=4, latents=0)), 3).tolist() == [1, 2, 3]
-    with pytest.raises(InvalidInput, match="budget is 0"):
-        rows_to_keep(latent, 0)
 
 
 # ---------------------------------------------------------------- properties

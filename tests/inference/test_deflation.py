@@ -4,7 +4,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.inference.dense import dense_covariance
 from tests.inference.problems import constrained_inverse_mass, normal, problem
 
 from forcegp.inference.likelihood import DeflatedSystem, Deflation, deflate, solve_deflated, whiten
@@ -50,13 +49,6 @@ def test_any_other_basis_gives_the_same(seed):
         torch.testing.assert_close(here.beta, there.beta, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("constraints", [0, 1, 2, 3])
-def test_each_constraint_saves_one_dimension(constraints):
-    """H A^T = 0 up to rounding, also where H is large."""
-    H = 1e3 * constrained_inverse_mass(20, 4, constraints)
-    assert deflate(H, normal(20, 4)).rank == 4 - constraints
-
-
 def test_points_of_lower_rank_keep_an_orthonormal_basis():
     W = constrained_inverse_mass(4, 3, 0)
     W[1] = constrained_inverse_mass(1, 3, 2)[0]
@@ -93,18 +85,3 @@ def test_whitening(covariances, shared):
         W_white.mT @ y_white[..., None], given_problem.W.mT @ torch.linalg.solve(R, given_problem.residual[..., None])
     )
     torch.testing.assert_close(half_log_determinant, 0.5 * torch.logdet(R).sum())
-
-
-def test_the_deflated_covariance_has_the_spectrum_of_the_dense_one():
-    """S~ = U T U^T + (I - U U^T) U^T: eigenvalues of T, and ones."""
-    given_problem = problem(count=5, outputs=4, constraints=2)
-    W_white, y_white, _ = whiten(*given_problem.data)
-    with torch.no_grad():
-        matrices = given_problem.kernels(given_problem.features)
-        system = solve_deflated(deflate(W_white, y_white), matrices)
-        lower = system.factor.lower.tril()
-        deflated = torch.linalg.eigvalsh(lower @ lower.mT)
-        dense = torch.linalg.eigvalsh(dense_covariance(W_white, torch.ones(1, 4, dtype=torch.float64), matrices))
-    assert deflated.shape == (10,)
-    expected = torch.cat([deflated, torch.ones(10, dtype=torch.float64)]).sort().values
-    torch.testing.assert_close(dense, expected, rtol=1e-10, atol=1e-10)

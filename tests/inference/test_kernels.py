@@ -3,7 +3,6 @@ import pytest
 import torch
 from gpytorch.constraints import Positive
 from gpytorch.priors import GammaPrior, LogNormalPrior
-from tests.inference.dense import squared_exponential
 from tests.inference.kernel_functions import kernel_cross, kernel_diagonal, kernel_matrix
 from tests.inference.problems import normal
 
@@ -81,27 +80,6 @@ def test_gradients_are_those_of_gpytorch(kernel):
         torch.testing.assert_close(gradient, reference, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
-def test_a_backward_pass_leaves_the_kernel_as_it_was(kernel):
-    """GPyTorch takes `active_dims` off during its own call; a recomputation that is cut short must not lose them."""
-    kernel, z = kernel(), normal(7, 3)
-    first = kernel_matrix(kernel, z)
-    first.sum().backward()
-    assert torch.equal(kernel_matrix(kernel, z), first)
-
-
-@pytest.mark.parametrize("dimension", [None, 1, 3])
-def test_squared_exponential_against_its_definition(dimension):
-    kernel = scaled_rbf(dimension)
-    z, other = normal(6, dimension or 3), normal(4, dimension or 3, seed=1)
-    arguments = kernel.base_kernel.lengthscale.detach(), kernel.outputscale.detach()
-    with torch.no_grad():
-        torch.testing.assert_close(
-            kernel_matrix(kernel, z), squared_exponential(z, z, *arguments), rtol=1e-14, atol=0.0
-        )
-        torch.testing.assert_close(kernel_cross(kernel, other, z), squared_exponential(other, z, *arguments))
-
-
 @pytest.mark.parametrize("dimension", [None, 1, 3])
 def test_squared_exponential_gradcheck(dimension):
     kernel = scaled_rbf(dimension)
@@ -114,13 +92,6 @@ def test_squared_exponential_gradcheck(dimension):
         return latent.matrices(given, [z])[0]
 
     assert torch.autograd.gradcheck(matrix, (z, *parameters))
-
-
-def test_duplicate_points_are_perfectly_correlated():
-    z = normal(5, 3)[[0, 1, 1, 0, 2]]
-    K = kernel_matrix(scaled_rbf(3), z).detach()
-    torch.testing.assert_close(K[0, 3], K[0, 0], rtol=1e-14, atol=0.0)
-    assert torch.linalg.eigvalsh(K)[0] > -1e-13
 
 
 def test_the_variance_of_a_point_is_the_output_scale_to_the_last_bit():
@@ -154,14 +125,6 @@ def test_second_derivatives_are_refused_and_never_silently_wrong():
     z = normal(4, 3).requires_grad_()
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         torch.autograd.grad(kernel_matrix(scaled_rbf(3), z).sum(), z, create_graph=True)
-
-
-@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
-def test_no_points(kernel):
-    kernel, z = kernel(), normal(0, 3)
-    assert kernel_matrix(kernel, z).shape == (0, 0)
-    assert kernel_diagonal(kernel, z).shape == (0,)
-    assert kernel_cross(kernel, normal(2, 3), z).shape == (2, 0)
 
 
 # ---------------------------------------------------------------- several latents
@@ -216,11 +179,6 @@ def test_log_prior_and_its_gradient():
         torch.testing.assert_close(gradient, reference, rtol=1e-6, atol=1e-8)
 
 
-def test_without_priors_there_is_nothing_to_add():
-    kernels = three_kernels()
-    assert float(kernels.log_prior(kernels.initial_parameters())) == 0.0
-
-
 def test_a_kernel_that_latents_share_has_one_prior():
     kernel = with_priors()
     alone, shared = LatentKernels([kernel]), LatentKernels([kernel] * 3)
@@ -246,8 +204,3 @@ def test_a_copy_at_other_parameters_leaves_the_original_alone():
 def test_float32_kernels_are_refused():
     with pytest.raises(InvalidInput, match=r"kernels.1.raw_outputscale is torch.float32; .* call .double\(\)"):
         LatentKernels([scaled_rbf(), gk.ScaleKernel(gk.RBFKernel())])
-
-
-def test_as_many_features_as_kernels():
-    with pytest.raises(ValueError, match="shorter"):
-        three_kernels()([normal(5, 3)] * 2)

@@ -14,9 +14,8 @@ from forcegp.codegen.library import compiler
 from forcegp.errors import CompilerError
 from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
-from forcegp.inference.one_input_functions import (
+from forcegp.inference.one_input import (
     OneInputFunctions,
-    cubic_table,
     drawn_form,
     one_input_form,
     value_and_slope,
@@ -31,10 +30,8 @@ EXACT = [
     "matern-5/2",
     "linear",
     "constant",
-    "linear * matern-5/2 + constant",
-    "friction * (constant + linear) + matern-3/2 + matern-1/2",
+    "friction + matern-3/2 + matern-1/2 + constant",
 ]
-TABLES = ["squared-exponential", "rational-quadratic", "periodic", "squared-exponential * linear + matern-3/2"]
 
 # the macros of the C writer, for one state and for eight
 ONE = """#include <math.h>
@@ -100,7 +97,6 @@ def test_exact_forms_are_the_sums_everywhere(expression, count):
     given = latents(expression, normal(count, seed=3))
     form = one_input_form(given, 0)
     assert form is not None
-    assert form.error == 0.0
     for s in (points(given.features[0][:, 0]), torch.tensor([-1e3, 1e3], dtype=torch.float64)):
         close(form.values(s)[:, 0], summed(given, s), 1e-12)
 
@@ -141,63 +137,23 @@ def test_several_functions_are_prepared_at_once():
     torch.testing.assert_close(form.only(1).values(s)[:, 0], form.values(s)[:, 1], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("expression", EXACT + TABLES)
+@pytest.mark.parametrize("expression", EXACT)
 def test_slopes_are_those_of_the_sums(expression):
     given = latents(expression, normal(30, seed=3))
     form = one_input_form(given, 0)
     s = torch.linspace(-2, 2, 101, dtype=torch.float64)  # no centres: kinks have no slope
     expected = value_and_slope(lambda s: summed(given, s)[:, None], s)[1]
-    close(value_and_slope(form.values, s)[1], expected, 1e-11 if form.error == 0.0 else 1e-5)
-
-
-@pytest.mark.parametrize("expression", ["matern-3/2", "matern-5/2", *TABLES])
-def test_slopes_are_continuous_where_the_kernel_is_smooth(expression):
-    form = one_input_form(latents(expression, normal(30, seed=3)), 0)
-    inner = form.knots[1:-1]
-    left, right = value_and_slope(form.values, inner - 1e-12)[1], value_and_slope(form.values, inner)[1]
-    close(left, right, 1e-9)
-
-
-@pytest.mark.parametrize("expression", TABLES)
-def test_the_error_of_a_table_is_below_its_bound_on_a_fine_grid(expression):
-    given = latents(expression, normal(40, seed=11))
-    form = one_input_form(given, 0)
-    s = torch.linspace(form.low, form.high, 20001, dtype=torch.float64)
-    assert 0.0 < form.error <= 1e-8
-    close(form.values(s)[:, 0], summed(given, s), 1e-8)
-
-
-@pytest.mark.parametrize(("expression", "scale"), [("squared-exponential", 1e-3), ("rational-quadratic", 1e-2)])
-def test_a_table_finds_what_is_narrow_at_its_centers(expression, scale):
-    centers = torch.tensor([-1.0, 0.123, 0.7], dtype=torch.float64)
-    given = latents(expression, centers, scale=scale)
-    form = one_input_form(given, 0)
-    s = (centers[:, None] + scale * torch.linspace(-6, 6, 301, dtype=torch.float64)).flatten()
-    close(form.values(s)[:, 0], summed(given, s), 1e-8)
-
-
-def test_a_table_holds_a_margin_beyond_its_centers_and_is_nan_elsewhere():
-    centers = torch.tensor([-1.0, 3.0], dtype=torch.float64)
-    form = one_input_form(latents("squared-exponential", centers), 0)
-    assert (form.low, form.high) == (-2.0, 4.0)
-    f, slope = value_and_slope(form.values, torch.tensor([-2.0, 4.0, -2.001, 4.001, math.nan], dtype=torch.float64))
-    assert f[:, 0].isnan().tolist() == slope[:, 0].isnan().tolist() == [False, False, True, True, True]
-    one = one_input_form(latents("squared-exponential", centers[1:]), 0)
-    assert (one.low, one.high) == (2.25, 3.75)
-
-
-def test_functions_without_any_weight_have_a_table():
-    form = one_input_form(latents("periodic", normal(5, seed=3), weights=torch.zeros(5, dtype=torch.float64)), 0)
-    assert (form.values(torch.tensor([0.3], dtype=torch.float64)) == 0.0).all()
+    close(value_and_slope(form.values, s)[1], expected, 1e-11)
 
 
 def test_what_has_no_form():
-    """Several inputs, and what varies too fast for a table."""
+    """Several inputs, and what is smooth."""
     kernels = LatentKernels([kernel_of("matern-3/2", 2, 1.0)])
     several = Latents(kernels, (normal(5, 2),), (normal(5),))
     assert one_input_form(several, 0) is None
     assert drawn_form(draw_functions(posterior("matern-3/2", 2), 2, seed=0), several, 0) is None
-    assert cubic_table(lambda s: torch.cos(1e6 * s)[:, None], normal(5), 0.25, 1e-8) is None
+    assert one_input_form(latents("squared-exponential", normal(5)), 0) is None
+    assert drawn_form(draw_functions(posterior("matern-5/2"), 2, seed=0), posterior("matern-5/2"), 0) is None
 
 
 def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
@@ -209,35 +165,16 @@ def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
     return ExactPosterior.condition(kernels, terms)
 
 
-@pytest.mark.parametrize(("expression", "tolerance"), [("squared-exponential", 1e-8), ("matern-5/2", 1e-6)])
-def test_drawn_functions_have_tables(expression, tolerance):
-    latent = posterior(expression)
-    drawn = draw_functions(latent, 3, seed=5)
-    form = drawn_form(drawn, latent, 0, tolerance)
-    s = torch.linspace(form.low, form.high, 2001, dtype=torch.float64)
-    close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, tolerance)
-
-
-@pytest.mark.parametrize("expression", ["friction", "linear * matern-1/2 + friction", "matern-1/2 + constant"])
+@pytest.mark.parametrize("expression", ["friction", "linear + friction", "matern-1/2 + constant"])
 def test_drawn_functions_of_rough_kernels_are_exact(expression):
     """The cosines of a Matern 1/2 have any frequency, and no table could hold them."""
     latent = posterior(expression)
     drawn = draw_functions(latent, 3, seed=5, widening=1.5)
     form = drawn_form(drawn, latent, 0)
-    assert form.error == 0.0
     s = torch.cat([latent.features[0][:, 0], torch.linspace(-90, 90, 2001, dtype=torch.float64)])
     close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, 1e-11)
     nothing = torch.zeros(12, 3, dtype=torch.float64)
     assert (form.values(s) - one_input_form(latent, 0, nothing).values(s)).abs().max() > 0.1
-
-
-def test_only_a_matern_is_drawn_on_a_grid():
-    """A rational quadratic of alpha 1/2 has a factor of the same shape."""
-    latent = posterior("rational-quadratic")
-    latent.kernels[0].base_kernel.alpha = torch.tensor(0.5, dtype=torch.float64)
-    (term,) = draw_functions(latent, 2, seed=1).terms[0]
-    assert term.grid is None
-    assert len(term.frequencies) == 1
 
 
 def test_the_mean_of_a_posterior():
@@ -289,7 +226,7 @@ def run(library: ctypes.CDLL, form: OneInputFunctions, s: np.ndarray, slopes: bo
 
 
 @pytest.mark.parametrize(("head", "options"), [(ONE, STRICT), (EIGHT, ("-std=gnu99",))], ids=["one", "eight"])
-@pytest.mark.parametrize("expression", [EXACT[-1], "friction", "linear", "constant", "squared-exponential"])
+@pytest.mark.parametrize("expression", [EXACT[-1], "friction", "linear", "constant"])
 def test_the_c_code_computes_the_same(expression, head, options, tmp_path):
     given = latents(expression, normal(30, seed=3))
     form = one_input_form(given, 0, normal(30, 3, seed=4))

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from tests.inference.dense import dense_posterior
 from tests.inference.problems import Problem, normal, problem
 
-from forcegp.errors import NumericalError
 from forcegp.inference import ExactPosterior, LatentKernels, posterior
 
 SHAPES = {
@@ -78,11 +77,6 @@ def test_other_kernels_and_features_of_several_dimensions():
     assert_equals_dense(given_problem)
 
 
-def test_at_the_training_points_themselves():
-    given_problem = problem(constraints=1)
-    assert_equals_dense(given_problem, given_problem.features)
-
-
 def test_no_data_leaves_the_prior():
     given_problem = problem(count=0)
     features = new_features(given_problem)
@@ -103,23 +97,6 @@ def test_data_that_say_nothing_leave_the_prior():
     torch.testing.assert_close(covariance, dense(given_problem, features)[1])
 
 
-def test_no_new_points():
-    given_problem = problem(outputs=4)
-    features = new_features(given_problem, points=0)
-    assert condition(given_problem).mean(features).shape == (0, 4)
-    assert condition(given_problem).covariance(features).shape == (0, 4, 4)
-
-
-def test_far_away_the_prior_returns():
-    given_problem = problem()
-    features = [z + 1e3 for z in new_features(given_problem)]
-    with torch.no_grad():
-        mean, covariance = condition(given_problem).mean(features), condition(given_problem).covariance(features)
-        variances = torch.stack([kernel.outputscale for kernel in given_problem.kernels.kernels])
-    assert not mean.any()
-    torch.testing.assert_close(covariance, torch.diag(variances).expand_as(covariance))
-
-
 def test_data_without_noise_are_reproduced():
     given_problem = problem(constraints=0)
     given_problem.noise = torch.full((1, 5), 1e-10, dtype=torch.float64)
@@ -135,22 +112,6 @@ def test_mean_is_differentiable_in_the_features():
     features = [z.requires_grad_() for z in new_features(given_problem, points=2)]
     assert torch.autograd.gradcheck(lambda *z: conditioned.mean(z), features)
     assert torch.autograd.gradcheck(lambda *z: conditioned.covariance(z), features)
-
-
-def test_conditioning_keeps_no_graph_of_the_data():
-    given_problem = problem(count=4)
-    for tensor in (*given_problem.data, *given_problem.features):
-        tensor.requires_grad_()
-    conditioned = condition(given_problem)
-    kept = (*conditioned.features, conditioned.system.beta, conditioned.system.factor.lower)
-    assert not any(tensor.requires_grad for tensor in kept)
-
-
-def test_data_that_are_not_finite_are_refused():
-    given_problem = problem(count=4)
-    given_problem.residual[2, 0] = torch.nan
-    with pytest.raises(NumericalError, match="row 2"):
-        condition(given_problem)
 
 
 # ---------------------------------------------------------------- properties
@@ -175,17 +136,3 @@ def test_covariance_is_positive_semi_definite_and_below_the_prior(count, outputs
     scale = float(prior.max())
     assert torch.linalg.eigvalsh(covariance).min() > -1e-8 * scale
     assert torch.linalg.eigvalsh(prior - covariance).min() > -1e-8 * scale
-
-
-@settings(max_examples=15)
-@given(seed=st.integers(0, 10_000))
-def test_conditioning_in_two_halves_is_conditioning_at_once(seed):
-    """Adding points never widens the posterior."""
-    given_problem = problem(count=8, outputs=3, seed=seed)
-    features = new_features(given_problem)
-    half = Problem(
-        *(tensor[:4] for tensor in given_problem.data), [z[:4] for z in given_problem.features], given_problem.kernels
-    )
-    with torch.no_grad():
-        wide, narrow = condition(half).covariance(features), condition(given_problem).covariance(features)
-    assert torch.linalg.eigvalsh(wide - narrow).min() > -1e-9

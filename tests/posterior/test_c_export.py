@@ -14,10 +14,11 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import NumericalError
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
+from forcegp.noise import Noise
 from forcegp.posterior import Posterior, c_export
 from forcegp.posterior.c_export import identifier, rounding
 
@@ -289,6 +290,12 @@ class Deciding(JointFriction):
         return tuple(z if ways[self.how](z) else -z for z in super().features(dynamics))
 
 
+def test_measured_torques_are_refused(tmp_path):
+    measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
+    with pytest.raises(InvalidInput, match="a program is for commanded torques"):
+        export_c(measured, tmp_path / "arm")
+
+
 @pytest.mark.parametrize(
     ("given", "found"),
     [
@@ -303,21 +310,6 @@ class Deciding(JointFriction):
 )
 def test_names_for_c(given, found):
     assert identifier(given) == found
-
-
-def test_a_state_outside_of_a_table_is_reported(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
-        model = fit(arm_model().with_forces(JointFriction(kernel="squared-exponential")), arm_data(140, 0), **options)
-    made = export_c(model, tmp_path / "arm")
-    assert 0.0 < made.differences["arm_mean"] < 1e-7
-    assert "tables of one input, relative error" in (tmp_path / "arm" / "arm.h").read_text()
-    mean = compiled(tmp_path / "arm", "arm.c").arm_mean
-    assert call(mean, [3], [0.3] * 3, [0.5] * 3, [0.0] * 3)[0] == 0
-    bits, (a,) = call(mean, [3], [0.3] * 3, [1e3] * 3, [0.0] * 3)
-    assert bits == 4
-    assert np.isnan(a).all()
 
 
 @pytest.mark.nightly

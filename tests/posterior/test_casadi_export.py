@@ -20,7 +20,7 @@ casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip inst
 PRIORS = {
     "joint": JointForces(),
     "friction under load": (JointFriction(), ContactFriction(load=True, expected=0.2)),
-    "matern": (JointFriction(kernel="matern-5/2"), JointForces(kernel="matern-3/2 * periodic + linear", inputs=("q",))),
+    "matern": (JointFriction(kernel="matern-5/2"), JointForces(kernel="matern-3/2 + linear", inputs=("q",))),
     "none": (),
 }
 

@@ -180,11 +180,9 @@ def test_horizons_that_mean_nothing_are_refused(posterior, data, horizon):
         posterior.update(data.rows(slice(FIRST, None)), horizon=horizon)
 
 
-def test_unknown_terms_budgets_and_time_that_goes_back_are_refused(posterior, data):
+def test_unknown_terms_and_time_that_goes_back_are_refused(posterior, data):
     rows = data.rows(slice(FIRST, None))
     with pytest.raises(InvalidInput, match="no term 'load' in this model"):
         posterior.update(rows, horizon={"load": 1.0})
-    with pytest.raises(InvalidInput, match="give no budget"):
-        posterior.update(rows, 10, horizon=1.0)
     with pytest.raises(InvalidInput, match="order of time"):
         posterior.update(rows, horizon=1.0).update(data.rows(slice(0, FIRST)), horizon=1.0)

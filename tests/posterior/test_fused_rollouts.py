@@ -82,20 +82,6 @@ def test_motions_that_become_too_fast_end_as_they_do_in_torch(friction, predicto
     close(found, expected)
 
 
-def test_motions_that_leave_a_table_go_on(starts):
-    """A table of a squared exponential reaches a quarter beyond its centres; beyond it torch takes over."""
-    posterior = fitted(JointFriction(kernel="squared-exponential"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("forcegp.inference.one_input_calls.FEW_CENTERS", 0)
-        predictor = posterior.predictor(covariance="none")
-    q, v, u = starts
-    v = v * torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64)
-    close(predictor.rollouts(q, v, u, DT), rolled_out(posterior, (q, v, u)), 1e-5)
-    torch.testing.assert_close(
-        predictor.mean(q, v, u[:, 0]), posterior.predict(q, v, u[:, 0]).mean, rtol=1e-6, atol=1e-6
-    )
-
-
 def test_batches_broadcast_and_threads_change_nothing(predictor, starts):
     q, v, u = starts
     found = predictor.rollouts(q[0], v[0], u[:6].reshape(2, 3, STEPS, 3), DT, threads=2)

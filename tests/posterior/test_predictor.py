@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointForces, JointFriction
+from forcegp.forces import ContactFriction, JointForces, JointFriction, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
@@ -91,11 +91,11 @@ def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
     "model",
     [
         arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2)),
-        arm_model().with_forces(ContactFriction(inputs=("velocity", "position"))),
+        arm_model().with_forces(ToolForces(inputs=("velocity", "position"))),
         arm_model(),
         arm_model().with_forces(JointFriction()).without_mean(),
     ],
-    ids=["friction under load", "friction map", "no forces", "zero mean"],
+    ids=["friction under load", "tool forces", "no forces", "zero mean"],
 )
 def test_it_is_predict_with_any_prior(states, model):
     check(fitted(model), states)

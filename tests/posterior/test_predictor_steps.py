@@ -18,7 +18,7 @@ PRIORS = {
     "joint": JointForces(),  # has u among its features
     "friction under load": (JointFriction(), ContactFriction(load=True, expected=0.2)),
     "friction under nominal load": (JointFriction(), ContactFriction(load=True)),
-    "tool forces with load": (JointFriction(), ToolForces(inputs=("velocity", "load"))),
+    "tool forces on place": (JointFriction(), ToolForces(inputs=("velocity", "position"))),
     "none": (),
 }
 

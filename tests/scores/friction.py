@@ -9,7 +9,7 @@ from tests.posterior.arm import NOISE, arm_data, arm_model
 from forcegp.data import Dataset
 from forcegp.fit import fit
 from forcegp.forces import Unknown
-from forcegp.forces.tool_forces import ToolPoint
+from forcegp.forces.link_forces import ToolPoint
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
 from forcegp.posterior import Posterior

@@ -187,7 +187,6 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
         (("given",), {"integrator": "euler"}, "euler"),
         (("given",), {"identification": "guessing"}, "no force 'guessing'"),
         (("given",), {"identification": "gp:joint"}, "nothing to identify, or unknown forces"),
-        (("given",), {"identification": "viscous@windows:.1"}, "from windows; give accelerations or torques"),
         (("given",), {"split": "episodes:7"}, "held-out episodes are"),
     ],
 )

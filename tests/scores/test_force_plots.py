@@ -13,7 +13,7 @@ from tests.scores.friction import VISCOUS, fitted, friction_data, joint_law
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointFriction, PeriodicJointForces
+from forcegp.forces import ContactFriction, JointFriction, JointPositionForces
 from forcegp.scores import curve_panels, friction_curves_figure, normal_force_figure, save_figure
 
 
@@ -116,7 +116,7 @@ def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, 
 
 
 def test_large_models_say_how_many_curves_are_shown(monkeypatch):
-    model = fitted(JointFriction(), PeriodicJointForces(1.0), iterations=1)
+    model = fitted(JointFriction(), JointPositionForces(period=1.0), iterations=1)
     monkeypatch.setattr("forcegp.scores.figures.friction_curves.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
     assert len(figure.axes) == 2

@@ -13,7 +13,7 @@ from tests.robots.test_moving_bases import LIMBS
 from forcegp import JointFriction, Model, Noise, fit
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Motions, Torques
-from forcegp.evidence.training_data import TrainingData
+from forcegp.evidence.likelihood import TrainingData
 from forcegp.fit import ALL_ROWS
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.inference import Inducing

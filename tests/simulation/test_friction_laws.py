@@ -11,8 +11,7 @@ from scipy.optimize import brentq
 
 from forcegp import Robot
 from forcegp.errors import InvalidInput, SimulationError
-from forcegp.forces.force import JointLaw
-from forcegp.forces.parameters import Coefficient
+from forcegp.forces.force import Coefficient, JointLaw
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.joint_friction import LawsOfJoints

@@ -57,7 +57,7 @@ def test_payload_friction_and_foot_forces_are_found():
     train = simulate_quadruped(QuadrupedConfig(seconds=6.0, seed=1))
     test = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=2))
     trunk = train.model.robot.link("trunk")
-    learned = RigidBodies({"trunk": Body(0.01, ("mass", "center_of_mass"))})
+    learned = RigidBodies({"trunk": Body(0.01)})
     model = train.model.with_forces(learned, Viscous(), Stribeck())
     posterior = fit(model, train, Accelerations(), rows=200)
     assert posterior.parameters["trunk.mass"].value - trunk.mass == pytest.approx(2.0, rel=0.02)

@@ -132,7 +132,7 @@ class CheckInput:
     @classmethod
     def quick(cls, dataset: Dataset, model: Model | None) -> "CheckInput":
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
-        found: dict[str, Any] = {"compared": dataset, "compared_noise": dataset.noise_level, "most_rows": QUICK_ROWS}
+        found: dict[str, Any] = {"compared": dataset, "compared_noise": dataset.noise_std, "most_rows": QUICK_ROWS}
         if dataset.time_ordered and not move_on(dataset):
             dataset = replace(dataset, time_ordered=False)
         if dataset.time_ordered:

@@ -23,7 +23,7 @@ from forcegp.data.dataset import require_rows
 from forcegp.data.views import white_noise
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look, ok
 from forcegp.errors import InvalidInput, require_type
-from forcegp.evidence.identifiability import base_parameters, excitation
+from forcegp.evidence.bodies import base_parameters, excitation
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
@@ -183,7 +183,7 @@ FAR_OFF = 10.0
 def stated_noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     """`noise_std` against the noise that the acceleration of successive rows shows."""
     log = inputs.log
-    stated, seen = log.noise_level, white_noise(log)
+    stated, seen = log.noise_std, white_noise(log)
     if stated is None or seen is None:
         return
     with np.errstate(invalid="ignore", divide="ignore"):

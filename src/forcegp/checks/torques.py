@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 from forcegp.data import Dataset
 from forcegp.doubts import Doubt, look
 from forcegp.forces import JointLaw
-from forcegp.forces.columns import law_columns, usual_columns
+from forcegp.forces.joint_laws import law_columns, usual_columns
 from forcegp.robots import Robot
 
 CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding

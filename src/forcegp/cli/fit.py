@@ -43,7 +43,6 @@ from forcegp.cli.robot_options import (
     parse_contacts,
 )
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
-from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, InvalidInput
 
 NEARLY_ALL = 0.995
@@ -67,7 +66,6 @@ class Fit(Command):
       forcegp fit log.h5 --identified identified --forces gp:joint-friction --evidence accelerations,motions:1 --out run
       forcegp fit log.h5 --forces viscous,gp:joint-friction --robot arm.urdf --noise learned --out run
       forcegp fit train.h5 --forces gp:independent --points 100 --out baseline
-      forcegp fit raw.h5 --forces gp:joint --evidence windows:.1 --points 100 --out run
     """
 
     log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
@@ -80,9 +78,8 @@ class Fit(Command):
     gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
     gp:independent is without physics, none the noise alone. See docs/how-to/forces.md."""
     evidence: Annotated[tuple[str, ...], listed(), unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
-    """What is learned from: accelerations, torques (torques:both where accelerations are noisy, too, torques:mean=.4
-    of means), or windows:S of raw positions, where nothing is differentiated. Beside it motions:S refines the
-    numbers on recorded positions, over windows of S seconds."""
+    """What is learned from: accelerations or torques (torques:both where accelerations are noisy, too, torques:mean=.4
+    of means). Beside it motions:S refines the numbers on recorded positions, over windows of S seconds."""
     baseline: Annotated[Path | None, DATASET, unless_given("LOG", "none", Path)] = None
     """A second log, of the same robot without the payloads that are estimated."""
     contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
@@ -126,19 +123,15 @@ class Fit(Command):
         start, notes = time.monotonic(), []
         dataset = forcegp.Dataset.load(self.log)
         given = self._known(dataset)
-        windows = any(isinstance(each, forcegp.evidence.Windows) for each in evidence)
-        self._check(terminal, dataset, given, not windows)
+        self._check(terminal, dataset, given)
         recording = dataset
-        if self.rows != "auto" or not windows:  # raw accelerations show no contact
-            dataset, note = self._rows(dataset, given)
-            notes += [] if note is None else [note]
+        dataset, note = self._rows(dataset, given)
+        notes += [] if note is None else [note]
         words = self.forces
         if not words:
             usual = forcegp.scores.usual_forces(given)
             words = forcegp.scores.summands(usual)
             notes.append(f"forces: {usual}, the usual ones; forcegp score compares others")
-        if windows and noise is None:  # no dataset states the noise of windows
-            noise = forcegp.Noise(None, learn=True)
         model = forcegp.scores.named_model(given, words, noise).to(self.device)
         with terminal.progress("fitting") as report:
             posterior, found = forcegp.scores.learn(
@@ -179,18 +172,10 @@ class Fit(Command):
         model = self.robot.chosen_model(dataset, self.log)
         return model.with_contacts((*contacts, *model.loops)) if self.contact else model
 
-    def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model, accelerations: bool) -> None:
-        """One line on what would spoil the model; contacts are not warned of again by the fit.
-
-        Without `accelerations` nobody has measured `a`: nothing is compared with it.
-        """
+    def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
+        """One line on what would spoil the model; contacts are not warned of again by the fit."""
         if self.checks:
-            # without a model it compares no torques; those of moving bases are never compared
-            without = not (accelerations or model.robot.layout.groups)
-            looked_at = (replace(dataset, model=None), None) if without else (dataset, model)
-            found = forcegp.checks.quick_check(*looked_at)
-            of_accelerations = () if accelerations else ("acceleration", "base acceleration", "base force", "noise_std")
-            used = Doubts(each for each in found if each.about not in of_accelerations)
+            used = forcegp.checks.quick_check(dataset, model)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
                 see = f"See {shlex.join(['forcegp', 'check', str(self.log), *self.words(*options_of(RobotOptions))])}"
                 see = used[0].advice.rstrip(".") if self.contact else see
@@ -251,7 +236,7 @@ def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> 
     """What a fit came to, as plain values. `objective` is what the search lowered, `nll` the likelihood alone."""
     result, settings, unknown = posterior.result, posterior.settings, posterior.model.unknown_forces
     force_noise = posterior.hyperparameters.get("noise.log_force")
-    looked = not {"air", "observe"} & set(settings) and not posterior.model.held_inputs  # not for wind in windows
+    looked = not {"air", "observe"} & set(settings) and not posterior.model.held_inputs
     return {
         "model": posterior.description,
         "points": len(posterior.training),

@@ -24,10 +24,9 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
-from forcegp.evidence.identifiability import base_parameters, torque_regressor
-from forcegp.inference.cholesky_update import with_only
+from forcegp.evidence.bodies import base_parameters, torque_regressor
 from forcegp.inference.memory import blas_threads
-from forcegp.inference.posterior import exact
+from forcegp.inference.posterior import exact, with_only
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact
 from forcegp.model import Model
@@ -82,7 +81,7 @@ class LearnedForces:
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, model = posterior.noise_std.numpy(), posterior.model
         rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model)
-        return learn_more_rows(posterior, rows, None)
+        return learn_more_rows(posterior, rows)
 
     def spread(self, posterior: Posterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""

@@ -89,23 +89,6 @@ def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " row
     return np.einsum("nk,nkj->nj", weights, moved)
 
 
-def chart_acceleration(
-    space: ConfigurationSpace,
-    step: Float[np.ndarray, "*batch nv"],
-    rate: Float[np.ndarray, "*batch nv"],
-    bend: Float[np.ndarray, "*batch nv"],
-) -> Float[np.ndarray, "*batch nv"]:
-    """a of a path whose `step` from a fixed position has these first and second derivatives `rate` and `bend` in time.
-
-    With step' = D(step) v (`ConfigurationSpace.chart_matrix`), a = D^-1 (step'' - D' v).
-    """
-    at, moving, bent = (torch.tensor(x) for x in (step, rate, bend))
-    D = space.chart_matrix(at)
-    v = torch.linalg.solve(D, moving)
-    changed = torch.func.jvp(lambda x: space.chart_velocity(x, v), (at,), (moving,))[1]
-    return torch.linalg.solve(D, bent - changed).numpy()
-
-
 def in_base(
     q: Float[Tensor, "rows positions"],
     values: Float[Tensor, "rows velocities"],
@@ -146,9 +129,3 @@ def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
 def actuators(dataset: Dataset) -> int:
     """How many columns of u are forces. Those of observers and switches follow, which no filter may touch."""
     return dataset.u.shape[1] if dataset.model is None else len(dataset.model.actuators)
-
-
-def switches(dataset: Dataset) -> list[int]:
-    """Which columns of u are switches of contacts."""
-    own = [] if dataset.model is None else [contact.switch for contact in dataset.model.contacts]
-    return [] if dataset.model is None else [k for k, name in enumerate(dataset.model.inputs) if name in own]

@@ -27,7 +27,6 @@ from forcegp.data.dataset_fields import (
 )
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
-from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
 
 ORDER = "a", "lambda", "Q_U", "in_contact"
@@ -53,7 +52,7 @@ class Dataset(Summary):
         rad/s^2. By default, and in any case equal to, those of `model.robot`; without a model none.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     model: the robot and what it touches, or None.
-    noise_std: standard deviation of the noise on `a`, if known: (nv,), or (rows, nv) where it differs between rows.
+    noise_std: standard deviation of the noise on `a`, (nv,), if known.
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
@@ -72,7 +71,7 @@ class Dataset(Summary):
     sliding: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
     model: forcegp.model.Model | None = None
-    noise_std: Float[np.ndarray, " nv"] | Float[np.ndarray, "rows nv"] | None = None
+    noise_std: Float[np.ndarray, " nv"] | None = None
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
     time_ordered: bool = True
@@ -105,7 +104,7 @@ class Dataset(Summary):
         if not set(self.sliding) <= set(names) or (own is not None and set(self.sliding) != set(own)):
             allowed = f"joints are {list(names)}" if own is None else f"those of the robot are {list(own)}"
             raise DatasetError(f"sliding joints are {list(self.sliding)}; {allowed}.")
-        put("noise_std", _noise_std(self.noise_std, names, rows))
+        put("noise_std", _noise_std(self.noise_std, names))
         put("truth", _truth(self.truth, names, rows, self.model))
         put("metadata", frozen_json(self.metadata))
         put("time_ordered", bool(self.time_ordered))
@@ -134,7 +133,7 @@ class Dataset(Summary):
         robot = f"{self.model.robot.name!r}, {len(self.model.contacts)} contacts" if self.model else "none"
         facts: dict[str, object] = {"rows": len(self), "joints": listed(self.joint_names, most=7)}
         facts |= {"episodes": listed(self.episodes), "robot": robot}
-        noise = self.noise_level
+        noise = self.noise_std
         return facts | {"noise std": "not stated" if noise is None else rounded(noise), "truth": listed(self.truth)}
 
     __iter__: ClassVar[None] = None
@@ -164,13 +163,6 @@ class Dataset(Summary):
         values, first = np.unique(self.episode, return_index=True)
         return tuple(int(value) for value in values[np.argsort(first)])
 
-    @property
-    def noise_level(self) -> Float[np.ndarray, " nv"] | None:
-        """`noise_std` as one number per joint: itself, or its root mean square over the rows. None if unknown."""
-        if self.noise_std is None or self.noise_std.ndim == 1:
-            return self.noise_std
-        return np.sqrt(np.square(self.noise_std).mean(axis=0))
-
     @usable_arguments("Dataset.rows")
     def rows(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
         """The rows of a slice, boolean mask (rows,) or list of row numbers, in the order given.
@@ -180,8 +172,6 @@ class Dataset(Summary):
         chosen = _row_numbers(index, len(self))
         truth = {name: values[chosen] for name, values in self.truth.items()}
         arrays = {name: getattr(self, name)[chosen] for name in ("q", "v", "u", "a", "time", "episode")}
-        if self.noise_std is not None and self.noise_std.ndim == 2:
-            arrays["noise_std"] = self.noise_std[chosen]
         ordered = _first_disorder(arrays["time"], arrays["episode"]) is None
         return replace(self, **arrays, truth=truth, time_ordered=ordered)
 
@@ -230,19 +220,15 @@ def _joint_names(given: Sequence[str], model: forcegp.model.Model | None) -> tup
     return names
 
 
-def _noise_std(given: object, joint_names: tuple[str, ...], rows: int) -> np.ndarray | None:
+def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None:
     if given is None:
         return None
-    if real_array("noise_std", given, error=DatasetError).ndim > 1:
-        values = finite_columns("noise_std", given, joint_names, rows)
-    else:
-        values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
+    values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
     if (values <= 0).any():
-        *row, column = np.argwhere(values <= 0)[0]
-        where = f" at row {row[0]}" if row else ""
+        column = int((values <= 0).argmax())
         raise DatasetError(
-            f"noise_std of joint {joint_names[column]!r} is {values[(*row, column)]}{where}; it must be > 0. "
-            "Give None if it is not known or if there is no noise."
+            f"noise_std of joint {joint_names[column]!r} is {values[column]}; it must be > 0. Give None if it is not "
+            "known or if there is no noise."
         )
     return values
 

@@ -17,7 +17,7 @@ from forcegp.data.dataset import Dataset, require_rows
 from forcegp.data.filters import Lag, episodes_in_order
 from forcegp.data.views import in_blocks
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.forces.columns import law_columns, usual_columns
+from forcegp.forces.joint_laws import law_columns, usual_columns
 from forcegp.robots.manifold import TURN, Group
 
 LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s

@@ -2,13 +2,12 @@ from .evidence import (
     Accelerations as Accelerations, Evidence as Evidence, Motions as Motions, Torques as Torques,
 )
 from .evidence import EVIDENCE as EVIDENCE, parse_evidence as parse_evidence
-from .identifiability import (
+from .bodies import (
     BaseParameters as BaseParameters, base_parameters as base_parameters, excitation as excitation,
     body_names as body_names, parameter_names as parameter_names, standard_parameters as standard_parameters,
     torque_regressor as torque_regressor,
 )
 from .least_squares import ROUNDS as ROUNDS, NoiseLevels as NoiseLevels
 from .likelihood import MarginalLikelihood as MarginalLikelihood
-from .recorded_rows import motion_residuals as motion_residuals, residual_scores as residual_scores
-from .training_data import TrainingData as TrainingData
-from .evidence import WindowedRows as WindowedRows, Windows as Windows
+from .recorded_rows import motion_residuals as motion_residuals
+from .likelihood import TrainingData as TrainingData

@@ -1,34 +1,160 @@
-"""Coordinates for the inertial parameters of bodies, which always belong to a body of positive density.
+"""Inertial parameters: the torque regressor, the combinations that show, and bodies as coordinates.
 
-They are relative to a reference ``P_0 = V V^T`` (V upper triangular) of each body, its pseudo-inertia in the URDF, so
-that one unit is one unit of the affine-invariant metric (Lee, Wensing & Park, "Geometric robot dynamic identification:
-a convex programming approach", T-RO 2020), whatever the mass, size and frame:
-
-    P = V F F^T V^T         F upper triangular, the log-Cholesky factor (Rucker & Wensing, RA-L 2022)
-
-and |log F F^T|_F is the distance.
-
-The distance is a vector norm, so that it can stand among the residuals of non-linear least squares.
-
-A body is often several links. With the factors of its old and new pseudo-inertia, ``P = V V^T`` and ``P' = U U^T``
-(upper triangular), every link gets ``C P_k C^T`` with ``C = U V^-1``: they add up to P', each stays physically
-possible, and links that were equal stay equal. Motions show nothing but their sum.
+Base parameters: Atkeson, An & Hollerbach (IJRR 1986); Gautier (J. Robotic Systems 1991), by QR with column pivoting.
+Coordinates: P = V F F^T V^T about a reference V V^T, F a log-Cholesky factor (Rucker & Wensing, RA-L 2022), of which
+every body has a positive density; |log F F^T| is the affine-invariant distance (Lee, Wensing & Park, T-RO 2020).
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
-from typing import ClassVar
+from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
+import torch
 from jaxtyping import Float
 from scipy.linalg import block_diag
+from torch import Tensor
 
-from forcegp.errors import NonPhysicalInertia
-from forcegp.evidence.identifiability import body_names, body_pseudo_inertias, carrying
+from forcegp.errors import InvalidInput, NonPhysicalInertia
 from forcegp.forces import Body
 from forcegp.robots import Robot
-from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia, standard_basis
+from forcegp.robots.inertia import (
+    physical_of_pseudo_inertia,
+    pseudo_inertia,
+    standard_basis,
+    standard_of_pseudo_inertia,
+)
 from forcegp.robots.urdf_file import replace_inertial
+
+PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+"""Names of the standard parameters of one body; mx = m cx."""
+UNITS = ("kg", *("kg m",) * 3, *("kg m^2",) * 6)
+"""Their units."""
+
+
+def torque_regressor(
+    robot: Robot, q: Float[Tensor, "*#rows nq"], v: Float[Tensor, "*#rows nv"], a: Float[Tensor, "*#rows nv"]
+) -> Float[Tensor, "... nv columns"]:
+    """Y (..., nv, 10 bodies) with ``Y @ standard_parameters(robot)`` the joint forces in Nm or N, without armature.
+
+    Columns are named by `parameter_names`. Raises InvalidInput for wrong shapes, dtypes or devices.
+    """
+    return robot.kinematics(q, v).torque_regressor(a)[..., carrying(robot), :].flatten(-2)
+
+
+def carrying(robot: Robot) -> list[int]:
+    """Numbers of the bodies with mass: what lies between the joints of a universal joint has no parameters."""
+    return robot.tree.inertias[:, 3, 3, 0].nonzero()[:, 0].tolist()
+
+
+def standard_parameters(robot: Robot) -> Float[Tensor, "columns"]:
+    """The parameters pi (10 bodies,) that the robot's URDF gives, links fixed to one another merged."""
+    return standard_of_pseudo_inertia(body_pseudo_inertias(robot)).flatten()
+
+
+def body_pseudo_inertias(robot: Robot) -> Float[Tensor, "bodies 4 4"]:
+    """Pseudo-inertia of every body in the frame of its child link."""
+    own = carrying(robot)
+    inverse = torch.linalg.inv(torch.as_tensor(robot.layout.child_frames[own], device=robot.device))
+    return inverse @ robot.tree.inertias[own, ..., 0] @ inverse.mT
+
+
+def body_names(robot: Robot) -> tuple[str, ...]:
+    """What the bodies are called: by the child link of their joint."""
+    return tuple(robot.layout.bodies[body].child for body in carrying(robot))
+
+
+def parameter_names(robot: Robot) -> tuple[str, ...]:
+    """Names of the regressor's columns: `LINK.m`, `LINK.mx`, ..., `LINK.Izz` for every body."""
+    return tuple(f"{body}.{parameter}" for body in body_names(robot) for parameter in PARAMETERS)
+
+
+RANK_TOLERANCE = 1e-9
+"""Diagonal entries of R below this fraction of the largest are zero, for columns of norm 1."""
+NAMED = 1e-6
+"""Coefficients below this fraction of the largest in a base parameter are rounding."""
+RANDOM_ROWS = 50
+"""Random states per joint that stand for every motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseParameters:
+    """What a regressor (rows, p) identifies of p parameters.
+
+    `independent` are the columns of the base parameters, `dependent` those that are regrouped by `regrouping` (r, p -
+    r), `unseen` those that are zero; `condition` is that of the independent columns, each divided by its norm.
+    """
+
+    names: tuple[str, ...]
+    independent: tuple[int, ...]
+    dependent: tuple[int, ...]
+    unseen: tuple[int, ...]
+    regrouping: Float[np.ndarray, "r dependent"]
+    condition: float
+
+    @classmethod
+    def of(cls, regressor: Float[np.ndarray, "rows p"], names: tuple[str, ...]) -> "BaseParameters":
+        """From the stacked rows of a regressor. Raises InvalidInput where it is zero or not finite."""
+        if not np.isfinite(regressor).all():
+            raise InvalidInput("the regressor is not finite; check q, v and a for NaN and infinity.")
+        norms = np.linalg.norm(regressor, axis=0)
+        seen = np.flatnonzero(norms > RANK_TOLERANCE * norms.max())
+        if norms.max() == 0.0:
+            raise InvalidInput("the regressor is zero: nothing moves and nothing weighs, so no parameter shows.")
+        triangular, order = scipy.linalg.qr(regressor[:, seen] / norms[seen], mode="r", pivoting=True)
+        diagonal = np.abs(triangular.diagonal())
+        rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
+        first, rest = seen[order[:rank]], seen[order[rank:]]
+        scaled = scipy.linalg.solve_triangular(triangular[:rank, :rank], triangular[:rank, rank:])
+        regrouping = scaled * norms[rest] / norms[first][:, None]
+        values = np.linalg.svd(triangular[:rank, :rank], compute_uv=False)
+        unseen = np.setdiff1d(np.arange(len(names)), seen)
+        return cls(
+            names,
+            *(tuple(int(k) for k in columns) for columns in (first, rest, unseen)),
+            regrouping=regrouping,
+            condition=float(values[0] / values[-1]),
+        )
+
+    @property
+    def rank(self) -> int:
+        """How many base parameters there are."""
+        return len(self.independent)
+
+    @property
+    def expressions(self) -> tuple[str, ...]:
+        """Every base parameter as a sum, for instance "fore.mz + 0.25 hand.m"."""
+        return tuple(self._expression(row) for row in range(self.rank))
+
+    def values(self, parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
+        """Base parameters beta of these parameters."""
+        return parameters[list(self.independent)] + self.regrouping @ parameters[list(self.dependent)]
+
+    def _expression(self, row: int) -> str:
+        weights = self.regrouping[row]
+        terms = [self.names[self.independent[row]]]
+        scale = max(1.0, float(abs(weights).max(initial=0.0)))
+        for column, weight in zip(self.dependent, weights, strict=True):
+            if abs(weight) > NAMED * scale:
+                factor = "" if abs(abs(weight) - 1.0) < NAMED else f"{abs(weight):.3g} "
+                terms.append(f"{'+' if weight > 0 else '-'} {factor}{self.names[column]}")
+        return " ".join(terms)
+
+
+def base_parameters(robot: Robot) -> BaseParameters:
+    """The base parameters of a robot, whatever the motion: from random states, the same ones every time."""
+    turns, v, a = np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv))
+    q = robot.space.integrate(robot.space.neutral(), torch.tensor(turns, device=robot.device)).cpu().numpy()
+    return excitation(robot, q, v, a)
+
+
+def excitation(
+    robot: Robot, q: Float[np.ndarray, "rows nq"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
+) -> BaseParameters:
+    """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
+    states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))
+    return BaseParameters.of(torque_regressor(robot, *states).flatten(0, 1).cpu().numpy(), parameter_names(robot))
+
 
 # symmetric matrices Z = sum_k z_k E_k, orthonormal in the Frobenius norm
 _ROWS, _COLUMNS = np.triu_indices(4)
@@ -46,48 +172,33 @@ QUANTITIES = (
 )
 """What people read of a body: inertia about its centre of mass."""
 _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-# which of alpha, d1-3, s12, s23, s13, t1-3 each part of a body moves: a mass keeps the inertia about its centre
-PARTS = {"mass": np.zeros((1, 10)), "center_of_mass": np.eye(10)[7:], "inertia": np.eye(10)[1:7]}
-PARTS["mass"][0, :4] = 1.0, -1.0, -1.0, -1.0
 
 
 class Bodies:
     """Coordinates of n bodies, 0 at the reference pseudo-inertias (4, 4) each, which are definite.
 
-    Ten of each, alpha, d1-3, s12, s23, s13, t1-3, or fewer for those of which `priors` open some parts alone.
+    Ten of each: alpha, d1-3, s12, s23, s13, t1-3.
     """
-
-    longest_step: ClassVar[float] = 1.0  # a mass by a factor of e^2
 
     def __init__(self, references: Sequence[Float[np.ndarray, "4 4"]], priors: Sequence[Body]) -> None:
         self.priors = tuple(priors)
         self.factors = upper_cholesky(np.array(references).reshape(-1, 4, 4))
         self._to_standard = np.linalg.pinv(standard_basis().numpy())
-        self._whole = tuple(len(prior.parts) == len(PARTS) for prior in self.priors)
-        own = [np.eye(10) if whole else np.concatenate([PARTS[part] for part in prior.parts]).T
-               for whole, prior in zip(self._whole, self.priors, strict=True)]  # fmt: skip
-        self._full = block_diag(*own) if own else np.zeros((0, 0))
         self._weights = np.repeat([prior.strength**0.5 for prior in self.priors], 10)
 
     @property
     def size(self) -> int:
         """Number of coordinates."""
-        return self._full.shape[1]
+        return 10 * len(self.priors)
 
     @property
     def slices(self) -> tuple[slice, ...]:
         """Which coordinates belong to each body."""
-        ends = np.cumsum([0, *(sum(len(PARTS[part]) for part in prior.parts) for prior in self.priors)])
-        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
-
-    @property
-    def quantities(self) -> tuple[tuple[str, str], ...]:
-        """Names and units of what people read of a body."""
-        return QUANTITIES
+        return tuple(slice(10 * k, 10 * k + 10) for k in range(len(self.priors)))
 
     def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
         """P of every body."""
-        return self._congruent(_log_cholesky(self._full @ x)[0])
+        return self._congruent(_log_cholesky(x)[0])
 
     def parameters(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10"]:
         """Standard parameters."""
@@ -104,38 +215,31 @@ class Bodies:
 
     def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "standard k"]:
         """Derivatives of the standard parameters of all bodies, one after the other, in the coordinates."""
-        own = self._standard(self._congruent(_log_cholesky(self._full @ x)[1])).swapaxes(-1, -2)
-        return block_diag(*own) @ self._full if len(own) else np.zeros((0, 0))
+        own = self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2)
+        return block_diag(*own) if len(own) else np.zeros((0, 0))
 
     def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
 
-        Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley. Bodies of
-        which some parts are open move along x.
+        Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley.
         """
-        there = x + step
-        if not any(self._whole):
-            return there
-        inner, derivatives = _log_cholesky(self._full @ x)
-        inner = inner + np.einsum("nk,nkab->nab", (self._full @ step).reshape(-1, 10), derivatives)
+        if not self.priors:
+            return x + step
+        inner, derivatives = _log_cholesky(x)
+        inner = inner + np.einsum("nk,nkab->nab", step.reshape(-1, 10), derivatives)
         values = np.linalg.eigvalsh(inner)
-        possible = (values[:, 0] > DEFINITE * values[:, -1]) & np.array(self._whole)
+        possible = values[:, 0] > DEFINITE * values[:, -1]
         F = upper_cholesky(inner[possible])
         scale, inside = F[:, 3, 3:], F[:, *np.transpose(_PLACES)] / F[:, 3, 3:]
-        whole = (self._full @ there).reshape(-1, 10)
-        whole[possible] = np.concatenate([np.log(scale), np.log(inside[:, :3]), inside[:, 3:]], axis=1)
-        out, column = there.copy(), 0
-        for k, prior in enumerate(self.priors):
-            width = sum(len(PARTS[part]) for part in prior.parts)
-            out[column : column + width] = whole[k] if possible[k] else there[column : column + width]
-            column += width
-        return out
+        there = (x + step).reshape(-1, 10)
+        there[possible] = np.concatenate([np.log(scale), np.log(inside[:, :3]), inside[:, 3:]], axis=1)
+        return there.ravel()
 
     def distance(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
         """A vector whose norm is the distance from the references times the root of its weight, and its Jacobian."""
         if not self.priors:
             return np.zeros(0), np.zeros((0, 0))
-        inner, change = _log_cholesky(self._full @ x)
+        inner, change = _log_cholesky(x)
         values, vectors = np.linalg.eigh(inner)
         values = np.maximum(values, np.finfo(np.float64).tiny)
         logs = np.log(values)
@@ -148,14 +252,13 @@ class Bodies:
         divided = np.where(equal, 1.0 / mean, (logs[:, :, None] - logs[:, None, :]) / np.where(equal, 1.0, gap))
         inside = turned[:, None] @ change @ vectors[:, None] * divided[:, None]
         moved = vectors[:, None] @ inside @ turned[:, None]
-        jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved)) @ self._full
-        return self._weights * np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel(), self._weights[
-            :, None
-        ] * jacobian
+        jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved))
+        distance = np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel()
+        return self._weights * distance, self._weights[:, None] * jacobian
 
     def numbers(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
         """`QUANTITIES` of every body, in axes with these poses in its frame."""
-        told = [self.physical(pseudo) for pseudo in _in_frames(self.pseudo_inertias(x), frames)]
+        told = [physical_of_pseudo_inertia(pseudo) for pseudo in _in_frames(self.pseudo_inertias(x), frames)]
         each = [[mass, *center, *(inertia[at] for at in _INERTIA)] for mass, center, inertia in told]
         return np.array(each).ravel()
 
@@ -163,7 +266,7 @@ class Bodies:
         """Derivatives of `numbers` in the coordinates."""
         if not self.priors:
             return np.zeros((0, 0))
-        changes = _in_frames(self._congruent(_log_cholesky(self._full @ x)[1]), frames[:, None])
+        changes = _in_frames(self._congruent(_log_cholesky(x)[1]), frames[:, None])
         blocks = []
         for pseudo, change in zip(_in_frames(self.pseudo_inertias(x), frames), changes, strict=True):
             mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
@@ -174,12 +277,7 @@ class Bodies:
             dS = dS - mass * (outer + outer.swapaxes(1, 2))
             dI = np.trace(dS, axis1=1, axis2=2)[:, None, None] * np.eye(3) - dS
             blocks.append(np.concatenate([dm[None], dc.T, np.array([dI[:, *at] for at in _INERTIA])]))
-        return block_diag(*blocks) @ self._full
-
-    @staticmethod
-    def physical(pseudo: Float[np.ndarray, "4 4"]) -> tuple[float, np.ndarray, np.ndarray]:
-        """Mass, centre of mass, and inertia about it (3, 3)."""
-        return physical_of_pseudo_inertia(pseudo)
+        return block_diag(*blocks)
 
     def _standard(self, pseudo: np.ndarray) -> np.ndarray:
         return pseudo.reshape(*pseudo.shape[:-2], 16) @ self._to_standard.T

@@ -1,21 +1,7 @@
-"""Weighted non-linear least squares: the noise of each joint is found along with the coordinates.
+"""Non-linear least squares, where the noise of each joint is found along with the coordinates.
 
-Gaussian residuals of joint j with unknown variance are most likely where ``sum_j rows log(sum_n r_nj^2)`` is least;
-weighting each joint by the residuals of the last round until nothing changes finds that (iteratively reweighted least
-squares). The prior stands among the residuals. With `robust` residuals beyond 1.5 standard deviations count by their
-absolute value (soft L1), and the scale of each joint comes from the median.
-
-Residuals r_n = a_n - a^_n that have noise of both kinds are normal with covariance
-
-    S_n = diag(sigma_a^2) + M_n^-1 diag(sigma_F^2) M_n^-1,
-
-so joints of small inertia count less where the noise is one of forces. The two levels of every joint are those of
-largest likelihood (the model of `forcegp.posterior.Noise`). One level per joint would let rows of large M^-1 decide.
-Under constraints H of Gauss' principle stands in the place of M^-1.
-
-Joint forces along A^T are those of contacts and unknown. Of whitened residuals w and z = A^T / sigma they take the part
-in the span of z, and what is left, ``(1 - P) w``, has the likelihood in which they are integrated out under a flat
-prior (generalized least squares). Of joint j it has the mean square ``sum_n (1 - P_n)_jj`` where sigma is right.
+Iteratively reweighted: sum_j rows log(sum_n r_nj^2) is least. Accelerations with noise of both kinds have the
+covariance diag(sigma_a^2) + H diag(sigma_F^2) H^T. Forces along A^T are integrated out under a flat prior.
 """
 
 from collections.abc import Callable
@@ -51,16 +37,11 @@ class NoiseLevels:
         M: Float[np.ndarray, "rows nv nv"],
         H: Float[np.ndarray, "rows nv nv"] | None = None,
         near: "NoiseLevels | None" = None,
-        robust: bool = False,
     ) -> "NoiseLevels":
         """Those of largest likelihood, each between `LEAST` and `MOST` times the whole: Fisher scoring of logarithms.
 
         `H` is that of Gauss' principle under constraints; None is M^-1. The search begins `near` others, if given.
-        With `robust`, outliers are moved to `OUTLYING` standard deviations first.
         """
-        if robust:
-            most = OUTLYING * MAD * np.median(abs(residual), axis=0)
-            residual = residual.clip(-most, most)
         chosen = np.unique(np.linspace(0, len(residual) - 1, min(ROWS, len(residual))).astype(int))
         inverse = torch.as_tensor(np.linalg.inv(M[chosen]) if H is None else H[chosen])
         r = torch.as_tensor(residual[chosen])
@@ -126,12 +107,6 @@ LEAST_NOISE = 1e-6
 """Noise that is this fraction of the residual at the start counts as none: the data are exact."""
 SETTLED = 1e-3
 """Relative change of the noise level that ends them."""
-BEND = 1.5
-"""Standard deviations beyond which a robust residual counts by its absolute value."""
-OUTLYING = 3.0
-"""Standard deviations beyond which a robust residual is an outlier where levels of noise are sought."""
-MAD = 1.4826
-"""Median absolute deviation of a normal distribution -> its standard deviation."""
 
 
 class Regressor:
@@ -187,17 +162,15 @@ Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class Fit:
     """Where least squares ended.
 
-    `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k) there, `noise` (nv,) in units of the residual, `weight`
-    (rows, nv) between 0 and 1 for robust residuals, `prior_information` (k, k), and the message of the search. `span`
-    (rows, nv, m) are orthonormal directions of whitened residuals that unknown forces have, None for none. `expected`
-    is by how many nats the first step of the last round was to lower the objective.
+    `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k), `noise` (nv,), `prior_information` (k, k). `span`
+    (rows, nv, m): directions of whitened residuals that unknown forces have. `expected`: nats of the first step of the
+    last round.
     """
 
     x: Float[np.ndarray, " k"]
     residual: Float[np.ndarray, "rows nv"]
     jacobian: Float[np.ndarray, "rows nv k"]
     noise: Float[np.ndarray, " nv"]
-    weight: Float[np.ndarray, "rows nv"]
     prior_information: Float[np.ndarray, "k k"]
     evaluations: int
     settled: bool
@@ -209,15 +182,15 @@ class Fit:
         """Residuals over their noise, without what unknown forces explain."""
         return without(self.residual / self.noise, self.span)
 
-    def weighted(self, time: Float[np.ndarray, " nv"] | float = 1.0) -> Float[np.ndarray, "n k"]:
-        """The Jacobian (rows nv, k) over the noise, for residuals of which one in so many rows is independent."""
-        scaled = without(self.jacobian / self.noise[:, None], self.span) * np.sqrt(self.weight / time)[..., None]
-        return scaled.reshape(-1, scaled.shape[-1])
+    @property
+    def white_jacobian(self) -> Float[np.ndarray, "rows nv k"]:
+        """The Jacobian over the noise, without what unknown forces explain."""
+        return without(self.jacobian / self.noise[:, None], self.span)
 
     @property
     def information(self) -> Float[np.ndarray, "k k"]:
         """Gauss-Newton curvature of the data, each residual weighted by its noise."""
-        weighted = self.weighted()
+        weighted = self.white_jacobian.reshape(-1, len(self.x))
         return weighted.T @ weighted
 
 
@@ -228,7 +201,6 @@ def weighted_least_squares(
     bounds: tuple[np.ndarray, np.ndarray],
     *,
     longest: Float[np.ndarray, " k"] | float = np.inf,
-    robust: bool = False,
     progress: Callable[[int, float], None] | None = None,
     held: Float[np.ndarray, "rows m nv"] | None = None,
     known: Float[np.ndarray, " nv"] | None = None,
@@ -237,10 +209,9 @@ def weighted_least_squares(
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
-    `longest` is the most that a coordinate may change in one step: infinite where the residual is linear in it. `held`
-    are directions of r that unknown forces have, in every row independent ones, then zeros; they do not count. `known`
-    is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps follow `moved`: residuals
-    that are as good as linear along it have no curved valleys, in which searches creep.
+    `longest` is the most that a coordinate may change in one step. `held` are directions of r that unknown forces have,
+    which do not count. `known` is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps
+    follow `moved`: residuals that are as good as linear along it have no curved valleys.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, Any]]] = []
 
@@ -255,30 +226,27 @@ def weighted_least_squares(
     some = slice(None) if held is None else np.unique(np.linspace(0, len(r) - 1, min(ROWS, len(r))).astype(int))
     seen = None if held is None else held[some]
     span = _span(held, np.ones(r.shape[1]))
-    noise, total, settled = _noise(r, robust, span) if known is None else known, 0, False
+    noise, total, settled = _noise(r, span) if known is None else known, 0, False
     converged, expected = False, 0.0
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
-        point = partial(_point, at, prior, noise, robust, span)
+        point = partial(_point, at, prior, noise, span)
         x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved)
         total += nfev
         r, jacobian = at(x)
         before = noise
         # forces of contacts hide most of it at first
         for _ in range(0 if known is not None else 1 if held is None else PASSES):
-            noise = np.maximum(noise * _noise(r[some] / noise, robust, _span(seen, noise)), floor)
+            noise = np.maximum(noise * _noise(r[some] / noise, _span(seen, noise)), floor)
         if progress is not None:
             progress(round_number, float(np.sqrt((without(r, _span(held, np.ones_like(noise))) ** 2).mean())))
         settled = bool((abs(noise - before) <= SETTLED * before).all())
         if settled:
             break
     span = _span(held, noise)
-    weight = _weights(without(r / noise, span), robust)
     in_prior = prior(x)[1]
-    return Fit(
-        x, r, np.asarray(jacobian), noise, weight, in_prior.T @ in_prior, total, settled and converged, span, expected
-    )
+    return Fit(x, r, np.asarray(jacobian), noise, in_prior.T @ in_prior, total, settled and converged, span, expected)
 
 
 def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:
@@ -351,9 +319,7 @@ def _minimized(
     return here.x, most, False, first or 0.0
 
 
-def _point(
-    at: Residual, prior: Residual, noise: np.ndarray, robust: bool, span: np.ndarray | None, x: np.ndarray
-) -> _Point:
+def _point(at: Residual, prior: Residual, noise: np.ndarray, span: np.ndarray | None, x: np.ndarray) -> _Point:
     bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
     with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
         try:
@@ -361,37 +327,27 @@ def _point(
         except (np.linalg.LinAlgError, NumericalError):  # a mass matrix that rounding made singular
             return bad
         white = without(r / noise, span)
-        weight = _weights(white, robust)
-        cost = BEND**2 * ((1.0 / weight) - 1.0).sum() if robust else 0.5 * (white**2).sum()
-        if isinstance(jacobian, Chained) and span is None and not robust:
+        if isinstance(jacobian, Chained) and span is None:
             gradient, curvature = jacobian.normal_equations(white, noise)
         else:
-            flat = without(np.asarray(jacobian) / noise[:, None], span)
-            flat = (flat * np.sqrt(weight)[..., None] if robust else flat).reshape(-1, len(x))
-            gradient, curvature = flat.T @ (np.sqrt(weight) * white).ravel(), flat.T @ flat
+            flat = without(np.asarray(jacobian) / noise[:, None], span).reshape(-1, len(x))
+            gradient, curvature = flat.T @ white.ravel(), flat.T @ flat
         gradient, curvature = gradient + prior_jacobian.T @ prior_r, curvature + prior_jacobian.T @ prior_jacobian
-        cost = float(cost + 0.5 * (prior_r**2).sum())
+        cost = 0.5 * float((white**2).sum() + (prior_r**2).sum())
     if not (np.isfinite(cost) and np.isfinite(curvature).all()):
         return bad
     return _Point(x, cost, gradient, curvature)
 
 
-def _weights(white: np.ndarray, robust: bool) -> np.ndarray:
-    """Derivative of the soft L1 loss 2 BEND^2 (sqrt(1 + z) - 1) in r^2, z = (r / BEND)^2; 1 for plain squares."""
-    return (1.0 + (white / BEND) ** 2) ** -0.5 if robust else np.ones_like(white)
-
-
-def _noise(r: np.ndarray, robust: bool, span: np.ndarray | None) -> np.ndarray:
+def _noise(r: np.ndarray, span: np.ndarray | None) -> np.ndarray:
     left = 1.0 if span is None else np.sqrt(np.maximum(1.0 - (span**2).sum(-1).mean(0), 1e-9))
-    r = without(r, span)
-    scale = MAD * np.median(abs(r), axis=0) if robust else np.sqrt((r**2).mean(axis=0))
-    return np.maximum(scale / left, 1e-12)  # data that the start explains exactly
+    # data that the start explains exactly have next to none
+    return np.maximum(np.sqrt((without(r, span) ** 2).mean(axis=0)) / left, 1e-12)
 
 
 def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.ndarray, " rows"]) -> np.ndarray:
     """Rows that one independent residual is worth, per joint: 1 + 2 sum of autocorrelations until they turn negative.
 
-    Filtered signals have residuals that resemble their neighbours; without this factor standard errors are too small.
     The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).
     """
     total = (residual**2).sum(0)

@@ -1,6 +1,7 @@
-"""Where physics and Gaussian processes meet: from states and checked forces to (m, W), features, NLL."""
+"""Where physics and Gaussian processes meet: rows, from states and checked forces to (m, W), features, likelihood."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,14 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput
-from forcegp.evidence.training_data import RESIDUAL_FLOOR, Standardization, TrainingData
-from forcegp.forces import Unknown, UnknownForces
-from forcegp.forces.unknown import Scaling
+from forcegp.data import Dataset
+from forcegp.errors import ContactError, DataWarning, InvalidInput
+from forcegp.forces import Scaling, Unknown, UnknownForces
 from forcegp.inference import (
     Engine,
     Exact,
-    FunctionalPosterior,
     LatentKernels,
     LatentPosterior,
     ProblemSize,
@@ -25,10 +24,132 @@ from forcegp.inference import (
     collapsed_bound,
     negative_log_likelihood,
 )
-from forcegp.inference.linear_functionals import functional_negative_log_likelihood, weighted
-from forcegp.mechanics import ConstrainedDynamics
+from forcegp.mechanics import AffineMap, ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION, FORCE, Noise
+
+CONSTANT = 1e-12
+"""Spread of a feature, relative to 1 plus its size, below which it is constant."""
+RESIDUAL_FLOOR = 1e-6
+"""Smallest start variance of a latent over the largest: one that the start residual misses can still grow."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """States and measured accelerations (N, nv), float64.
+
+    `reference` holds the rows that features are standardised by, where they are others. Where errors resemble each
+    other over `correlated_rows`, as many rows count as one.
+    """
+
+    q: Float[Tensor, "N nq"]
+    v: Float[Tensor, "N nv"]
+    u: Float[Tensor, "N nu"]
+    a: Float[Tensor, "N nv"]
+    reference: "TrainingData | None" = None
+    correlated_rows: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @classmethod
+    def of(cls, rows: Dataset, device: torch.device) -> "TrainingData":
+        """Copies of all rows of a Dataset."""
+        q, v, u, a = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
+        return cls(q, v, u, a)
+
+    def to(self, device: torch.device) -> "TrainingData":
+        """The same rows on another device."""
+        return replace(self, **{name: x.to(device) for name, x in vars(self).items() if hasattr(x, "to")})
+
+
+@dataclass(frozen=True, eq=False)
+class Standardization:
+    """Shift and scale of each latent's features, from the training points; constant features keep scale 1."""
+
+    shift: tuple[Float[Tensor, "_"], ...]
+    scale: tuple[Float[Tensor, "_"], ...]
+
+    @classmethod
+    def of(
+        cls, features: Sequence[Float[Tensor, "N _"]], scalings: Sequence[tuple[Scaling, ...] | Scaling] | None = None
+    ) -> "Standardization":
+        """As `scalings` say for each latent or each of its features; None shifts and scales all of them."""
+        scalings = ("standardize",) * len(features) if scalings is None else scalings
+        shifts, scales = [], []
+        for z, given in zip(features, scalings, strict=True):
+            ways = (given,) * z.shape[-1] if isinstance(given, str) else given
+            shifted = torch.tensor([way == "standardize" for way in ways], dtype=torch.bool, device=z.device)
+            scaled = torch.tensor([way != "none" for way in ways], dtype=torch.bool, device=z.device)
+            shift = torch.where(shifted, z.mean(0), torch.zeros_like(z[0]))
+            size = (z - shift).square().mean(0)
+            # below rounding of the values themselves a feature counts as constant; the root comes after that choice,
+            # for its derivative at 0 is infinite
+            varies = scaled & (size > (CONSTANT * (1.0 + shift.abs())).square())
+            shifts.append(shift)
+            scales.append(torch.where(varies, size, torch.ones_like(size)).sqrt())
+        return cls(tuple(shifts), tuple(scales))
+
+    def __call__(self, features: Sequence[Float[Tensor, "*batch _"]]) -> list[Float[Tensor, "*batch _"]]:
+        """Standardised features."""
+        return [(z - m) / s for z, m, s in zip(features, self.shift, self.scale, strict=True)]
+
+
+def second_moments(a: Float[Tensor, "N nv"]) -> Float[Tensor, "nv nv"]:
+    """S of accelerations; a joint that never moved counts as moving a millionth as much as the others."""
+    squares = a.square().mean(0)
+    return torch.diag_embed(squares + 1e-12 * squares.sum())
+
+
+def shrunk(
+    acceleration: AffineMap,
+    H: Float[Tensor, "*batch nv nv"],
+    force_std: Float[Tensor, "nv"],
+    moments: Float[Tensor, "nv nv"],
+) -> tuple[AffineMap, Float[Tensor, "*batch nv nv"]]:
+    """G a_f as a function of the unknown force, and the covariance that is left, H F H^T G^T.
+
+    Forward dynamics divides by the inertia: .05 Nm of noise at a wrist of 1e-3 kg m^2 are 50 rad/s^2. With the noise F
+    of u, and motions a ~ N(0, S), a | u, f ~ N(G a_f, H F H^T G^T), G = S (H F H^T + S)^-1: errors in variables
+    (Carroll et al., "Measurement error in nonlinear models", 2006, section 4.2), linear in f. S is diagonal:
+    correlations between joints are those of one motion and not of the next (Franka Panda: intervals held 76 to 92 %
+    with, 87 to 100 without).
+    """
+    torque_noise = (H * force_std.square()) @ H.mT
+    kept = torch.linalg.solve(torque_noise + moments, moments.expand_as(torque_noise)).mT  # G
+    covariance = torque_noise @ kept.mT
+    matrix, offset = kept @ acceleration.matrix, (kept @ acceleration.offset[..., None])[..., 0]
+    return AffineMap(offset, matrix), 0.5 * (covariance + covariance.mT)
+
+
+FAR_FROM_SURFACE = 0.01
+"""Median distance of the training points from a contact's surface, in m, beyond which a warning is given."""
+
+
+def check_distance(model: Model, training: TrainingData) -> None:
+    """Refuse a surface that no training state touches, and warn where half of them are far from it."""
+    kinematics = model.robot.kinematics(training.q)
+    for index, contact in enumerate(model.contacts):
+        # divided by |s_p|, which is 1 for signed distances, the value of any surface is a distance near it
+        size = torch.linalg.vector_norm(contact.surface.gradient(contact.position(kinematics)), dim=-1)
+        distances = (contact.distance(kinematics) / size).abs()
+        distance = float(distances.median())
+        what = f"the surface of contact {index} (frame {contact.frame!r})"
+        remedy = "check its surface, point and units (m), or leave the contact out"
+        if float(distances.min()) > FAR_FROM_SURFACE:
+            raise ContactError(
+                f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away, half of them "
+                f"more than {distance:.3g} m; {remedy}"
+            )
+        if distance > FAR_FROM_SURFACE:
+            _warn(
+                f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
+                "rows in contact only (forcegp.data.rows_in_contact)"
+            )
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, DataWarning, stacklevel=6)
 
 
 def checked_values(forces: UnknownForces, dynamics: ConstrainedDynamics) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -39,43 +160,33 @@ def checked_values(forces: UnknownForces, dynamics: ConstrainedDynamics) -> tupl
 
 def _checked(prior: Unknown, dynamics: ConstrainedDynamics) -> tuple[Tensor, tuple[Tensor, ...]]:
     robot, own = dynamics.state.robot, type(prior).__name__
-    names = prior.latent_names(robot)
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+    names, features, scalings = prior.latent_names(robot), prior.features(dynamics), prior.scalings(robot)
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise InvalidInput(f"{own}.latent_names gives {names!r}; it must give a tuple with a name per latent")
-    rows, count = len(dynamics.state.q), len(names)
-    B = _tensor(f"{own}.direction", prior.direction(dynamics), (rows, robot.nv, count), "(rows, nv, latents)")
-    features = _one_per_latent(f"{own}.features", prior.features(dynamics), names)
-    for name, z in zip(names, features, strict=True):
+    for method, given in (("features", features), ("scalings", scalings)):
+        if not isinstance(given, list | tuple) or len(given) != len(names):
+            kind = f"{len(given)} entries" if isinstance(given, list | tuple) else f"a {type(given).__name__}"
+            raise InvalidInput(f"{own}.{method} gives {kind}; it must give a tuple with one for each of {names}")
+    rows, ways = len(dynamics.state.q), get_args(Scaling)
+    B = _tensor(f"{own}.direction", prior.direction(dynamics), (rows, robot.nv, len(names)), "(rows, nv, latents)")
+    for name, z, given in zip(names, features, scalings, strict=True):
         _tensor(f"{own}.features of {name!r}", z, (rows, None), "(rows, features); one feature is z[..., None]")
-    ways = get_args(Scaling)
-    for name, given, z in zip(
-        names, _one_per_latent(f"{own}.scalings", prior.scalings(robot), names), features, strict=True
-    ):
         each = (given,) * z.shape[-1] if isinstance(given, str) else tuple(given)
         if len(each) != z.shape[-1] or not set(each) <= set(ways):
             allowed = ", ".join(map(repr, ways))
             raise InvalidInput(f"{own}.scalings of {name!r} is {given!r}; give one of {allowed}, or one per feature")
-    return B, features
-
-
-def _one_per_latent(what: str, given: Any, names: Any) -> tuple[Any, ...]:
-    if not isinstance(given, list | tuple):
-        raise InvalidInput(f"{what} gives a {type(given).__name__}; it must give a tuple with an entry per latent")
-    if len(given) != len(names):
-        raise InvalidInput(f"{what} gives {len(given)} entries for {len(names)} latents ({', '.join(names)})")
-    return tuple(given)
+    return B, tuple(features)
 
 
 def _tensor(what: str, given: Any, shape: tuple[int | None, ...], wanted: str) -> Tensor:
-    if not isinstance(given, Tensor):
-        raise InvalidInput(f"{what} is a {type(given).__name__}; it must be a float64 tensor {wanted}")
-    if len(given.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, given.shape, strict=True)):
+    found = tuple(getattr(given, "shape", ()))
+    fits = len(found) == len(shape) and all(n in (None, m) for n, m in zip(shape, found, strict=True))
+    if not isinstance(given, Tensor) or not fits or given.dtype != torch.float64 or given.requires_grad:
+        kind = f"a {getattr(given, 'dtype', type(given).__name__)} of shape {found}"
         sizes = ", ".join("any" if size is None else str(size) for size in shape)
-        raise InvalidInput(f"{what} has shape {tuple(given.shape)}; it must be ({sizes}), that is {wanted}")
-    if given.dtype != torch.float64:
-        raise InvalidInput(f"{what} is {given.dtype}; it must be float64: compute it from the state, or call .double()")
-    if given.requires_grad:
-        raise InvalidInput(f"{what} requires gradients, but only kernels are learned: detach the tensors that it holds")
+        raise InvalidInput(
+            f"{what} is {kind}; it must be a float64 tensor ({sizes}) without gradients, that is {wanted}"
+        )
     lost = ~torch.isfinite(given).flatten(1).all(1)
     if bool(lost.any()):
         raise InvalidInput(f"{what} is not finite at training row {int(lost.nonzero()[0])}; mend it there")
@@ -86,8 +197,7 @@ def _tensor(what: str, given: Any, shape: tuple[int | None, ...], wanted: str) -
 class MarginalLikelihood:
     """-log p(a | q, v, u, parameters) of one model on one training set, as a function of unconstrained parameters.
 
-    Parameters by name: those of the kernels, `noise.log_acceleration` (nv,) and optionally `noise.log_force` (nv,). All
-    of them receive gradients in one backward pass.
+    By name: those of the kernels, `noise.log_acceleration` (nv,) and optionally `noise.log_force` (nv,).
     """
 
     model: Model
@@ -129,28 +239,17 @@ class MarginalLikelihood:
 
     @cached_property
     def residual(self) -> Float[Tensor, "N nv"]:
-        """a - m; that of a window is repeated for all of its nodes."""
-        residual, weights = self.training.a - self.dynamics.acceleration_map().offset, self.training.weights
-        if weights is None:
-            return residual
-        return weighted(weights, residual).repeat_interleave(weights.shape[1], dim=0)
+        """a - m."""
+        return self.training.a - self.dynamics.acceleration_map().offset
 
     def terms(self, parameters: Mapping[str, Tensor]) -> Terms:
-        """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`.
-
-        Of windows, those of all nodes.
-        """
-        factors, alike = self.training.noise_factors, self.training.correlated_rows
-        noise = Noise.covariance(parameters, self.dynamics.H, factors) * alike
+        """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`."""
+        noise = Noise.covariance(parameters, self.dynamics.H) * self.training.correlated_rows
         return Terms(self.features, self.mixing, self.residual, noise)
 
     @cached_property
     def kernels(self) -> LatentKernels:
-        """Kernels with moment-based start values.
-
-        Each latent starts with the variance of its least-squares estimate W^+ (a - m), the pseudo-inverse force
-        residual. Kernels that have the method `visit` take the range that the rows visit.
-        """
+        """Kernels that start with the variance of W^+ (a - m); `visit` of a kernel takes the range of the rows."""
         if self.training.reference is not None:  # on whose rows kernels were made
             return replace(self, training=self.training.reference).kernels
         features = self.features
@@ -191,19 +290,13 @@ class MarginalLikelihood:
         return terms, kernels.matrices(parameters, terms.features)
 
     def of_terms(self, terms: Terms, matrices: Sequence[Float[Tensor, "N N"]]) -> Float[Tensor, ""]:
-        """-log p of rows, or of windows, with these terms."""
-        if self.training.weights is not None:
-            return functional_negative_log_likelihood(self.training.weights, terms, matrices)
+        """-log p of rows with these terms."""
         return negative_log_likelihood(terms.W, terms.residual, terms.noise, matrices)
 
     def bound(
         self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
     ) -> Float[Tensor, ""]:
-        """`collapsed_bound` of the same with these inducing points (prepared features) of every latent.
-
-        Where k rows count as one, densities N(a | f, R) are taken to the power of 1/k: N(a | f, k R) times
-        |2 pi k R|^(1/2) / |2 pi R|^(1 / (2 k)), so that learned noise stays that of a row.
-        """
+        """`collapsed_bound` with these inducing points. Where k rows count as one, densities have the power 1/k."""
         terms, k = self.terms(parameters), self.training.correlated_rows
         bound = collapsed_bound(terms, kernels, parameters, points)
         if k == 1.0:
@@ -229,8 +322,6 @@ class MarginalLikelihood:
         kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
             terms = self.terms(parameters)
-            if self.training.weights is not None:
-                return FunctionalPosterior.condition(kernels, self.training.weights, terms)
             return (engine or Exact()).condition(kernels, terms, start=start)
 
     @property

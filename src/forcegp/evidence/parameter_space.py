@@ -1,7 +1,6 @@
 """The numbers of a model that a fit estimates, as coordinates x of size 1: bodies, then coefficients of laws.
 
-A law adds ``-f(parameters; z)`` to the torque that a motion needs, and a rotor ``I a``. One unit of a coordinate is the
-typical size of its number in the log, or a factor of e for numbers on a log scale; ten times smaller is likely as well.
+One unit is the typical size of a number in the log, or a factor of e on a log scale.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,13 +15,13 @@ from scipy.linalg import block_diag
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.evidence.bodies import Bodies, with_bodies
-from forcegp.evidence.identifiability import body_names, carrying
+from forcegp.evidence.bodies import QUANTITIES, Bodies, body_names, body_pseudo_inertias, carrying, with_bodies
 from forcegp.forces import JointLaw, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
-from forcegp.forces.parameters import Body
+from forcegp.forces.force import Body
 from forcegp.forces.registry import force_name
 from forcegp.mechanics import State
 from forcegp.model import Model
+from forcegp.robots.inertia import physical_of_pseudo_inertia
 
 LINEAR_SPREAD = 10.0
 """Standard deviation of the weak prior on numbers that are not logarithms, in their sizes: as large as the torques."""
@@ -32,10 +31,9 @@ FARTHEST = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One coefficient of a law: the entries of it that are estimated.
+    """One coefficient of a law: entries that are estimated, at `joints` (places in v; None: one number for all).
 
-    `joints` are their places in v, or None for a number that all directions share. value = size x, or size e^x with
-    `logarithm`; a priori x has the mean `center` and the standard deviation `spread`.
+    value = size x, or size e^x with `logarithm`; a priori x has the mean `center` and the standard deviation `spread`.
     """
 
     law: int
@@ -76,9 +74,6 @@ class Carried:
 class ParameterSpace:
     """The parameters of a model that are open: `Law.learned`, `RigidBodies.learn`, payloads without a mass.
 
-    Parameters
-    ----------
-    model: laws and priors; payloads are on links that are chosen already.
     typical: sizes of "force", "position", "velocity" and "inertia" of each joint in the log, (nv,) each.
     """
 
@@ -118,7 +113,7 @@ class ParameterSpace:
     def longest_steps(self) -> Float[np.ndarray, " k"]:
         """Most that a coordinate should change at once: infinite for those that the torque is linear in."""
         each = [np.full_like(term.size, 1.0 if term.logarithm else np.inf) for term in self.terms]
-        return self._joined(np.full(self.bodies.size, self.bodies.longest_step), each)
+        return self._joined(np.full(self.bodies.size, 1.0), each)
 
     def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
@@ -147,7 +142,7 @@ class ParameterSpace:
         robot, starts = self.model.robot, self.numbers(stated)
         out, place = [], 0
         for each in self.carried:
-            for name, unit in self.bodies.quantities:
+            for name, unit in QUANTITIES:
                 out.append(Parameter(f"{each.name}.{name}", unit, float(starts[place]), each.prior))
                 place += 1
         for term in self.terms:
@@ -236,7 +231,7 @@ class ParameterSpace:
         assert each.offset is not None, "it is a payload"
         assert each.payload is not None, "it is a payload"
         there = np.linalg.inv(each.offset)
-        mass, center, inertia = self.bodies.physical(there @ pseudo @ there.T)
+        mass, center, inertia = physical_of_pseudo_inertia(there @ pseudo @ there.T)
         given = self.model.laws[each.payload]
         assert isinstance(given, Payload), "its number is that of a payload"
         return replace(given, mass=float(mass), center_of_mass=tuple(center), inertia=tuple(map(tuple, inertia)))
@@ -397,8 +392,6 @@ def _carried(model: Model) -> list[Carried]:
     named = dict(zip(own, body_names(robot), strict=True))
     for index, law in enumerate(model.laws):
         if isinstance(law, RigidBodies):
-            from forcegp.evidence.identifiability import body_pseudo_inertias
-
             references = dict(zip(own, body_pseudo_inertias(robot).cpu().numpy(), strict=True))
             for body, prior in law.bodies(own, robot).items():
                 if body not in references:

@@ -1,33 +1,10 @@
 """Rows of a recording as least squares sees them: residuals of torque or acceleration, with exact Jacobians.
 
-With the standard parameters pi of the bodies, the laws that are estimated t(x; v, a) and the forces Q that are given,
-
     torque           r = Y(q, v, a) pi + M_0 a + t(x; v, a) - Q
-    acceleration     r = a - a^,    a^ = (M(pi) + M_0 + M_t(x))^-1 (Q - bias(pi) - t(x; v, 0))
+    acceleration     r = a - a^,    dr/dpi = H Y(q, v, a^),    dr/dx = H dt/dx (v, a^)
 
-where M_0 is the inertia of what is listed and not estimated. Differentiating M a^ = Q - bias - t,
-
-    dr/dpi = M^-1 Y(q, v, a^),    dr/dx = M^-1 dt/dx (v, a^).
-
-Feet that stand and closed loops add A^T lambda to Q, with A a = b and unknown lambda. Accelerations are then
-those of Gauss' principle, and H stands in the place of M^-1. Of the torques only the part that is orthogonal to the
-rows of A, row by row of the recording, is an equation without lambda.
-
-Friction g(x; v) |u| under load makes u the solution of u = z + g |u|, with z all other terms:
-
-    u = z / (1 - g s),    s = sign z = sign u for |g| < 1,    du/dx = (dz/dx + u s dg/dx) / (1 - g s).
-
-The measured |u| in its place would explain the measured torque by itself: g tends to 1, whatever the robot is.
-
-Where a and u are both noisy, the a* that was there is unknown as well. Over it, (e_a / sigma_a)^2 + (e_F / sigma_F)^2
-is least at
-
-    r^T S^-1 r,    S = M diag(sigma_a^2) M^T + diag(sigma_F^2),    a* = a - diag(sigma_a^2) M^T S^-1 r
-
-(errors in variables: Fuller, "Measurement Error Models", 1987, section 3.2). As S changes with pi, its derivative in pi
-is 2 Y(q, v, a*)^T S^-1 r. Least squares of torque take Y(q, v, a) there, whose noise draws inertias to zero: without a
-bound where rows are homogeneous in them, as those of a base without actuators are. Where contacts hold, A a* = b: a and
-its covariance are those under that condition.
+Friction g |u| under load makes u = z / (1 - g sign z). Where a and u are both noisy, the accelerations that were there
+are those of errors in variables (Fuller, "Measurement Error Models", 1987, section 3.2), given the contacts.
 """
 
 from collections.abc import Sequence
@@ -42,11 +19,11 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, NumericalError, require_type
-from forcegp.evidence.identifiability import standard_parameters
-from forcegp.evidence.least_squares import BEND, NoiseLevels, orthonormal_columns, without
+from forcegp.evidence.bodies import standard_parameters
+from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.forces import Law, RigidBodies
-from forcegp.forces.thrusters import OBSERVED
+from forcegp.forces.actuation import OBSERVED
 from forcegp.mechanics import Contact, Held, LoopClosure, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
 from forcegp.model import Model
@@ -57,10 +34,8 @@ def motion_residuals(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    What A^T lambda can explain, the forces of feet that stand and of loops, is left out of the force
-    residual; under contacts that slide it holds the contact forces as well. Under friction that grows with |u| it is
-    what the measured u exceeds the u by that the model needs (`recorded_rows`), for the friction of the measured |u|
-    shrinks the residual of any model.
+    Forces of feet that stand and of loops are left out; those of contacts that slide are not. Under friction
+    that grows with |u| the force is what u exceeds the u by that the model needs.
     """
     require_type("dataset", dataset, Dataset)
     q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=model.robot.device) for x in ("q", "v", "u", "a"))
@@ -76,19 +51,6 @@ def motion_residuals(
         held, _ = independent_rows(dynamics.A.cpu().numpy(), dynamics.b.cpu().numpy())
         return without(force.cpu().numpy(), held.swapaxes(1, 2)), (a - dynamics.acceleration_map().offset).cpu().numpy()
     return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
-
-
-def residual_scores(
-    force: Float[np.ndarray, "rows nv"], acceleration: Float[np.ndarray, "rows nv"], dataset: Dataset
-) -> dict[str, list[float]]:
-    """Per joint: rms of both residuals, and that of the acceleration over its standard deviation (nRMSE)."""
-    rms = np.sqrt((acceleration**2).mean(0))
-    spread = dataset.a.std(0)
-    return {
-        "force_rms": np.sqrt((force**2).mean(0)).tolist(),
-        "acceleration_rms": rms.tolist(),
-        "acceleration_nrmse": np.divide(rms, spread, out=np.full_like(rms, np.nan), where=spread > 0.0).tolist(),
-    }
 
 
 def _under_load(state: State, load: Tensor) -> State:
@@ -107,8 +69,8 @@ Inputs = Float[np.ndarray, "rows nu"]
 class Motion:
     """Accelerations of the rows, and the torque that they need, but for what is estimated.
 
-    `regressor` are derivatives in the standard parameters of the bodies that are estimated, `fixed` the torque of all
-    others and of inertias that are given, less the given forces.
+    `regressor`: derivatives in the standard parameters of estimated bodies; `fixed`: torque of all others less given
+        forces.
     """
 
     a: Rows
@@ -229,12 +191,9 @@ class RecordedRows:
         force = FIRST * np.sqrt(((M @ residual[..., None]) ** 2).mean((0, 2))).clip(1e-12)
         return NoiseLevels(np.sqrt((residual**2).mean(0)).clip(1e-12), force)
 
-    def likely(
-        self, x: np.ndarray, measured: Motion, noise: NoiseLevels, robust: bool = False
-    ) -> "LikelyAccelerations":
+    def likely(self, x: np.ndarray, measured: Motion, noise: NoiseLevels) -> "LikelyAccelerations":
         """What was there where a and u are noisy, by the estimates at x and these levels of noise.
 
-        With `robust`, rows beyond what these levels explain count less, by the Cauchy loss log(1 + (rms / BEND)^2).
         Forces of joints that nothing measures, as those of a base, belong to a*, since they move the robot.
         """
         _, M, H = self.acceleration(x)
@@ -257,10 +216,6 @@ class RecordedRows:
         white = whitening @ at_contact[..., None]
         weighted = whitening.swapaxes(1, 2) @ white
         there = self.moving(a + moved - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0])
-        if robust:  # of whole rows, since Y(a*) is the slope of their squares, not of single entries
-            equations = a.shape[1] - self.held.any(-1).sum(1)
-            mean_square = (white**2).sum((1, 2)) / np.maximum(equations, 1)
-            whitening = whitening / np.sqrt(1.0 + mean_square / BEND**2)[:, None, None]
         return LikelyAccelerations(there, at_contact - self.in_torque(x, there)[0], whitening)
 
 
@@ -268,8 +223,8 @@ class RecordedRows:
 class LikelyAccelerations:
     """Motions with the accelerations a* where a and u are noisy.
 
-    `offset` (rows, nv) are the forces that the measured a needs, once it obeys the contacts, less those of a*.
-    `whitening` (rows, nv, nv) are L^-1 with S = L L^T, without the directions of contact forces.
+    `offset` (rows, nv): forces that the measured a needs less those of a*; `whitening` (rows, nv, nv): L^-1 of S = L
+    L^T.
     """
 
     motion: Motion

@@ -14,11 +14,10 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset import require_rows
 from forcegp.data.views import with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
-from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData, WindowedRows, Windows
-from forcegp.evidence.likelihood import MarginalLikelihood, problem_size
+from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData
+from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.training_data import check_distance
-from forcegp.fit.doubts import check_forces, refuse_what_looks_alike, warn_of_contacts
+from forcegp.fit.doubts import check_forces, refuse_what_has_no_answer, warn_of_contacts
 from forcegp.fit.joint import (
     CHANGE,
     MOST_ROUNDS,
@@ -45,14 +44,13 @@ from forcegp.fit.search import (
     Search,
     described_rows,
     learns_noise,
-    noise_of_windows,
     resolved_noise,
+    widened,
     with_variance_priors,
 )
-from forcegp.fit.widening import widened
 from forcegp.forces import UnknownForces
 from forcegp.forces.registry import described_force
-from forcegp.inference import Engine, Exact, OptimizationResult, OptimizerOptions, engine_of
+from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
@@ -84,44 +82,34 @@ def fit(
 ) -> Any:
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
-    Numbers of laws and bodies are found by Gauss-Newton steps, from all rows where there are no unknown functions, and
-    kernels and noise by marginal likelihood times the priors that they carry, which keeps few points calibrated; where
-    both are open, each kernel at its best numbers. Then functions are conditioned on the rows. The result is a
-    `Posterior`: `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
+    Numbers are found by Gauss-Newton steps, kernels and noise by marginal likelihood times their priors; where both are
+    open, each kernel at its best numbers. `posterior.parameters["viscous.joint_1"]`, `posterior.predict(q, v, u)`.
 
     Parameters
     ----------
     model: what is known, for example `dataset.model.with_forces(JointFriction())`. Laws without numbers are estimated.
     dataset: rows with the joints of the robot in its order; nothing in it is changed.
-    evidence: what is learned from: `Accelerations()`, `Torques()`, `Windows(seconds)` of raw signals, and beside one of
-        these `Motions(seconds)`, which refines what it found. None stands for accelerations where functions are
-        unknown, and else for torques, with noisy accelerations where the base moves.
+    evidence: `Accelerations()` or `Torques()`, and beside it `Motions(seconds)`, which refines what it found. None
+        stands for accelerations where functions are unknown, else for torques, with noisy accelerations where the base
+        moves.
     baseline: a second log, of the same robot without the payloads that are estimated.
-    points: learn functions from this many rows (or windows), those that lie farthest apart in (q, v, u); None: all.
-    rows: of models without unknown functions, use so many at most, evenly spread; None: 5,000, fewer beyond eight
-        degrees of freedom.
-    restarts: number of starts; the first uses moments of the data, the others multiply these by seeded random
-        factors, every other one from a smoother start; the best final value wins, and by default starts that fall
-        behind two earlier ones are dropped (`settings["restart_status"]`). None means 4 up to 400 points, where
-        local optima cost most and searches cost little, and 1 beyond, which then begins where searches on 250 and
-        500 of the rows ended.
-    seed: of the random factors; restart k uses (seed, k), so its result does not depend on how many there are.
-    jobs: restarts at once, in as many processes of this machine, or an executor in which they run, such as Dask's
-        `client.get_executor()`. Results do not depend on it.
-    options: the search itself; None is `fit.search.default_options`, which is content sooner beyond 400 points.
-    start: hyper-parameters at which the first search begins instead of moments, for example
-        `posterior.hyperparameters` of a fit to fewer points; those that are missing start from moments. With
-        `Motions` alone, the posterior to refine.
-    engine: how the posterior is computed from all points: "exact", "inducing", or one of
-        `forcegp.inference.ENGINES` with its settings; "auto" chooses by their number, the features and the free
-        memory, with the reason in `settings["engine_reason"]`.
-    learning_points: find the hyper-parameters on this many of the points, those that lie farthest apart; None means
-        all up to 1500 and 600 beyond. The posterior is that of all points.
-    progress: called as progress(restart, iteration, objective) where the restarts run in this process. The restart is
-        `ALL_ROWS` while all rows are taken in, and while numbers of laws and bodies are sought.
+    points: learn functions from this many rows, those that lie farthest apart in (q, v, u); None: all.
+    rows: of models without unknown functions, use so many at most, evenly spread; None: 5,000, fewer beyond 8 joints.
+    restarts: number of starts, the first from moments of the data; None: 4 up to 400 points, and 1 beyond. Starts that
+        fall behind two earlier ones are dropped (`settings["restart_status"]`).
+    seed: of the random starts; restart k uses (seed, k).
+    jobs: restarts at once, in as many processes, or a `concurrent.futures.Executor`. Results do not depend on it.
+    options: the search itself; None is `fit.search.default_options`.
+    start: hyper-parameters at which the first search begins, as `posterior.hyperparameters`; with `Motions` alone, the
+        posterior to refine.
+    engine: "exact", "inducing", one of `forcegp.inference.ENGINES` with its settings, or "auto", with the reason in
+        `settings["engine_reason"]`.
+    learning_points: find the hyper-parameters on this many of the points; None: all up to 1500, and 600 beyond.
+    progress: called as progress(restart, iteration, objective); the restart is `ALL_ROWS` while all rows are taken in,
+        and while numbers of laws and bodies are sought.
 
-    Where the model has a friction that is proportional to the normal force, and no `expected` friction is given,
-    the fit is repeated with the normal force under the friction that was found, until it settles.
+    Friction in proportion to the normal force, with no `expected` friction, is fitted again under the normal force that
+    was found, until it settles.
 
     Raises
     ------
@@ -130,7 +118,7 @@ def fit(
     ContactError: a contact cannot hold at some row, or no row touches its surface.
     FitError: no restart could be evaluated; the message names the cause.
     NotEnoughMemory: the engine, or the likelihood of the learning points, would need more than is free.
-    NumericalError: the engine failed, for example to reach its tolerance.
+    NumericalError: the engine failed.
     """
     require_type("model", model, Model, ", for example dataset.model")
     rest, refinement = _chosen(evidence, model, start)
@@ -138,7 +126,7 @@ def fit(
     logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
     if isinstance(start, Posterior):
         posterior: Any = start
-    elif isinstance(rest, Torques) or (model.is_open and not model.unknown_forces and isinstance(rest, Accelerations)):
+    elif isinstance(rest, Torques) or (model.is_open and not model.unknown_forces):
         if model.unknown_forces:
             raise InvalidInput(
                 "torques are evidence for numbers of laws and bodies; functions are learned from accelerations, with "
@@ -151,7 +139,7 @@ def fit(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
         search = Search(checked_jobs(jobs), restarts, seed, options, start, progress)
-        posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points, rest)
+        posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points)
     if refinement is None:
         return posterior
     report = None if progress is None else partial(progress, ALL_ROWS)
@@ -162,13 +150,13 @@ def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start:
     """The evidence to begin with, and the motions that refine what it found."""
     given = () if evidence is None else (evidence,) if isinstance(evidence, Evidence) else tuple(evidence)
     if not all(isinstance(each, Evidence) for each in given):
-        raise InvalidInput(f"evidence is {evidence!r}; give Accelerations(), Torques(), Windows(S) or Motions(S).")
+        raise InvalidInput(f"evidence is {evidence!r}; give Accelerations(), Torques() or Motions(S).")
     motions = [each for each in given if isinstance(each, Motions)]
     others = [each for each in given if not isinstance(each, Motions)]
     if len(motions) > 1 or len(others) > 1:
         raise InvalidInput(
-            f"evidence is {', '.join(map(str, given))}: the same rows twice; give one of accelerations, torques and "
-            "windows, and motions beside it if these shall refine it."
+            f"evidence is {', '.join(map(str, given))}: the same rows twice; give accelerations or torques, and "
+            "motions beside them if these shall refine it."
         )
     refinement = motions[0] if motions else None
     if isinstance(start, Posterior) and (refinement is None or others):
@@ -193,7 +181,7 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
     dataset = with_memory(dataset, model)
     _, first = np.unique(np.hstack([dataset.q, dataset.v, dataset.u, dataset.a]), axis=0, return_index=True)
     again = ~np.isin(np.arange(len(dataset)), first)
-    if isinstance(evidence, Windows) or refinement is not None or model.memory.names:
+    if refinement is not None or model.memory.names:
         for number in dataset.episodes:
             again[dataset.episode == number] &= again[dataset.episode == number].all()
     if not again.any():
@@ -214,7 +202,7 @@ def _of_numbers(
     report = None if progress is None else partial(progress, ALL_ROWS)
     if rows is not None:
         whole_number("rows", rows, 1)
-    refuse_what_looks_alike(model, logs[0])
+    refuse_what_has_no_answer(model, logs[0])
     found = fit_physical(model, logs, evidence, rows, report)
     trained = replace(found.model, noise=found.noise)
     training = TrainingData.of(found.rows, model.robot.device)
@@ -239,19 +227,15 @@ class _Functions:
     engine: Engine | str
     learning_points: int | None
 
-    def fitted(self, dataset: Dataset, points: int | None, evidence: Evidence) -> Posterior:
-        """From rows or windows."""
-        if isinstance(evidence, Windows):
-            return self._of_windows(dataset, points, evidence)
+    def fitted(self, dataset: Dataset, points: int | None) -> Posterior:
+        """In the air of the log, where that moves."""
         plain = unobserved(self.model)
         if len(plain.inputs) < len(self.model.inputs) and dataset.u.shape[1] == len(plain.inputs):
-            return replace(self, model=plain).fitted(dataset, points, evidence)
+            return replace(self, model=plain).fitted(dataset, points)
         if found := in_air(self.model, dataset):
             settings, seen = found
             assert seen.model is not None, "it was given one"
-            learned: Any = replace(self, model=seen.model).fitted(
-                replace(seen, model=seen.model.known), points, evidence
-            )
+            learned: Any = replace(self, model=seen.model).fitted(replace(seen, model=seen.model.known), points)
             return learned.with_model(unobserved(learned.model)).with_settings(**settings)
         return self._of_rows(dataset, points)
 
@@ -278,20 +262,6 @@ class _Functions:
         report = None if progress is None else partial(progress, ALL_ROWS)
         return on_all_rows(fitted, all_rows, chosen, described, report)
 
-    def _of_windows(self, dataset: Dataset, points: int | None, evidence: Windows) -> Posterior:
-        """From windows: hyper-parameters and the posterior from all of them."""
-        if not isinstance(engine_of(self.engine) or Exact(), Exact) or self.learning_points is not None:
-            raise InvalidInput(
-                "engine and learning_points are for rows with accelerations; windows are conditioned on exactly, and "
-                "all are learned from: leave both out, and give fewer points if it takes too long"
-            )
-        windows = evidence.windows(dataset, points)
-        own = replace(self, model=replace(self.model, noise=noise_of_windows(self.model.noise, windows)))
-        fitted = own._with_numbers(windows, dataset)
-        reason = f"exact: from {len(windows)} windows of {windows.weights.shape[1]} nodes"
-        described = {"observe": dict(windows.nodes.metadata["windows"]), "learning_points": len(windows)}
-        return widened(fitted).with_settings(**described, engine=Exact().to_dict(), engine_reason=reason)
-
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
         search = self.search
@@ -309,13 +279,12 @@ class _Functions:
                 start = closed._search(ordered.rows(slice(stage)), dataset).hyperparameters
         return start
 
-    def _with_numbers(self, rows: Dataset | WindowedRows, dataset: Dataset) -> Posterior:
+    def _with_numbers(self, rows: Dataset, dataset: Dataset) -> Posterior:
         """Searches for functions with numbers of laws and bodies free, where these are open."""
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
-        given = rows.nodes if isinstance(rows, WindowedRows) else rows
-        refuse_what_looks_alike(self.model, given)
-        typical = typical_sizes(self.model, [given])
+        refuse_what_has_no_answer(self.model, rows)
+        typical = typical_sizes(self.model, [rows])
         model = with_payloads_placed(self.model, [dataset], typical)
         space = ParameterSpace(model, typical)
         x = space.start
@@ -333,14 +302,12 @@ class _Functions:
         estimates = replace(estimates_beside(space, found, len(rows)), settled=change < CHANGE)
         return replace(posterior, estimates=estimates).with_settings(rounds=rounds)
 
-    def _beside_numbers(
-        self, rows: Dataset | WindowedRows, dataset: Dataset, space: ParameterSpace, x: np.ndarray
-    ) -> Posterior:
+    def _beside_numbers(self, rows: Dataset, dataset: Dataset, space: ParameterSpace, x: np.ndarray) -> Posterior:
         """One search with the numbers about x free."""
         here = replace(space.model_at(x), noise=self.model.noise)
         return replace(self, model=here)._search(rows, dataset, lambda given: with_free_numbers(given, space, x))
 
-    def _with_loads(self, rows: Dataset | WindowedRows, dataset: Dataset) -> Posterior:
+    def _with_loads(self, rows: Dataset, dataset: Dataset) -> Posterior:
         """One search, or more under the normal force that friction changes."""
         first = self._search(rows, dataset)
 
@@ -355,11 +322,11 @@ class _Functions:
 
     def _search(
         self,
-        rows: Dataset | WindowedRows,
+        rows: Dataset,
         dataset: Dataset,
         beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None,
     ) -> Posterior:
-        """One search on these rows or windows of the log with the model as it is, and the exact posterior there.
+        """One search on these rows of the log with the model as it is, and the exact posterior there.
 
         `beside` gives the likelihood in which numbers are free.
         """

@@ -1,17 +1,8 @@
 """Numbers of laws and bodies beside unknown functions: least squares on rows whose covariance contains the functions.
 
-With kernels and noise given, the rows y = m(x) + W f + e have the covariance S = R + W K W^T, and
-
-    1/2 r^T S^-1 r + 1/2 |prior(x)|^2,    r = y - m(x),    J = -dm/dx
-
-is least squares (generalised least squares; Rasmussen & Williams 2006, section 2.7). Whitened and deflated as in
-`forcegp.inference.likelihood`, r^T S^-1 r = |(1 - U U^T) y~|^2 + |L^-1 U^T y~|^2 with T = L L^T, so it costs one factor
-of T and a solution for each number. That the directions W change with x as well is left out of the derivative.
-
-Kernels are sought at the best numbers of every kernel (`FreeNumbers`; variable projection, Golub & Pereyra 1973), with
-the residual linear about the numbers of the last round. Sought in turn, functions learn at first what wrong numbers do,
-and are then known too well to give it back: the mass of a tool ended 6 cm away.
-Information about x does not depend on that about kernels: a mean and a covariance (Kay 1993, eq. 3.31).
+Generalised least squares (Rasmussen & Williams 2006, section 2.7), whitened and deflated. Kernels are sought at the
+best numbers of every kernel (variable projection, Golub & Pereyra 1973): sought in turn, functions learn at first what
+wrong numbers do, and are then known too well to give it back.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +21,6 @@ from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.inference import LatentKernels, Terms
 from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.likelihood import deflated_covariance, whiten
-from forcegp.inference.linear_functionals import Functionals
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import Estimates
 
@@ -45,30 +35,20 @@ class Whitening:
     """What columns of residuals are over their covariance, functions included."""
 
     terms: Terms
-    weights: Float[Tensor, "N n"] | None
-    U: Float[Tensor, "N D r"] | None
+    U: Float[Tensor, "N D r"]
     factor: CholeskyFactor | None
 
     @classmethod
-    def of(
-        cls, terms: Terms, weights: Float[Tensor, "N n"] | None, matrices: Sequence[Float[Tensor, "N N"]]
-    ) -> "Whitening":
-        """That of rows, or of windows with these weights. Raises NumericalError without a factorisation."""
-        if weights is not None:
-            S = Functionals.of(weights, terms).covariance(matrices)
-            return cls(terms, weights, None, factorize(lambda: 0.5 * (S + S.mT)))
+    def of(cls, terms: Terms, matrices: Sequence[Float[Tensor, "N N"]]) -> "Whitening":
+        """That of rows. Raises NumericalError without a factorisation."""
         found = terms.deflated()
         factor = factorize(lambda: deflated_covariance(found.C, matrices)) if found.rank else None
-        return cls(terms, None, found.U, factor)
+        return cls(terms, found.U, factor)
 
     def __call__(self, values: Float[Tensor, "rows D k"]) -> Float[Tensor, "n k"]:
         """Of every state."""
-        if self.weights is not None:
-            assert self.factor is not None, "windows have one"
-            columns = Functionals.of(self.weights, self.terms._replace(W=values)).G.sum(2)
-            return self.factor.solve_lower(columns.flatten(0, 1))
         columns, *_ = whiten(values, self.terms.residual, self.terms.noise)
-        if self.U is None or self.factor is None:
+        if self.factor is None:
             return columns.flatten(0, 1)
         along = self.U.mT @ columns
         across = (columns - self.U @ along).flatten(0, 1)
@@ -82,7 +62,7 @@ class Slopes:
         self.space = space
         q, v, u = (x.cpu().numpy() for x in (training.q, training.v, training.u))
         self.rows = RecordedRows(space, q, v, u, any_contact=True)
-        self.a = training.a.cpu().numpy()  # of windows, their mean, which weights of sum 1 leave as it is
+        self.a = training.a.cpu().numpy()
         self.device = training.a.device
 
     def at(self, x: Float[np.ndarray, " k"]) -> Float[Tensor, "rows nv columns"]:
@@ -96,8 +76,8 @@ class Slopes:
 class FreeNumbers:
     """The marginal likelihood at the best numbers, in nats: a function of kernels and noise alone.
 
-    `slopes` (rows, nv, k) are derivatives of the residual about the numbers of the model; `prior` is the distance from
-    the prior there, and its Jacobian. Derivatives in kernels are those at numbers that stay (envelope theorem).
+    `slopes` (rows, nv, k) of the residual about the numbers of the model; `prior`: the distance there, and its
+    Jacobian.
     """
 
     likelihood: MarginalLikelihood
@@ -114,7 +94,7 @@ class FreeNumbers:
         terms, matrices = self.likelihood.checked_terms(kernels, parameters)
         distance, jacobian = self.prior
         with torch.no_grad():
-            white = Whitening.of(terms, self.training.weights, matrices)
+            white = Whitening.of(terms, matrices)
             of_data = white(torch.cat([terms.residual[..., None], self.slopes], -1))
             columns = torch.cat([of_data, torch.cat([distance[:, None], jacobian], -1)])
             step = torch.linalg.lstsq(columns[:, 1:], -columns[:, :1]).solution[:, 0]
@@ -137,7 +117,7 @@ def numbers_beside(
     with torch.no_grad():
         terms = likelihood.terms(posterior.hyperparameters)
         matrices = posterior.kernels.matrices(posterior.hyperparameters, terms.features)
-        white = Whitening.of(terms, posterior.training.weights, matrices)
+        white = Whitening.of(terms, matrices)
 
         def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             columns = white(slopes.at(x)).cpu().numpy()  # one equation in a row

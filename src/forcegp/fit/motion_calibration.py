@@ -11,7 +11,7 @@ import torch
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
-from forcegp.evidence.training_data import TrainingData
+from forcegp.evidence.likelihood import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import DEVIATIONS, HORIZONS, MotionIntervals
@@ -33,17 +33,13 @@ def calibrated(
     integrator: str = "rk4",
     report: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """The same model with intervals of motions that hold: of stretches of the training time, left out in turn.
+    """The same model with intervals of motions that hold: of four stretches of the training time, left out in turn.
 
-    For each of four stretches the model is made again from the other rows at the same hyper-parameters (refined on
-    their motions if it was), and predicts motions in the stretch. `rollout(...).interval()` then uses the widths.
-    Of a model that observes wind, those are of what `observing` gives for this model and a recording.
+    Each is predicted by the model made again from the other rows at the same hyper-parameters.
+    `rollout(...).interval()` uses the widths.
 
-    Parameters
-    ----------
     dataset: the recording that the model learned from, in equal steps of time.
-    horizons: lengths of the motions in s, at which widths are found.
-    integrator: of these motions, as for `rollout`.
+    horizons: lengths of the motions in s, at which widths are found; integrator: of these motions.
     report: called as report(stretch, stretches).
 
     Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.

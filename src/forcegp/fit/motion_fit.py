@@ -1,22 +1,9 @@
-"""What moves is what is fitted: known forces, inertias and latent functions refined on recorded positions.
-
-Accelerations of a log are filtered and differentiated; their errors resemble each other over the filter's memory and
-integrate into motions. Here the recording is cut into windows k of some tenths of a second to some seconds, and
+"""What moves is what is fitted: laws, inertias and latent functions refined on recorded positions.
 
     1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |w|^2 + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2
 
-is minimised over the windows' initial states x_k, joint friction and inertias p, and the weights w of the latent
-functions f_c = phi_c . w_c, which are standard normal a priori (`inference.inducing.WeightSpace`): the Gaussian process
-is the regulariser. sigma_j is what motions leave unexplained, tau_j how many rows of a window one independent residual
-is worth (`evidence.least_squares.correlation_time`): without it a window at 1 kHz would count as a thousand facts.
-
-Gauss-Newton with Levenberg's damping; initial states are eliminated window by window (Schur complement); motions and
-their derivatives come from the implicit midpoint rule (`integration.midpoint_sensitivities`), with
-
-    da/dp = -H (Y dpi/dp + d(tau)/dp),    da/dw_c = H b_c phi_c(z_c)^T
-
-of the torque regressor Y, joint terms tau and mixing b_c. The covariance of w is the inverse of the Gauss-Newton
-curvature, with all other unknowns marginalised (Laplace).
+over initial states x_k of windows, numbers p and weights w of the functions; tau_j is how many rows one independent
+residual is worth. Gauss-Newton; initial states are eliminated window by window; the covariance is Laplace's.
 """
 
 import math
@@ -158,8 +145,7 @@ class MotionFit:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gauss-Newton's matrix and right side for x, and (G, g) with the change of states g - G dx, (K, 2 nv, ...).
 
-        Diagonals are 1 + `damping` times as large, those of states as well: near a reversal of dry friction a motion
-        hangs on its start.
+        Diagonals are 1 + `damping` times as large, those of states as well.
         """
         r, A, B = self.whitened(here, noise)
         weight = self.spread(sigma) ** -2
@@ -271,10 +257,9 @@ def refine_on_motions(
 ) -> Posterior:
     """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
 
-    Numbers that the laws of a model that is `stated` know by a standard deviation of 0 stay.
-    `report(step, rms of q in rad or m)` is called after each step. Where a base moves, errors of positions are steps in
-    its axes. Observed wind counts as known. Raises InvalidInput for models without physics, windows that no episode has
-    room for and uneven steps, NumericalError where no motion is found near the recorded one.
+    Numbers that the laws of `stated` know by a standard deviation of 0 stay. `report(step, rms of q)` after each step.
+    Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
+    NumericalError where no motion is found near the recorded one.
     """
     require_unobserved(posterior, "refinements on motions")
     if posterior.carries_known_forces:

@@ -100,9 +100,8 @@ class Unknowns:
     def rescaled(self, x: Tensor, N: Tensor) -> "Unknowns":
         """With the scales that make these weights likely, given the curvature N of the objective at them.
 
-        s^2 = |w|^2 / gamma with gamma the number of weights that the data determine (MacKay, "Bayesian interpolation",
-        Neural Computation 1992, section 4.4). Steps down are twice as long on the log scale: where the motions do
-        not tell a function, s falls to nothing by the same factor each time.
+        s^2 = |w|^2 / gamma (MacKay, "Bayesian interpolation", 1992, section 4.4); steps down are twice as long on the
+        log scale.
         """
         spread, weights = torch.linalg.inv(N).diagonal()[self.sizes[0] :], self.split(x)[1]
         scales = self.scales.clone()
@@ -113,11 +112,7 @@ class Unknowns:
         return replace(self, scales=scales)
 
     def support(self, x: Tensor, N: Tensor) -> Float[Tensor, " C"]:
-        """Log evidence of each latent over none in its place, in nats, given the curvature N of the objective at x.
-
-        With N that of its weights w, all else marginalised, and s its scale: 1/2 w^T N w - 1/2 log|s^2 N|
-        (Laplace; MacKay 1992, section 2.3).
-        """
+        """Log evidence of each latent over none [nats]: 1/2 w^T N w - 1/2 log|s^2 N| (Laplace; MacKay 1992)."""
         covariance, weights = torch.linalg.inv(N), self.split(x)[1]
         first, out = self.sizes[0], []
         for c, part in enumerate(self.weights.slices):

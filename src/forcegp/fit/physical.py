@@ -1,8 +1,4 @@
-"""The numbers of laws and bodies from all rows of a log: weighted least squares, or maximum likelihood.
-
-Torque is linear in the parameters of bodies and in most coefficients, so a few Gauss-Newton steps find them
-(`forcegp.evidence.least_squares`). What is minimised is chosen by the evidence: `Torques`, `Accelerations`.
-"""
+"""The numbers of laws and bodies from all rows of a log: Gauss-Newton steps of weighted least squares."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,17 +13,139 @@ from forcegp.data import Dataset, evenly
 from forcegp.doubts import Doubt, Doubts
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
-from forcegp.evidence.bodies import thickened
-from forcegp.evidence.identifiability import BaseParameters, parameter_names
-from forcegp.evidence.least_squares import LEAST, Fit, NoiseLevels, weighted_least_squares, without
+from forcegp.evidence.bodies import BaseParameters, parameter_names, thickened
+from forcegp.evidence.least_squares import (
+    LEAST,
+    Chained,
+    Fit,
+    Jacobian,
+    NoiseLevels,
+    Regressor,
+    weighted_least_squares,
+    without,
+)
 from forcegp.evidence.parameter_space import ParameterSpace
+from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
 from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
-from forcegp.fit.equations import Equations, most_likely, possible_links
+from forcegp.fit.payload_link import most_likely, possible_links
 from forcegp.forces import Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior.fitted import STRETCHES, Estimates
 from forcegp.robots import Robot
+
+
+class Equations:
+    """Rows of one log or several as one array each, and the equations that they give at x."""
+
+    def __init__(self, space: ParameterSpace, logs: Sequence[Dataset], evidence: Torques | Accelerations) -> None:
+        self.space, self.evidence, self.logs = space, evidence, logs
+        self.parts = [RecordedRows(space, log.q, log.v, log.u, loaded=not k) for k, log in enumerate(logs)]
+        self.a = np.concatenate([log.a for log in logs])
+        self.ends = np.cumsum([len(log) for log in logs])[:-1]
+        self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
+        self.held = _stacked([part.held for part in self.parts])
+        seconds = evidence.mean if isinstance(evidence, Torques) else None
+        self.windows = None if seconds is None else WindowMeans(logs, seconds)
+        self._stays: tuple[np.ndarray, ...] = ()
+        """Regressors of the last search, which no coordinate changes."""
+
+    def each(self, values: np.ndarray) -> list[np.ndarray]:
+        """Rows by log."""
+        return np.split(values, self.ends)
+
+    def joined(self, parts: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
+        """Arrays of all logs."""
+        return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+
+    def equations(self, x: np.ndarray, parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, Jacobian]:
+        """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
+        r, Y, in_terms = zip(*parts, strict=True)
+        if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
+            flat = np.concatenate(Y).reshape(*self.a.shape, 10 * len(self.space.carried))
+            self._stays, self._regressor = Y, Regressor(flat)
+        slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
+        return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
+
+    def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
+        """Torques needed less those measured."""
+        found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
+        r, jacobian = self.equations(x, found)
+        if self.windows is None:
+            return r, jacobian
+        free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
+        return self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
+
+    def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Accelerations measured less those predicted."""
+        found = [part.in_acceleration(x, a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
+        r, jacobian = self.equations(x, found)
+        return r, np.asarray(jacobian)
+
+    def whitened(self, x: np.ndarray, likely: Sequence[LikelyAccelerations]) -> tuple[np.ndarray, Jacobian]:
+        """Torques needed less those measured, over the noise of both."""
+        found = []
+        for part, each in zip(self.parts, likely, strict=True):
+            r, Y, in_terms, _ = part.in_torque(x, each.motion)
+            Y = each.white_regressor if Y is each.motion.regressor else each.white(Y)
+            found.append(((each.whitening @ (r + each.offset)[..., None])[..., 0], Y, each.whitening @ in_terms))
+        r, jacobian = self.equations(x, found)
+        if self.windows is None:
+            return r, jacobian
+        return self.windows.mean(r), self.windows.mean(np.asarray(jacobian))
+
+    def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
+        """Predicted accelerations, M and H."""
+        return self.joined([part.acceleration(x) for part in self.parts])
+
+    def levels(self, x: np.ndarray, near: NoiseLevels | None, least: NoiseLevels | None, rough: bool) -> NoiseLevels:
+        """The noise about the estimates at x, sought `near` others and above `least`."""
+        if rough:
+            noise = self.parts[0].rough_noise(x, self.each(self.a)[0])
+        else:
+            predicted, M, H = self.accelerations(x)
+            noise = NoiseLevels.of(self.a - predicted, M, H, near)
+        if least is None:
+            return noise
+        return NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
+
+    def stretches(self) -> list[np.ndarray]:
+        """Numbers of equations by stretch of time, some of each log in every one."""
+        lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
+        nv, starts = self.a.shape[1], np.concatenate([[0], np.cumsum(lengths)])
+        numbers = []
+        for log, start, length in zip(self.logs, starts, lengths, strict=False):
+            order = np.arange(length)
+            if self.windows is None:
+                order = np.lexsort((log.time, log.episode))
+            numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))
+        rows = [np.concatenate(each) for each in zip(*numbers, strict=True)]
+        return [(nv * each[:, None] + np.arange(nv)).ravel() for each in rows if len(each)]
+
+
+class WindowMeans:
+    """Means over windows of time, times the root of their rows, so that white noise keeps its size."""
+
+    def __init__(self, logs: Sequence[Dataset], seconds: float) -> None:
+        number = np.concatenate([np.full(len(log), k) for k, log in enumerate(logs)])
+        episode, time = (np.concatenate([getattr(log, name) for log in logs]) for name in ("episode", "time"))
+        keys = np.stack([number, episode, np.floor(time / seconds)])
+        self.starts = np.flatnonzero(np.r_[True, (np.diff(keys) != 0).any(axis=0)])
+        self.roots = np.sqrt(np.diff(np.r_[self.starts, len(time)]))
+        self.lengths = np.bincount(number[self.starts]).tolist()
+        """Windows of every log."""
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """(rows, ...) as (windows, ...)."""
+        sums = np.add.reduceat(values, self.starts, axis=0)
+        return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _stacked(held: Sequence[np.ndarray]) -> np.ndarray:
+    """Directions of contact forces of all logs, as many in every row: zeros where a log has fewer."""
+    most = max(each.shape[1] for each in held)
+    return np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
+
 
 ROWS = 5_000
 """Rows that are used at most, evenly spread: more of a filtered recording add little."""
@@ -88,30 +206,26 @@ def fit_physical(
         if progress is not None:
             progress(done, rms)
 
-    robust = evidence.robust
     options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved}
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
-    noise, start = None, space.start
+    noise, x = None, space.start
     if evidence.noisy_in_both:
-        # levels of noise about a poor start would hide outliers
-        first = partial(equations.in_torque, motions=equations.measured)
-        begin = search(first, start=start, robust=True, held=held, progress=note).x if robust else start
-        fit, noise = _with_noise_in_both(equations, search, begin, robust, note)
+        fit, noise = _with_noise_in_both(equations, search, x, note)
     elif evidence.of_torque:
         torque = partial(equations.in_torque, motions=equations.measured)
-        fit = search(torque, start=start, robust=robust, held=held, progress=note)
+        fit = search(torque, start=x, held=held, progress=note)
     else:
-        fit = search(equations.in_acceleration, start=start, robust=robust, progress=note)
+        fit = search(equations.in_acceleration, start=x, progress=note)
         for _ in range(REWEIGHTINGS):
             predicted, M, H = equations.accelerations(fit.x)
-            noise = NoiseLevels.of(equations.a - predicted, M, H, robust=robust)
+            noise = NoiseLevels.of(equations.a - predicted, M, H)
             W = noise.whitening(H)
 
             def white(x: np.ndarray, W: np.ndarray = W) -> tuple[np.ndarray, np.ndarray]:
                 r, jacobian = equations.in_acceleration(x)
                 return (W @ r[..., None])[..., 0], W @ jacobian
 
-            fit = search(white, start=fit.x, robust=robust, progress=note)
+            fit = search(white, start=fit.x, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
     doubts = list(_doubts_of_payloads(space, fit, equations.windows is not None))
@@ -127,16 +241,15 @@ def fit_physical(
 
 
 def _with_noise_in_both(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, robust: bool, note: Progress
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Progress
 ) -> tuple[Fit, NoiseLevels]:
     """Searches about likely accelerations, whose levels of noise are found along."""
-    noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, not robust
+    noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, True
     while True:
         number += 1
-        levels = equations.levels(x, noise, least, robust, rough)
+        levels = equations.levels(x, noise, least, rough)
         likely = [
-            part.likely(x, motion, levels, robust)
-            for part, motion in zip(equations.parts, equations.measured, strict=True)
+            part.likely(x, motion, levels) for part, motion in zip(equations.parts, equations.measured, strict=True)
         ]
         if not rough:
             noise, least = levels, levels.scaled(LEAST) if least is None else least
@@ -156,8 +269,7 @@ def _estimates(
     space: ParameterSpace, fit: Fit, equations: Equations, evidence: Torques | Accelerations, thick: tuple[str, ...]
 ) -> Estimates:
     """The numbers at the end of the search."""
-    scaled = without(fit.jacobian / fit.noise[:, None], fit.span) * np.sqrt(fit.weight)[..., None]
-    white = np.concatenate([scaled, (np.sqrt(fit.weight) * fit.white)[..., None]], axis=-1)
+    white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
     prior = space.prior(fit.x)[1]
     base, by_body = None, None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
@@ -200,9 +312,7 @@ def rows_at_most(robot: Robot) -> int:
 def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.ndarray, " nv"]]:
     """Sizes of forces, positions, velocities and inertias of each joint in these rows, to which coordinates relate.
 
-    Forces are those measured or those of inverse dynamics, whichever are larger: light joints may have friction alone,
-    passive ones are not driven. Inertia is at least what these forces accelerate: the rotor of a wrist has a thousand
-    times that of its link.
+    Forces are the larger of those measured and of inverse dynamics, inertia at least what they accelerate: rotors.
     """
     q, v, u, a = (np.concatenate([getattr(log, x) for log in logs]) for x in "qvua")
     at_q, at_v, at_u = (torch.as_tensor(x, device=model.robot.device) for x in (q, v, u))
@@ -303,12 +413,9 @@ STRETCHES_LEFT_OUT = 4
 def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerations) -> Noise:
     """Noise of accelerations and forces about models identified without the rows in question.
 
-    Residuals of the rows that parameters were fitted to are too small for others: those of a filtered log resemble
-    their neighbours. So every stretch is predicted by a model identified from the rest (block cross-validation;
-    Burman, Chow & Nolan 1994), and the levels of noise are those of all these residuals. Each search begins anew: from
-    the fit to all rows it takes up to a third less time, but stops near that fit, whose rows it has not to have seen,
-    and levels differ by up to some percent. Rows are left out by episodes, where there are three or more, else by
-    `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for too few rows.
+    Residuals of the rows that parameters were fitted to are too small for others, so every stretch is predicted by a
+    model identified from the rest (block cross-validation; Burman, Chow & Nolan 1994): episodes, where there are three
+    or more, else `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for too few rows.
     """
     require_type("model", model, Model)
     residuals, masses, mobilities = [], [], []

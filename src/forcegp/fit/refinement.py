@@ -1,9 +1,4 @@
-"""Fitting again: on all rows from what some rows gave, and with the normal force that a fit has found.
-
-docs/how-to/large-data.md describes the first. Solved for the second, Q_U would no longer be affine in the latent
-functions, and inference no longer exact (`python -m benchmarks.force_pictures contact-friction` draws the curve with
-and without).
-"""
+"""Fitting again: on all rows from what some rows gave, and with the normal force that a fit has found."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -16,8 +11,7 @@ import torch
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.preparation import memory
 from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
-from forcegp.evidence.likelihood import MarginalLikelihood
-from forcegp.evidence.training_data import TrainingData, check_distance
+from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData, check_distance
 from forcegp.fit.search import FitObjective
 from forcegp.forces import UnknownForces
 from forcegp.forces.contact_friction import JAMMING, TabulatedCurve, refined_loads
@@ -33,7 +27,6 @@ from forcegp.inference import (
     minimize_objective,
 )
 from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
-from forcegp.inference.linear_functionals import require_memory_for_functionals
 from forcegp.inference.memory import blas_threads, require_memory
 from forcegp.noise import ACCELERATION
 from forcegp.posterior import Posterior
@@ -48,10 +41,9 @@ Iteration = Callable[[int, float], None]
 
 
 def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
-    """The rows that hyper-parameters are found on: all, or those that lie farthest apart.
+    """The rows that hyper-parameters are found on: all up to 1500, else 600 (or so many) that lie farthest apart.
 
-    `ordered`: the rows come in that order already. None means all rows up to 1500, and 600 beyond.
-    Raises InvalidInput for a number out of range.
+    `ordered`: the rows come in that order already. Raises InvalidInput for a number out of range.
     """
     count = len(rows)
     if learning_points is None:
@@ -64,11 +56,9 @@ def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) 
 
 
 def independent_rows(rows: Dataset) -> Dataset:
-    """Those that lie further apart in time than a filter makes them alike; of two, the one that comes first.
+    """Those that lie further apart in time than a filter makes them alike, for learned noise is taken for independent.
 
-    Noise that is learned is taken for independent. Where rows of a filtered log lie close together, errors that change
-    slowly would look like forces, and the noise like none. Warns where many rows are left out, and where so few are
-    left that all stay.
+    Warns where many rows are left out, and where so few are left that all stay.
     """
     seconds = memory(rows.metadata) * (1.0 - 1e-9)
     if seconds == 0.0:
@@ -93,12 +83,7 @@ def independent_rows(rows: Dataset) -> Dataset:
 
 
 def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
-    """Raise NotEnoughMemory where the exact likelihood of these rows or windows does not fit into memory."""
-    weights = likelihood.training.weights
-    if weights is not None:
-        robot = likelihood.model.robot
-        require_memory_for_functionals(weights, robot.nv, len(likelihood.model.unknown.latent_names(robot)))
-        return
+    """Raise NotEnoughMemory where the exact likelihood of these rows does not fit into memory."""
     with torch.no_grad():
         size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
     remedy = "find hyper-parameters on fewer rows: `learning_points=600`, or give fewer points"
@@ -152,8 +137,7 @@ TOLERANCE = 1e-6
 def refined(posterior: Posterior, report: Callable[[int, float], None] | None = None) -> Posterior:
     """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
 
-    Where physical parameters were learned they and all others stay, for their standard errors belong together. Warns
-    where inducing points leave out so much that the posterior is an approximation.
+    Warns where inducing points leave out so much that the posterior is an approximation.
     """
     engine, latent = posterior.engine, posterior.latent
     if not isinstance(latent, InducingPosterior):
@@ -207,15 +191,11 @@ def fit_with_refined_loads(
     again: Callable[[UnknownForces, Posterior], Posterior],
     rounds: int = ROUNDS,
 ) -> Posterior:
-    """`first` itself, or the last of the fits that follow it with the normal forces of the one before.
+    """`first`, or the last of the fits that follow it under the normal forces of the one before, or the most likely.
 
-    Where an earlier one is more likely by more than `NOTICEABLE`, or the loads have not settled, the most likely one.
-
-    Every round is an exact fit of a legitimate prior: friction proportional to a given function of the state. What
-    changes from round to round is that function, towards the normal force under the friction that was found.
-    `again(prior, posterior)` fits with another prior, beginning from the parameters of a posterior. Warns
-    (NumericalWarning) where the normal forces have not settled after `rounds` fits, and where friction as the last one
-    expects it nearly jams a contact.
+    Every round is an exact fit of a prior: friction in proportion to a given function of the state. `again(prior,
+    posterior)` fits with another one, from the parameters of a posterior. Warns (NumericalWarning) where the normal
+    forces have not settled after `rounds` fits, and where friction as the last one expects it nearly jams a contact.
     """
     given = first.trained.unknown  # whose terms hold the expectations of the user
     best = last = first

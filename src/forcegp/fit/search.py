@@ -1,8 +1,9 @@
-"""The search of every fit: what it is given, what it lowers, and several seeded starts, of which the best is kept."""
+"""The search of every fit: several seeded starts, the best is kept; and how much wider intervals have to be."""
 
 import math
+import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -15,13 +16,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
-from forcegp.errors import DataWarning, FitError, InvalidInput, require_type, usable_arguments
-from forcegp.evidence.evidence import WindowedRows
-from forcegp.forces.basic_kernels import register_log_normal_prior
-from forcegp.inference import LatentKernels, OptimizationResult, OptimizerOptions, best_of, minimize_objective
+from forcegp.errors import DataWarning, FitError, InvalidInput, NumericalError, require_type, usable_arguments
+from forcegp.forces.kernels import register_log_normal_prior
+from forcegp.inference import (
+    LatentKernels,
+    LatentPosterior,
+    OptimizationResult,
+    OptimizerOptions,
+    best_of,
+    minimize_objective,
+)
 from forcegp.inference.memory import blas_threads
+from forcegp.inference.posterior import ExactPosterior
 from forcegp.noise import Noise
 from forcegp.parallel import Jobs, mapped
+from forcegp.posterior import Posterior
+from forcegp.posterior.fitted import DEVIATIONS
 from forcegp.robots.arguments import whole_number
 
 MOST_RESTARTS = 10_000
@@ -35,31 +45,14 @@ QUIET = 1e-3
 """Spread of a joint that hardly moves, as a fraction of the largest."""
 
 
-def noise_of_windows(noise: Noise | None, windows: WindowedRows) -> Noise | None:
-    """The noise given; for None, learned from where the sensors put it.
-
-    That of the sensors is the least that windows can have: states at nodes are not exact either. Raises InvalidInput
-    for a torque sensor whose noise predictions shall count: windows give the noise of a mean torque.
-    """
-    if noise is not None and noise.measured_torque:
-        raise InvalidInput(
-            "Noise(measured_torque=True) needs the noise of single torques, but windows give that of "
-            "their mean; leave measured_torque out, or fit to accelerations"
-        )
-    if noise is not None or windows.noise_level is None:
-        return noise
-    return Noise(tuple(float(std) for std in windows.noise_level), learn=True)
-
-
-def resolved_noise(noise: Noise | None, rows: Dataset | WindowedRows) -> Noise:
+def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
     """The noise given, else the level that the training rows state, else one that is learned, with a warning.
 
-    It is then learned from `START_SHARE` of the spread of every joint's acceleration; with `Noise(None, learn=True)`
-    nothing is warned of.
+    With `Noise(None, learn=True)` nothing is warned of.
     """
     if noise is not None and noise.acceleration is not None:
         return noise
-    level = rows.noise_level
+    level = rows.noise_std
     noise = noise or Noise()
     if level is not None:
         return replace(noise, acceleration=tuple(float(std) for std in level))
@@ -70,7 +63,7 @@ def resolved_noise(noise: Noise | None, rows: Dataset | WindowedRows) -> Noise:
             DataWarning,
             stacklevel=2,
         )
-    spread = (rows.observed if isinstance(rows, WindowedRows) else rows.a).std(axis=0)
+    spread = rows.a.std(axis=0)
     largest = float(spread.max())
     if not largest > 0.0:
         raise InvalidInput("the acceleration of every joint is constant, so its noise cannot be learned; give `noise`")
@@ -81,14 +74,8 @@ def resolved_noise(noise: Noise | None, rows: Dataset | WindowedRows) -> Noise:
 def learns_noise(noise: Noise | None, rows: Dataset) -> bool:
     """Whether `resolved_noise` is one that is learned."""
     if noise is None or noise.acceleration is None:
-        return rows.noise_level is None or (noise is not None and noise.learn)
+        return rows.noise_std is None or (noise is not None and noise.learn)
     return noise.learn
-
-
-def check_search_numbers(restarts: int, seed: int) -> None:
-    """Raises InvalidInput for numbers that are out of range."""
-    whole_number("restarts", restarts, 1, MOST_RESTARTS, "the most that one search runs")
-    whole_number("seed", seed, 0)
 
 
 @usable_arguments("start")
@@ -110,7 +97,7 @@ def first_start(
     return first
 
 
-def described_rows(rows: Dataset | WindowedRows, dataset: Dataset) -> dict[str, Any]:
+def described_rows(rows: Dataset, dataset: Dataset) -> dict[str, Any]:
     """What the settings of a fit hold about its training rows and where they come from, as plain JSON values."""
     return {
         "points": len(rows),
@@ -158,15 +145,17 @@ def default_restarts(points: int) -> int:
     return 4 if points <= MOST_POINTS_FOR_RESTARTS else 1
 
 
-def perturbed(start: Mapping[str, Tensor], seed: int, index: int) -> dict[str, Tensor]:
-    """Kernel parameters shifted by seeded normal numbers on their log scale; noise and physical parameters keep theirs.
+def started(moments: Mapping[str, Tensor], first: Mapping[str, Tensor], seed: int, index: int) -> Mapping[str, Tensor]:
+    """`first`; of later starts the moments, with kernels shifted by seeded normal numbers on their log scale.
 
     Odd restarts begin near a linear function, at a multiple of the length scales and its square of the variance.
     """
+    if not index:
+        return first
     generator = np.random.default_rng((seed, index))
     shifts = {"lengthscale": math.log(SMOOTHER), "outputscale": 2.0 * math.log(SMOOTHER)} if index % 2 else {}
     shifted = {}
-    for name, value in start.items():
+    for name, value in moments.items():
         if not name.startswith("kernels."):  # as in `LatentKernels.initial_parameters`
             shifted[name] = value
             continue
@@ -181,8 +170,7 @@ def run_restarts(
 ) -> Sequence[Outcome]:
     """`search(index, before=outcomes, progress=progress)` from 0 on, so many at once, on which outcomes do not depend.
 
-    Those before are given with `patience` only, and then `AT_ONCE` run at once. Only this process can report progress.
-    A single search needs no other process of this machine.
+    Those before are given with `patience` only, and then `AT_ONCE` run at once.
     """
     outcomes: list[Outcome] = []
     while len(outcomes) < restarts:
@@ -210,10 +198,9 @@ Starts = Callable[[int], Mapping[str, Tensor]]
 
 @dataclass(frozen=True, eq=False)
 class FitObjective:
-    """The objective as a function of the free hyper-parameters alone; a class so that processes can receive it.
+    """The objective of the free hyper-parameters, with their priors; a class so that processes can receive it.
 
-    Kernels (see also `with_variance_priors`) and learned noise have their priors. With inducing
-    `points` the bound through them stands for the likelihood.
+    With inducing `points` the bound through them stands for the likelihood.
     """
 
     likelihood: Any  # a MarginalLikelihood, or one of another model: (kernels, parameters) -> nats, with its `training`
@@ -237,12 +224,10 @@ class FitObjective:
 
 
 def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
-    """A copy of which every output scale (variance) carries the prior log variance ~ N(log of its present value, 2^2).
+    """A copy of which every output scale carries the prior log variance ~ N(log of its present value, 2^2).
 
-    For fits that learn physical parameters, whose present values come from moments of the residual. The likelihood is
-    flat below the noise: there a variance can run off to zero, the curvature takes the force for known to be zero, and
-    standard errors of what competes with it are too small. Shared kernels count once; priors that a kernel brought
-    along stay.
+    The likelihood is flat below the noise: a variance could run off to zero, and standard errors beside it be too
+    small.
     """
     out = deepcopy(kernels)
     for module in out.modules():
@@ -267,7 +252,9 @@ class Search:
 
     @usable_arguments("fit")
     def __post_init__(self) -> None:
-        check_search_numbers(1 if self.restarts is None else self.restarts, self.seed)
+        restarts = 1 if self.restarts is None else self.restarts
+        whole_number("restarts", restarts, 1, MOST_RESTARTS, "the most that one search runs")
+        whole_number("seed", self.seed, 0)
         if self.options is not None:
             require_type("options", self.options, OptimizerOptions)
 
@@ -278,15 +265,10 @@ class Search:
 
     def starts(self, moments: Mapping[str, Tensor], fixed: Mapping[str, Tensor]) -> Starts:
         """Start `index`: 0 is the moments, with what `start` gives in their place, others lie around the moments."""
-        return partial(_start, moments, first_start(moments, self.start or {}, fixed), self.seed)
+        return partial(started, moments, first_start(moments, self.start or {}, fixed), self.seed)
 
-    def best(
-        self, objective: FitObjective, starts: Starts, what: str = ""
-    ) -> tuple[OptimizationResult, dict[str, Any]]:
-        """The best of all starts with the work of all, and the settings of the search as plain JSON values.
-
-        Raises FitError where none could be evaluated; `what` follows "evaluated" in its message.
-        """
+    def best(self, objective: FitObjective, starts: Starts) -> tuple[OptimizationResult, dict[str, Any]]:
+        """The best of all starts with the work of all, and its settings. Raises FitError where none could begin."""
         restarts, options = self.resolved(len(objective.likelihood.training))
         one = partial(_one_start, objective, starts, options)
         with blas_threads(objective.likelihood.training.q.numel()):
@@ -294,7 +276,7 @@ class Search:
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
-            raise FitError(f"none of {restarts} restarts could be evaluated{what} ({causes})")
+            raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
         best = replace(
             best_of(usable),
             evaluations=sum(search.evaluations for search in usable),
@@ -311,10 +293,6 @@ class Search:
         return best, settings
 
 
-def _start(moments: Mapping[str, Tensor], first: Mapping[str, Tensor], seed: int, index: int) -> Mapping[str, Tensor]:
-    return perturbed(moments, seed, index) if index else first
-
-
 def _one_start(
     objective: FitObjective,
     starts: Starts,
@@ -329,3 +307,107 @@ def _one_start(
         return minimize_objective(objective, starts(index), options, note, best_value(before))
     except FitError as error:
         return error
+
+
+CONTENT, CONFIDENCE = 0.9, 0.995
+"""Share of the states that lie inside their 95 % intervals, in this share of the functions that the data leave open."""
+
+STATES = 24
+"""Training states at which functions and variances are compared."""
+
+DRAWS = 2000
+
+LARGEST_STEP = 2.0
+"""Most that a parameter is moved by, on its log scale: the spread of the widest prior on one."""
+
+NEGLIGIBLE = 1e-6
+"""Standard deviation, as a fraction of the largest, below which a constraint leaves nothing open."""
+
+
+def widened(posterior: Posterior) -> Posterior:
+    """The posterior with its `widening`, at least 1; without latents, itself."""
+    if not len(posterior.kernels.kernels):
+        return posterior
+    with torch.no_grad(), blas_threads(posterior.training.q.numel()):
+        states = _States(posterior)
+        assert isinstance(posterior.latent, ExactPosterior), "fits are exact"
+        factor = states.content_factor(posterior.latent)
+        if len(posterior.training) <= MOST_POINTS_FOR_RESTARTS:  # beyond, parameters are known well, and searches long
+            factor *= states.mixture_factor(posterior)
+    return posterior.with_settings(widening=factor)
+
+
+class _States:
+    """Some training states of a posterior, and the accelerations there as linear functions of the latents."""
+
+    def __init__(self, posterior: Posterior) -> None:
+        training = posterior.training
+        count = len(training.q)
+        at = torch.linspace(0, count - 1, min(STATES, count), device=training.q.device).round().long()
+        dynamics = posterior.dynamics(training.q[at], training.v[at], training.u[at])
+        self.W: Float[Tensor, "n nv C"] = dynamics.H @ posterior.trained.unknown.direction(dynamics)
+        self.features = posterior.likelihood.standardization(posterior.trained.unknown.features(dynamics))
+
+    def content_factor(self, latent: ExactPosterior) -> float:
+        """What makes `CONTENT` of the states lie inside, in `CONFIDENCE` of the functions; at least 1."""
+        n, nv, latents = self.W.shape
+        # every state has latents of its own: (n nv) accelerations from (C n) values
+        apart = torch.diag_embed(self.W.permute(1, 2, 0)).permute(2, 0, 1, 3)
+        linear = apart.reshape(n * nv, latents * n)
+        covariance = linear @ latent.joint_covariance(self.features) @ linear.mT
+        std = covariance.diagonal().clamp_min(0.0).sqrt()
+        open_ones = std > NEGLIGIBLE * std.max()
+        if not bool(open_ones.any()):
+            return 1.0
+        values, vectors = torch.linalg.eigh(0.5 * (covariance + covariance.mT))
+        generator = torch.Generator(device=std.device).manual_seed(0)
+        normal = torch.randn(len(values), DRAWS, generator=generator, dtype=std.dtype, device=std.device)
+        drawn = (vectors * values.clamp_min(0.0).sqrt()) @ normal
+        inside = torch.quantile((drawn[open_ones] / std[open_ones, None]).abs(), CONTENT, dim=0)
+        return max(1.0, float(torch.quantile(inside, CONFIDENCE)) / DEVIATIONS)
+
+    def mixture_factor(self, posterior: Posterior) -> float:
+        """Standard deviations with the hyper-parameters unknown, over those with them known; at least 1."""
+        likelihood, kernels = posterior.likelihood, posterior.kernels
+        _, fixed = likelihood.split_noise
+        free = {name: value for name, value in posterior.hyperparameters.items() if name not in fixed}
+        objective = FitObjective(likelihood, kernels, likelihood.noise, fixed)
+
+        here = float(objective(free))
+        mean, variance = self._moments(posterior.latent)
+        more = torch.zeros_like(variance)
+        scratch = kernels.at(free)
+        for names in _kinds(free):
+            try:
+                # at an optimum the objective rises by half of the curvature
+                curvature = 2.0 * (float(objective(_moved(free, names, 1.0))) - here)
+            except (NumericalError, torch.linalg.LinAlgError):
+                continue
+            step = min(LARGEST_STEP, max(curvature, LARGEST_STEP**-2) ** -0.5)
+            for sign in (1.0, -1.0):
+                moved = _moved(free, names, sign * step) | fixed
+                try:
+                    other = self._moments(likelihood.condition(scratch.moved_to(moved), moved, at_parameters=True))
+                except (NumericalError, torch.linalg.LinAlgError):
+                    continue  # no posterior there: nothing that the data leave open
+                more += 0.5 * ((other[0] - mean).square() + other[1] - variance)
+        total = float(variance.mean())
+        return math.sqrt(max(1.0, 1.0 + float(more.mean()) / total)) if total > 0.0 else 1.0
+
+    def _moments(self, latent: LatentPosterior) -> tuple[Tensor, Tensor]:
+        """Mean and variance (n, nv) of the accelerations that the latents make."""
+        mean = (self.W @ latent.mean(self.features)[..., None])[..., 0]
+        covariance = self.W @ latent.covariance(self.features) @ self.W.mT
+        return mean, covariance.diagonal(dim1=-2, dim2=-1)
+
+
+def _kinds(names: Iterable[str]) -> list[list[str]]:
+    """Parameters that differ in the latent that they belong to only, `kernels.<number>.<kind>`."""
+    kinds: dict[str, list[str]] = {}
+    for name in names:
+        kinds.setdefault(re.sub(r"^kernels\.\d+\.", "", name), []).append(name)
+    return list(kinds.values())
+
+
+def _moved(parameters: Mapping[str, Tensor], names: Iterable[str], step: float) -> dict[str, Tensor]:
+    return {**parameters, **{name: parameters[name] + step for name in names}}

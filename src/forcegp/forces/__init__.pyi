@@ -1,16 +1,21 @@
-from .actuation import Actuation as Actuation
-from .base_wrench import AerodynamicForce as AerodynamicForce, BaseWrench as BaseWrench
+from .actuation import (
+    Actuation as Actuation, LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench,
+    Thrusters as Thrusters,
+)
 from .contact_friction import ContactFriction as ContactFriction, foot_friction as foot_friction
-from .friction import Coulomb as Coulomb, Stribeck as Stribeck, LoadFriction as LoadFriction
 from .force import Force as Force, JointLaw as JointLaw, Law as Law
 from .joint_forces import (
     IndependentAccelerations as IndependentAccelerations, JointAccelerations as JointAccelerations,
     JointForces as JointForces, JointFriction as JointFriction,
-    JointPositionForces as JointPositionForces, PeriodicJointForces as PeriodicJointForces,
+    JointPositionForces as JointPositionForces,
 )
 from .kernels import KERNELS as KERNELS, kernel_of as kernel_of
-from .offset import Offset as Offset, Spring as Spring
-from .parameters import (
+from .joint_laws import (
+    Coulomb as Coulomb, CoupledRotors as CoupledRotors, DirectionalFriction as DirectionalFriction,
+    LoadFriction as LoadFriction, Offset as Offset, Rotor as Rotor, Spring as Spring, Stribeck as Stribeck,
+    Viscous as Viscous,
+)
+from .force import (
     Body as Body, Coefficient as Coefficient, LogNormal as LogNormal, Normal as Normal, Parameter as Parameter,
 )
 from .registry import (
@@ -18,12 +23,7 @@ from .registry import (
     split_outside as split_outside,
 )
 from .rigid_bodies import Payload as Payload, RigidBodies as RigidBodies
-from .rotor import CoupledRotors as CoupledRotors, Rotor as Rotor
-from .thrusters import (
-    LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench, Thrusters as Thrusters,
-)
-from .tool_forces import ToolForces as ToolForces
+from .link_forces import AerodynamicForce as AerodynamicForce, BaseWrench as BaseWrench, ToolForces as ToolForces
 from .unknown import (
     Scaling as Scaling, Unknown as Unknown, UnknownForces as UnknownForces, has_few_inputs as has_few_inputs,
 )
-from .friction import DirectionalFriction as DirectionalFriction, Viscous as Viscous

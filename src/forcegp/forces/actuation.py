@@ -1,22 +1,24 @@
-"""`Actuation`: what the actuators deliver."""
+"""What the actuators deliver, what thrusters on a link do, and what observers estimate; what robot files state."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_type
 from forcegp.forces.force import Force, Law, as_numbers
-from forcegp.forces.friction import Coulomb, Viscous
-from forcegp.forces.offset import Spring
+from forcegp.forces.joint_laws import Coulomb, Spring, Viscous
 from forcegp.forces.rigid_bodies import RigidBodies
-from forcegp.forces.thrusters import Thrusters
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
 from forcegp.robots.mjcf_model import Translation
+
+FADES = 0.25  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +26,7 @@ class Actuation(Law):
     """What the actuators deliver: `matrix` u with `matrix` (nv, nu), one column per actuator, called `names`.
 
     Without a matrix there is one actuator per joint of one degree of freedom, u = its force; bases that move have none.
-    Couplings and differentials are columns with several entries, without unit or in rad/rad. With `known` False u has
-    these columns, and what they do is left to the unknown forces.
+    With `known` False what they do is left to the unknown forces.
     """
 
     matrix: Sequence[Sequence[float]] | np.ndarray | Tensor | None = None
@@ -67,6 +68,165 @@ class Actuation(Law):
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
         return features[0] if self.known else torch.zeros_like(features[0])
+
+
+class LinkForce(Law):
+    """A force and a torque on the link `frame` that follow from columns of u called `names`.
+
+    Amplitudes are the force [N], then the torque [Nm] about the origin of the link, in the link's axes.
+    """
+
+    frame: str
+
+    @override
+    def direction(self, state: State) -> Float[Tensor, "*batch nv 6"]:
+        axes, J = state.kinematics.frame_pose(self.frame)[..., :3, :3], state.kinematics.frame_jacobian(self.frame)
+        return torch.cat([part.mT @ axes for part in J.split(3, dim=-2)], dim=-1)
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        """Columns of u, and the axes of the link."""
+        first = state.inputs.index(self.names[0])
+        axes = state.kinematics.frame_pose(self.frame)[..., :3, :3]
+        return state.u[..., first : first + len(self.names)], axes
+
+
+@dataclass(frozen=True, eq=False)
+class Thrusters(LinkForce):
+    """Thruster k at `places[k]` (m) pushes link `frame` along `axes[k]`: thrust[k] s, and torque[k] s about it.
+
+    s = u for `power` 1 (a thrust, or a share of it) and u |u| for `power` 2 (a rotor's speed). `thrust` in N and
+    `torque` in Nm per unit of s, positive for a torque on the link along the axis; one number, or one each. Columns of
+    u are called `names`. With `known` False what they do is left to the unknown forces.
+    Source: Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012. Raises InvalidInput for what does not
+    fit.
+    """
+
+    frame: str
+    places: Sequence[Sequence[float]] | Tensor
+    thrust: float | Sequence[float] | Tensor = 1.0
+    torque: float | Sequence[float] | Tensor = 0.0
+    axes: Sequence[float] | Sequence[Sequence[float]] | Tensor = (0.0, 0.0, 1.0)
+    power: int = 1
+    names: tuple[str, ...] = ()
+    known: bool = True
+
+    @classmethod
+    def of_wrench(cls, frame: str, wrench: Sequence[float], name: str) -> "Thrusters":
+        """One that does this per unit of u: force [N], and torque [Nm] about the origin of the link, in its axes."""
+        force, torque = np.split(np.array(wrench), 2)
+        thrust = float(np.linalg.norm(force))
+        along = force if thrust else torque
+        axis = along / np.linalg.norm(along) if along.any() else np.array([0.0, 0.0, 1.0])
+        place = np.cross(axis, torque) / thrust if thrust else np.zeros(3)  # a lever makes the rest
+        return cls(frame, [place.tolist()], thrust, float(torque @ axis), axis.tolist(), names=(name,))
+
+    @override
+    def bound_to(self, robot: Robot) -> "Thrusters":
+        robot.frame(self.frame)
+        places = _numbers("places", self.places, robot)
+        if places.dim() != 2 or places.shape[-1] != 3 or not len(places):
+            raise InvalidInput(f"Thrusters places are {self.places!r}; give x, y, z in m for each thruster.")
+        count = len(places)
+        axes = _fitting("axes", self.axes, (count, 3), robot)
+        length = torch.linalg.vector_norm(axes, dim=-1, keepdim=True)
+        if not bool((length > 0).all()):
+            raise InvalidInput(f"Thrusters axes are {self.axes!r}; give a direction for each thruster.")
+        if self.power not in (1, 2):
+            raise InvalidInput(f"Thrusters power is {self.power!r}; give 1 for thrusts or 2 for rotor speeds.")
+        thrust, torque = (_fitting(name, getattr(self, name), (count,), robot) for name in ("thrust", "torque"))
+        names = tuple(self.names) or tuple(f"rotor_{k + 1}" for k in range(count))
+        if len(names) != count or len(set(names)) != count:
+            raise InvalidInput(f"Thrusters names are {names}; give {count} different ones, one for each thruster.")
+        return Thrusters(self.frame, places, thrust, torque, axes / length, int(self.power), names, self.known)
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        wrench = self._wrench(features[0])
+        return wrench if self.known else torch.zeros_like(wrench)
+
+    def delivered(self, state: State) -> Tensor:
+        """Joint forces (..., nv) that they make, known or not."""
+        wrench = self._wrench(self.features(state)[0])
+        return (self.direction(state) @ wrench[..., None])[..., 0]
+
+    def _wrench(self, u: Tensor) -> Tensor:
+        s = u if self.power == 1 else u * u.abs()
+        places, axes, thrust, torque = (torch.as_tensor(x) for x in (self.places, self.axes, self.thrust, self.torque))
+        turning = thrust[:, None] * torch.linalg.cross(places, axes) + torque[:, None] * axes
+        return s @ torch.cat([thrust[:, None] * axes, turning], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedWrench(LinkForce):
+    """A slow force on link `frame` that an observer estimates from the past, as wind makes it; columns of u hold it.
+
+    `names`: a force [N] at the origin of the link along the world's axes; of six, a torque [Nm], too; of twelve, the
+    last six are the wrench that lasts, to which predicted motions fade within .25 s (`forcegp.posterior.observing`).
+    """
+
+    frame: str
+    names: tuple[str, ...] = ("wind_x", "wind_y", "wind_z")
+
+    @override
+    def bound_to(self, robot: Robot) -> "ObservedWrench":
+        robot.frame(self.frame)
+        if len(self.names) not in (3, 6, 12) or len(set(self.names)) < len(self.names):
+            raise InvalidInput(f"ObservedWrench names are {self.names}; give 3, 6 or 12 different ones.")
+        return ObservedWrench(self.frame, tuple(self.names))
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        u, axes = features
+        world = u[..., :6].unflatten(-1, (-1, 3))
+        own = (axes.mT[..., None, :, :] @ world[..., None]).flatten(-3)
+        return torch.cat([own, torch.zeros_like(own)], dim=-1) if len(self.names) == 3 else own
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedWind(Law):
+    """The velocity of the air [m/s] along the world's axes, which an observer estimates, in columns of u.
+
+    It is no force: `AerodynamicForce` takes velocities against it.
+    """
+
+    names: Any = ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        return (state.v,)
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return torch.zeros_like(features[0])
+
+    @classmethod
+    def at(cls, state: State) -> Float[Tensor, "*batch 3"] | None:
+        """The wind of these states; None where their system has no such columns."""
+        if cls.names[0] not in state.inputs:
+            return None
+        first = state.inputs.index(cls.names[0])
+        return state.u[..., first : first + 3]
+
+
+OBSERVED = (ObservedWrench, ObservedWind)
+
+
+def _numbers(name: str, given: object, robot: Robot) -> Tensor:
+    values = as_numbers(f"Thrusters {name}", given, robot, "numbers")
+    if not bool(torch.isfinite(values).all()):
+        raise InvalidInput(f"Thrusters {name} is {given!r}; give finite numbers.")
+    return values
+
+
+def _fitting(name: str, given: object, shape: tuple[int, ...], robot: Robot) -> Tensor:
+    values = _numbers(name, given, robot)
+    try:
+        return values.expand(shape).clone()
+    except RuntimeError:
+        raise InvalidInput(
+            f"Thrusters {name} has shape {tuple(values.shape)}; give one for all, or {shape[0]}, one for each thruster."
+        ) from None
 
 
 def forces_of_file(robot: Robot) -> tuple[Force, ...]:

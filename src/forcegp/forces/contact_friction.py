@@ -12,9 +12,9 @@ from torch.utils._python_dispatch import _get_current_dispatch_mode
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalWarning, require_type, usable_arguments
-from forcegp.forces.joint_forces import JointFriction, chosen_inputs, joint_indices
-from forcegp.forces.kernels import check_kernel
-from forcegp.forces.tool_forces import (
+from forcegp.forces.joint_forces import JointFriction, joint_indices
+from forcegp.forces.kernels import checked_kernel
+from forcegp.forces.link_forces import (
     SMALLEST_SPEED,
     ToolPoint,
     contact_axes,
@@ -68,8 +68,8 @@ class TabulatedCurve:
 class ExpectedFriction:
     """What is expected of the friction that changes a normal force.
 
-    sliding: friction coefficient over the sliding speed (m/s); joints: joint name -> resisting force (Nm or N) over the
-    joint's velocity. Curves may be negative, as those that a fit has found can be where the data are few.
+    sliding: coefficient over the sliding speed (m/s); joints: name -> resisting force (Nm or N) over the joint's
+        velocity.
     """
 
     sliding: TabulatedCurve
@@ -104,10 +104,8 @@ class ExpectedFriction:
     ) -> Float[Tensor, "*batch"]:
         """|normal force| in N under the known forces and the expected friction.
 
-        With the multiplier lambda_0 under known forces and joint friction, and sliding along the unit vector d with the
-        coefficient mu, lambda = lambda_0 - mu |s_p lambda| g, where g = (d lambda / d Q_U) J_p^T d, so that
-        |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g). Where that divisor is below `SMALLEST_SHARE`, it is set
-        to it, with a NumericalWarning.
+        |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g), g = (d lambda / d Q_U) J_p^T d, for sliding along d
+        with the coefficient mu. A divisor below `SMALLEST_SHARE` is set to it, with a NumericalWarning.
         """
         state, multiplier = dynamics.state, dynamics.multiplier_map()
         robot = state.robot
@@ -139,69 +137,35 @@ def _warn_of_jamming(growth: Tensor, contact: int) -> None:
         )
 
 
-AXES = ("isotropic", "two-axis")
-CONTACT_INPUTS = ("velocity", "position")
-
-
 @dataclass(frozen=True)
 class ContactFriction(ExpressedKernels):
-    """Q_U = -J_t^T f: tangential friction of contact number `contact`, positive latents resist the motion.
+    """Q_U = -J_t^T g(|v_t|) v_t / |v_t|: what resists the sliding of contact number `contact`; none without it.
 
-    Isotropic: f = g(|v_t|) v_t / |v_t| with one latent g on the sliding speed. Two-axis: one latent per tangent, each
-    on the velocity v_k along its own, f_k = g_k(v_k). Without the velocity among the inputs dry friction along two
-    axes is g_k v_k / |v_t|, so that it turns with the motion. Without the contact there is no friction.
-
-    axes: "isotropic" or "two-axis".
-    load: the friction is proportional to the nominal normal force (what the contact would carry under the known forces
-        alone, `nominal_normal_force`), and the latents are friction coefficients.
-    expected: only with `load`, since friction changes the normal force in turn: the friction that the normal force
-        counts with, as a coefficient or an `ExpectedFriction`, which stays as it is given. Where it is None,
-        `forcegp.fit` finds it for isotropic friction by itself, by fitting again with what it has learned
-        (`refined_loads`).
-    viscous: the latents are damping coefficients in N/(m/s) (with `load` in s/m): f = g v_t, and g_k v_k along every
-        tangent.
-    inputs: what the latents depend on, "velocity" (of sliding, see above), "position" (of the contact point along the
-        two tangents, which makes a map of the surface), or both.
-    kernel: an expression of `forcegp.forces.kernel_of`. None stands for "friction" (dry, varying with speed, viscous
-        friction with a learned velocity scale, see `JointFriction`) where the velocity is the only input and the
-        friction not viscous, and for "squared-exponential" elsewhere.
+    load: the friction is proportional to the nominal normal force (`nominal_normal_force`), the latent a coefficient.
+    expected: only with `load`, the friction that the normal force counts with, as a coefficient or an
+        `ExpectedFriction`. None: `forcegp.fit` finds it, by fitting again with what it has learned (`refined_loads`).
+    kernel: an expression of `forcegp.forces.kernel_of`.
     """
 
     contact: int = 0
-    axes: str = "isotropic"
     load: bool = False
     expected: ExpectedFriction | float | None = None
-    viscous: bool = False
-    inputs: tuple[str, ...] = ("velocity",)
-    kernel: str | None = None
+    kernel: str = "friction"
 
     @usable_arguments("ContactFriction")
     def __post_init__(self) -> None:
         require_type("load", self.load, bool)
-        if self.axes not in AXES or not is_contact_number(self.contact):
-            raise InvalidInput(
-                f"ContactFriction has axes {self.axes!r} and contact {self.contact!r}; give 'isotropic' or 'two-axis', "
-                "and a contact's number from 0."
-            )
+        if not is_contact_number(self.contact):
+            raise InvalidInput(f"ContactFriction has contact {self.contact!r}; give a contact's number from 0.")
         if self.expected is not None and not self.load:
             raise InvalidInput("ContactFriction has an expected friction but no load; give load=True, or leave it out")
         object.__setattr__(self, "expected", ExpectedFriction.of(self.expected))
-        object.__setattr__(self, "inputs", chosen_inputs("ContactFriction", self.inputs, CONTACT_INPUTS))
-        check_kernel(self.kernel_expression)
-
-    @property
-    @override
-    def kernel_expression(self) -> str:
-        if self.kernel is not None:
-            return self.kernel
-        return "friction" if self.inputs == ("velocity",) and not self.viscous else "squared-exponential"
+        checked_kernel(self.kernel)
 
     @property
     @override
     def title(self) -> str:
-        if self.load:
-            return "load-friction"
-        return "friction-map" if "position" in self.inputs else "contact-friction"
+        return "load-friction" if self.load else "contact-friction"
 
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
@@ -213,72 +177,48 @@ class ContactFriction(ExpressedKernels):
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
-        return ("sliding",) if self.axes == "isotropic" else ("tangent-1", "tangent-2")
+        return ("sliding",)
 
     @override
     def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
         if self.contact >= len(dynamics.contacts):
-            return torch.zeros_like(dynamics.H[..., :1]).expand(*dynamics.H.shape[:-1], self._count)
+            return torch.zeros_like(dynamics.H[..., :1])
         where = ToolPoint.of_contact(dynamics, self.contact)
         return where.jacobian[..., :3, :].mT @ self.point_force(dynamics)
 
     @override
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
         if self.contact >= len(dynamics.contacts):
-            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, self._count)
+            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, 1)
         tangents, sliding = self._sliding(dynamics)
-        motion = sliding[..., None] if self.viscous else _direction(sliding)
-        if self.axes == "isotropic":
-            directions = tangents @ motion
-        elif "velocity" in self.inputs and not self.viscous:
-            directions = tangents  # the latents are functions of the velocity, sign included
+        speed = _speed(sliding)
+        direction = tangents @ (sliding / speed)[..., None]
+        if not self.load:
+            return -direction
+        expected = ExpectedFriction.of(self.expected)
+        if expected is None:
+            normal_force = nominal_normal_force(dynamics, self.contact)
         else:
-            directions = tangents * motion.mT
-        if self.load:
-            directions = self._normal_force(dynamics, tangents, sliding)[..., None, None] * directions
-        return -directions
+            normal_force = expected.normal_force(dynamics, self.contact, direction[..., 0], speed[..., 0])
+        return -(normal_force[..., None, None] * direction)
 
     @override
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         if self.contact >= len(dynamics.contacts):  # the force is zero whatever its features are
-            width = len(self.inputs) + ("position" in self.inputs)
-            return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], width),) * self._count
-        tangents, sliding = self._sliding(dynamics)
-        speeds = (_speed(sliding),) if self.axes == "isotropic" else (sliding[..., :1], sliding[..., 1:])
-        position = ToolPoint.of_contact(dynamics, self.contact).position
-        place = (tangents.mT @ position[..., None])[..., 0]
-        return tuple(
-            torch.cat([{"velocity": speed, "position": place}[name] for name in self.inputs], dim=-1)
-            for speed in speeds
-        )
+            return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], 1),)
+        return (_speed(self._sliding(dynamics)[1]),)
 
     @override
-    def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...], ...]:
-        ways: dict[str, tuple[Scaling, ...]] = {"velocity": ("scale",), "position": ("standardize", "standardize")}
-        chosen: tuple[Scaling, ...] = tuple(way for name in self.inputs for way in ways[name])
-        return (chosen,) * self._count
+    def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
+        return ("scale",)
 
     @override
     def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
-        place = ("tool position along tangent-1 [m]", "tool position along tangent-2 [m]")
-        tangents = ("velocity along tangent-1 [m/s]", "velocity along tangent-2 [m/s]")
-        moving = ("sliding speed [m/s]",) if self.axes == "isotropic" else tangents
-        return tuple(
-            tuple(entry for name in self.inputs for entry in {"velocity": (speed,), "position": place}[name])
-            for speed in moving
-        )
+        return (("sliding speed [m/s]",),)
 
     @override
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
-        if self.load:
-            unit = "s/m" if self.viscous else ""  # of a friction coefficient per speed, and of a friction coefficient
-        else:
-            unit = "N/(m/s)" if self.viscous else "N"
-        return (unit,) * self._count
-
-    @property
-    def _count(self) -> int:
-        return 1 if self.axes == "isotropic" else 2
+        return ("" if self.load else "N",)
 
     def _sliding(self, dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor]:
         """Tangents (..., 3, 2) and the velocity of the contact point along them (..., 2)."""
@@ -286,20 +226,9 @@ class ContactFriction(ExpressedKernels):
         tangents = contact_axes(dynamics, self.contact)[..., :2]
         return tangents, (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]
 
-    def _normal_force(self, dynamics: ConstrainedDynamics, tangents: Tensor, sliding: Tensor) -> Tensor:
-        expected = ExpectedFriction.of(self.expected)
-        if expected is None:
-            return nominal_normal_force(dynamics, self.contact)
-        direction = (tangents @ _direction(sliding))[..., 0]
-        return expected.normal_force(dynamics, self.contact, direction, _speed(sliding)[..., 0])
-
 
 def _speed(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
     return (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
-
-
-def _direction(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2 1"]:
-    return (sliding / _speed(sliding))[..., None]
 
 
 Table = Callable[[str], TabulatedCurve]
@@ -307,11 +236,9 @@ Table = Callable[[str], TabulatedCurve]
 
 
 def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownForces | None:
-    """The same, where isotropic `ContactFriction` with a load and no `expected` expects the friction in `table`.
+    """The same, where `ContactFriction` with a load and no `expected` expects the friction in `table`.
 
-    A first fit takes the normal force under the known forces alone; its posterior mean of the sliding friction, and of
-    the `JointFriction` beside it in the sum, gives a better one, with which a second fit finds better curves, and so
-    on. An `expected` that is there was given on purpose and stays. None for forces without such a term.
+    That of the sliding, and of the `JointFriction` beside it. None for forces without such a term.
     """
     names = forces.latent_names(robot)
     if not any(_wants_load(term) for term in forces.terms):
@@ -333,16 +260,13 @@ def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownF
 
 
 def _wants_load(term: Unknown) -> bool:
-    """Whether its latent is a friction coefficient over the sliding speed alone, and the load is still to be found."""
-    if not isinstance(term, ContactFriction) or not term.load or term.expected is not None:
-        return False
-    return term.axes == "isotropic" and term.inputs == ("velocity",) and not term.viscous
+    """Whether its latent is a friction coefficient, and the load is still to be found."""
+    return isinstance(term, ContactFriction) and term.load and term.expected is None
 
 
 def foot_friction(contacts: tuple[int, ...] = (0, 1, 2, 3)) -> tuple[ContactFriction, ...]:
-    """Friction under feet that slide: a `ContactFriction` in proportion to the normal force at each of the contacts.
+    """Friction under feet that slide, in proportion to the normal force at each of the contacts.
 
-    The contacts are surfaces on which feet slide, such as `Contact(foot, point, Plane(...), switch=...)`; in rows whose
-    switch is 0 there is neither normal force nor friction. Points that are held (`fixed_point`) do not slide.
+    In rows whose switch is 0 there is none. Points that are held (`fixed_point`) do not slide.
     """
     return tuple(ContactFriction(contact=contact, load=True) for contact in contacts)

@@ -1,17 +1,13 @@
-"""`Force`: one class for all that acts on the joints; `Law`: a force that is known but for a few numbers.
+"""`Force`: one class for all that acts on the joints; `Law`: a force known but for a few numbers; priors on them.
 
-    Q(x) = sum_k B_k(x) g_k(z_k(x, s))
-
-with directions B, features z, amplitudes g and perhaps a state s that remembers. The amplitude of a `Law` is a formula
-with coefficients; that of an `Unknown` force (`forcegp.forces.unknown`) is a function with a Gaussian process prior. A
-new law is one subclass with `features` and `amplitude` and an entry in `forcegp.forces.FORCES`: then it acts in
-predictions, motions and compiled programs, its coefficients are estimated from logs of every kind, and files carry it.
+Q(x) = sum_k B_k(x) g_k(z_k(x, s)), with directions B, features z, amplitudes g and perhaps a state s that remembers. A
+new law is one subclass with `features` and `amplitude` and an entry in `forcegp.forces.FORCES`.
 """
 
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -20,11 +16,111 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput
-from forcegp.forces.parameters import Coefficient, LogNormal, Normal, joint_unit
+from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics.gauss_principle import Contact, State
 from forcegp.robots import Robot
 from forcegp.robots.arguments import by_joint
+
+UNITS = {
+    "force": ("Nm", "N"),
+    "position": ("rad", "m"),
+    "velocity": ("rad/s", "m/s"),
+    "acceleration": ("rad/s^2", "m/s^2"),
+    "inertia": ("kg m^2", "kg"),
+    "force/velocity": ("Nm s/rad", "N s/m"),
+    "force/position": ("Nm/rad", "N/m"),
+    "1": ("1", "1"),
+}
+"""Of coefficients, for joints that turn and joints that slide."""
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One number in a law, or one per joint.
+
+    unit: a key of `UNITS`, a quotient such as "force/velocity^2" of the four quantities that it names, or a unit.
+    default: the value where the law is given and this number is not, and where the search for it begins.
+    factor: its typical size, in a log in which forces, positions, velocities and inertias are of size 1.
+    lowest, highest: the least and largest value; with `logarithm` as multiples of the typical size.
+    logarithm: whether it is positive, and estimated on a log scale.
+    """
+
+    unit: str = "force"
+    default: float = 0.0
+    factor: float = 0.1
+    lowest: float = 0.0
+    highest: float = np.inf
+    logarithm: bool = False
+
+    def size(self, typical: Mapping[str, Float[np.ndarray, " nv"]]) -> Float[np.ndarray, " nv"]:
+        """`factor` times the unit, where "force", "position", "velocity" and "inertia" have these sizes."""
+        size = np.full_like(typical["force"], self.factor)
+        upper, *lower = self.unit.split("/")
+        for part, sign in ((upper, 1.0), *((each, -1.0) for each in lower)):
+            name, _, power = part.partition("^")
+            size = size * typical[name] ** (sign * float(power or 1.0)) if name in typical else size
+        return size
+
+
+def joint_unit(unit: str, slides: bool) -> str:
+    """The unit of a coefficient at a joint that turns, or slides."""
+    if unit in UNITS:
+        return UNITS[unit][slides]
+    parts = [each.partition("^") for each in unit.split("/")]
+    return "/".join(f"{UNITS[name][slides] if name in UNITS else name}{hat}{power}" for name, hat, power in parts)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """A number to be estimated, around `mean`; `std` of None is a weak prior: ten times its typical size in a log.
+
+    Both are one number, one per joint, or by joint name. Where std is 0 the number is known, where nan the prior weak.
+    """
+
+    mean: Any = 0.0
+    std: Any = None
+
+
+@dataclass(frozen=True)
+class LogNormal:
+    """A positive number to be estimated: its logarithm is around that of `median`, with deviation `spread`."""
+
+    median: Any
+    spread: Any = 1.0
+
+
+@dataclass(frozen=True)
+class Body:
+    """The ten parameters of a rigid body to be estimated, which stays physically possible (log-Cholesky).
+
+    strength: weight w of the prior w/2 d^2 about the body that is given, with d the affine-invariant distance of bodies
+        (one heavier throughout by a factor e costs 2 w; Lee, Wensing & Park, T-RO 2020).
+    """
+
+    strength: float = 1.0
+
+    @usable_arguments("Body")
+    def __post_init__(self) -> None:
+        if not (isinstance(self.strength, int | float) and 0.0 < self.strength < np.inf):
+            raise InvalidInput(
+                f"Body strength is {self.strength!r}; it must be > 0, since data never determine all of a body."
+            )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a model: its name, unit, where the search begins, and its prior; `prior` of None: it is known."""
+
+    name: str
+    unit: str
+    start: float
+    prior: Normal | LogNormal | Body | None
+
+
+def per_joint(name: str, joints: Sequence[str]) -> tuple[str, ...]:
+    """`name.joint` of every joint."""
+    return tuple(f"{name}.{joint}" for joint in joints)
+
 
 PerJoint = float | Sequence[float] | Mapping[str, float] | np.ndarray | Tensor
 Number = PerJoint | Normal | LogNormal | None
@@ -252,10 +348,6 @@ class JointLaw(Law):
             raise InvalidInput(f"{what} is {values.tolist()}; every joint needs {least}.")
         return values
 
-    @override
-    def _value(self, name: str) -> Tensor:
-        return super()._value(name)
-
 
 def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:
     """A tensor in float64 on the robot's device. Raises InvalidInput, with what to give, for what has no numbers."""
@@ -266,10 +358,9 @@ def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:
 
 
 class Memory:
-    """The numbers that all laws of a model remember, side by side.
+    """The numbers that all laws of a model remember, side by side; `names` are their columns of u.
 
-    `names` are their columns of u. None of the laws that forcegp brings remembers anything; a law of one's own does
-    with `memory_names` and `remember` (`tests/forces/test_memory.py` has one).
+    None of the laws that forcegp brings remembers anything (`tests/forces/test_memory.py` has one that does).
     """
 
     def __init__(self, forces: Sequence[Force], robot: Robot) -> None:

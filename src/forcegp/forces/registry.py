@@ -1,47 +1,43 @@
-"""Forces by name: as files carry them, and as commands and quick scripts write them.
+"""Forces by name, as files and commands have them: names out of `FORCES`, unknown forces behind "gp:".
 
-    viscous, stribeck:level=1.2, payload:tool0, gp:joint-friction:kernel=matern-3/2
-
-are names out of `FORCES`, of unknown forces behind "gp:", with options FIELD=VALUE (the first field needs no name).
+Options are FIELD=VALUE, as in viscous, stribeck:level=1.2, payload:tool0, gp:joint-friction:kernel=matern-3/2.
 """
 
 import difflib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from inspect import Parameter, signature
-from itertools import accumulate
 from typing import Any
 
 from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
-from forcegp.forces.force import Force, Law
-from forcegp.forces.parameters import Body, LogNormal, Normal
+from forcegp.forces.force import Body, Force, Law, LogNormal, Normal
 
 FORCES: dict[str, str | type[Force]] = {
     "actuation": "actuation.Actuation",
-    "thrusters": "thrusters.Thrusters",
-    "observed-wrench": "thrusters.ObservedWrench",
-    "observed-wind": "thrusters.ObservedWind",
+    "thrusters": "actuation.Thrusters",
+    "observed-wrench": "actuation.ObservedWrench",
+    "observed-wind": "actuation.ObservedWind",
     "rigid-bodies": "rigid_bodies.RigidBodies",
     "payload": "rigid_bodies.Payload",
-    "viscous": "friction.Viscous",
-    "direction": "friction.DirectionalFriction",
-    "coulomb": "friction.Coulomb",
-    "stribeck": "friction.Stribeck",
-    "load": "friction.LoadFriction",
-    "offset": "offset.Offset",
-    "spring": "offset.Spring",
-    "rotor": "rotor.Rotor",
-    "coupled-rotors": "rotor.CoupledRotors",
+    "viscous": "joint_laws.Viscous",
+    "direction": "joint_laws.DirectionalFriction",
+    "coulomb": "joint_laws.Coulomb",
+    "stribeck": "joint_laws.Stribeck",
+    "load": "joint_laws.LoadFriction",
+    "offset": "joint_laws.Offset",
+    "spring": "joint_laws.Spring",
+    "rotor": "joint_laws.Rotor",
+    "coupled-rotors": "joint_laws.CoupledRotors",
     "joint-forces": "joint_forces.JointForces",
     "joint-accelerations": "joint_forces.JointAccelerations",
     "independent": "joint_forces.IndependentAccelerations",
     "joint-friction": "joint_forces.JointFriction",
     "joint-position": "joint_forces.JointPositionForces",
-    "periodic-joint-forces": "joint_forces.PeriodicJointForces",
-    "tool-forces": "tool_forces.ToolForces",
+    "tool-forces": "link_forces.ToolForces",
     "contact-friction": "contact_friction.ContactFriction",
-    "base-wrench": "base_wrench.BaseWrench",
-    "aerodynamic": "base_wrench.AerodynamicForce",
+    "base-wrench": "link_forces.BaseWrench",
+    "aerodynamic": "link_forces.AerodynamicForce",
 }
 """Name -> class, or where in this package it is, so that only what is used is imported. Add yours."""
 
@@ -49,11 +45,10 @@ UNKNOWN = "gp:"
 SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
     "bodies": ("rigid-bodies", {"learn": "all"}),
     "joint": ("joint-forces", {}),
-    "joint-ripple": ("periodic-joint-forces", {}),
+    "joint-ripple": ("joint-position", {"period": 2.0 * math.pi}),
     "tool-friction": ("tool-forces", {}),
     "tool-forces": ("tool-forces", {"inputs": ("velocity", "position"), "kernel": "squared-exponential"}),
     "load-friction": ("contact-friction", {"load": True}),
-    "friction-map": ("contact-friction", {"viscous": True, "inputs": ("position",)}),
     "foot-friction": ("contact_friction.foot_friction", {}),
 }
 """Names that `parse_forces` takes besides, with fields that differ from their defaults."""
@@ -139,10 +134,9 @@ def _read(value: Any) -> Any:
 
 @usable_arguments("parse_forces")
 def parse_forces(expression: str | Sequence[str]) -> tuple[Force, ...]:
-    """The forces of a text, or of its parts: `NAME[:VALUE][:FIELD=VALUE...]` with commas between them.
+    """The forces of a text, or of its parts: `NAME[:VALUE][:FIELD=VALUE...]` with commas between them, "/" in lists.
 
-    Lists are written with "/", for example "gp:joint:inputs=q/v", and so are points. Raises InvalidInput for unknown
-    names, fields and values.
+    Raises InvalidInput for unknown names, fields and values.
     """
     words = split_outside(expression, ",") if isinstance(expression, str) else list(expression)
     joined: list[str] = []
@@ -234,14 +228,7 @@ def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Para
         return "all" if text == "all" else tuple(part.strip() for part in text.split("/"))
     if isinstance(default, tuple) or key == "joints":
         return tuple(part.strip() for part in text.split("/"))
-    return _without_parentheses(text)
-
-
-def _without_parentheses(text: str) -> str:
-    """Without the one pair that encloses the whole text; "(a) + (b)" stays as it is."""
-    depths = list(accumulate((character == "(") - (character == ")") for character in text))
-    enclosed = text.startswith("(") and 0 in depths and depths.index(0) == len(text) - 1
-    return text[1:-1].strip() if enclosed else text
+    return text[1:-1].strip() if text.startswith("(") and text.endswith(")") else text
 
 
 def split_outside(text: str, separator: str) -> list[str]:

@@ -11,8 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, usable_arguments
-from forcegp.forces.force import Law
-from forcegp.forces.parameters import Body
+from forcegp.forces.force import Body, Law
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
@@ -24,7 +23,7 @@ class RigidBodies(Law):
     """Coriolis, centrifugal and gravity forces of the robot's bodies, -bias(q, v); their inertia is the mass matrix.
 
     learn: which bodies a fit estimates, from those of the robot's file: "all" bodies that move, or by name of a link:
-        (link, ...), or {link: Body(strength, parts)}. A body is what one joint moves as one; any link of it names it.
+        (link, ...), or {link: Body(strength)}. A body is what one joint moves as one; any link of it names it.
     """
 
     learn: Literal["all"] | Sequence[str] | Mapping[str, Body] = ()
@@ -53,7 +52,7 @@ class RigidBodies(Law):
             if robot.layout.links[robot.link(link).name].body < 0:
                 raise InvalidInput(f"link {link!r} does not move, so nothing on it shows; give a moving one.")
             if not isinstance(body, Body):
-                raise InvalidInput(f"RigidBodies learn {link!r} is {body!r}; give Body(strength, parts).")
+                raise InvalidInput(f"RigidBodies learn {link!r} is {body!r}; give Body(strength).")
         return replace(self, learn=dict(bodies))
 
     def bodies(self, carrying: Sequence[int], robot: Robot) -> dict[int, Body]:

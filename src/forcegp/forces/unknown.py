@@ -1,10 +1,10 @@
 """What every prior on the unknown force defines: Q_U(x) = B(x) f(z(x)) with independent Gaussian processes f_c."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from gpytorch.kernels import Kernel
@@ -14,9 +14,10 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.forces.force import Force
-from forcegp.forces.kernels import kernel_of
+from forcegp.forces.kernels import checked_kernel, kernel_of
 from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
+from forcegp.robots.arguments import is_sequence
 
 Scaling = Literal["standardize", "scale", "none"]
 """How a model prepares the features of a latent for its kernel, from the training points: shift to mean 0 and divide by
@@ -162,26 +163,62 @@ def _kernels_of(
 
 
 class ExpressedKernels(Unknown):
-    """A dataclass of plain values whose `kernel_expression` every latent has a kernel of."""
+    """A dataclass of plain values, every latent of which has a kernel of the same expression, the field `kernel`."""
 
-    kernel: Any  # an expression, or None, of which every subclass names its own
-
-    @property
-    def kernel_expression(self) -> str:
-        """An expression of `forcegp.forces.kernel_of`."""
-        assert isinstance(self.kernel, str), "a prior whose kernel may be None overrides this"
-        return self.kernel
+    kernel: str
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return kernels_of(self.kernel_expression, dimensions, variances)
+        return tuple(kernel_of(self.kernel, d, s) for d, s in zip(dimensions, variances, strict=True))
 
 
-def kernels_of(expression: str, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-    """One kernel per latent from the same expression."""
-    return tuple(
-        kernel_of(expression, dimension, variance) for dimension, variance in zip(dimensions, variances, strict=True)
-    )
+class SharedInputs(ExpressedKernels):
+    """All latents depend on the same `inputs`, chosen by name; a subclass is a dataclass that has them as a field."""
+
+    inputs: tuple[str, ...]
+    allowed: ClassVar[tuple[str, ...]]
+    from_zero: ClassVar[tuple[str, ...]] = ()
+    """Inputs of which zero means something: scaled, never shifted."""
+
+    def __post_init__(self) -> None:
+        inputs, prior = as_names(self.inputs), type(self).__name__
+        if not inputs or any(name not in self.allowed for name in inputs) or len(set(inputs)) < len(inputs):
+            names = ", ".join(map(repr, self.allowed))
+            raise InvalidInput(f"{prior} inputs are {self.inputs!r}; give one or more of {names}, each once.")
+        object.__setattr__(self, "inputs", inputs)
+        checked_kernel(self.kernel)
+
+    @abstractmethod
+    def columns(self, dynamics: ConstrainedDynamics) -> Mapping[str, Callable[[], Tensor]]:
+        """What gives the features of each input."""
+
+    @abstractmethod
+    def labels(self, robot: Robot) -> Mapping[str, Sequence[str]]:
+        """Names with units of the features of each input."""
+
+    @override
+    def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
+        columns = self.columns(dynamics)
+        z = torch.cat([columns[name]() for name in self.inputs], dim=-1)
+        return (z,) * len(self.latent_names(dynamics.state.robot))
+
+    @override
+    def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...], ...]:
+        labels, how = self.labels(robot), {True: "scale", False: "standardize"}
+        ways: Any = tuple(how[name in self.from_zero] for name in self.inputs for _ in labels[name])
+        return (ways,) * len(self.latent_names(robot))
+
+    @override
+    def feature_names(self, robot: Robot) -> tuple[tuple[str, ...], ...]:
+        labels = self.labels(robot)
+        return (tuple(label for name in self.inputs for label in labels[name]),) * len(self.latent_names(robot))
+
+
+def as_names(given: object) -> tuple[Any, ...]:
+    """One name, or several, as a tuple; empty for what is neither."""
+    if isinstance(given, str):
+        return (given,)
+    return tuple(given) if is_sequence(given) else ()
 
 
 def has_few_inputs(prior: Unknown, robot: Robot) -> bool:

@@ -1,7 +1,4 @@
-"""Gaussian-process inference, exact by deflation, and for many rows by inducing points.
-
-Knows mixing vectors, kernels, noise and targets; nothing of robots.
-"""
+"""Gaussian-process inference, exact by deflation, and for many rows by inducing points; it knows nothing of robots."""
 
 import lazy_loader as lazy
 

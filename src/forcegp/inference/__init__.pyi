@@ -6,7 +6,6 @@ from .engines import (
 )
 from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound
 from .likelihood import Terms as Terms, negative_log_likelihood as negative_log_likelihood
-from .linear_functionals import FunctionalPosterior as FunctionalPosterior
 from .memory import require_memory as require_memory
 from .optimization import (
     OptimizationResult as OptimizationResult, OptimizerOptions as OptimizerOptions, best_of as best_of,

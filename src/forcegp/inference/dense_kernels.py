@@ -1,41 +1,176 @@
 """Kernels of all latents: matrices of GPyTorch kernels, exact and lean, and their parameters by name.
 
-GPyTorch's own sums are not used: it adds a low-rank matrix (a linear kernel) to a dense one through a root
-decomposition of the latter, which needs jitter where that is singular and is approximate where it is large. Its lazy
-paths switch silently to conjugate gradients above N D = 800 (an error of the mean of 7.9 rad/s^2 on the iiwa).
-
-Functions of the distance, linear and constant kernels, and those with an embedding or weight features
-(`kernel_matrices`) are evaluated here; every other kernel is called as it is, and once more in the backward pass.
+GPyTorch's own sums need jitter, and switch silently to conjugate gradients above N D = 800. A kernel class of anybody
+may have `squared_exponential_embedding(z)` (n, e), for k = exp(-1/2 |e - e'|^2); `matern_embedding(z)` and `nu`; or
+`weight_features(z)` (n, p), for k = phi . phi', all differentiable. Every other kernel is called as it is.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from operator import add, mul
 from typing import Any, cast
 
 import torch
-from gpytorch.kernels import AdditiveKernel, Kernel, MaternKernel, ProductKernel, RBFKernel, ScaleKernel
+from gpytorch.kernels import (
+    AdditiveKernel,
+    ConstantKernel,
+    Kernel,
+    LinearKernel,
+    MaternKernel,
+    PeriodicKernel,
+    ProductKernel,
+    RBFKernel,
+    ScaleKernel,
+)
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
-from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import (
-    PointMap,
-    StationaryMatrix,
-    embedding,
-    lengthscale_of,
-    of_distance,
-    weight_features,
-)
 
-COMBINED = (AdditiveKernel, ProductKernel)
-"""Of GPyTorch, of which subclasses may have other formulas and are called."""
+PointMap = Callable[[Tensor], Tensor]
+"""Features (n, d) -> something (n, _) of every point."""
+
+NO_DISTANCE = 1e-8
+"""Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
+
+
+def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
+    """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
+    if type(kernel) in (RBFKernel, MaternKernel):
+        smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
+        return partial(scaled, kernel), float(smoothness)
+    squared_exponential = getattr(kernel, "squared_exponential_embedding", None)
+    if type(kernel) is PeriodicKernel:
+        squared_exponential = partial(_circles, kernel)
+    if squared_exponential is not None:
+        return squared_exponential, math.inf
+    matern = getattr(kernel, "matern_embedding", None)
+    return None if matern is None else (matern, float(cast(float, kernel.nu)))
+
+
+def weight_features(kernel: Kernel) -> PointMap | None:
+    """phi(z) with k = phi(z) . phi(z'), one entry per weight; None for kernels that are not known to be so."""
+    if type(kernel) is LinearKernel:
+        return lambda z: z * kernel.variance.reshape(-1).sqrt()
+    if type(kernel) is ConstantKernel:
+        return lambda z: kernel.constant.sqrt().reshape(1, 1).expand(len(z), 1)
+    return getattr(kernel, "weight_features", None)
+
+
+def _circles(kernel: PeriodicKernel, z: Tensor) -> Tensor:
+    """e(x) = (cos, sin)(2 pi x / p) / sqrt l, for which 1/2 |e(x) - e(y)|^2 = 2 sin^2(pi (x - y) / p) / l."""
+    angle = (2.0 * math.pi) * z / kernel.period_length.reshape(-1)
+    return torch.cat([angle.cos(), angle.sin()], dim=-1) / lengthscale_of(kernel).sqrt().expand(z.shape[-1]).repeat(2)
+
+
+def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
+    """Length scales and output scale of a plain scaled squared exponential; None for every other kernel."""
+    if type(kernel) is not ScaleKernel or type(kernel.base_kernel) is not RBFKernel:
+        return None
+    base = kernel.base_kernel
+    if kernel.active_dims is not None or base.active_dims is not None or kernel.batch_shape or base.batch_shape:
+        return None
+    return lengthscale_of(base), cast(Tensor, kernel.outputscale)
+
+
+def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+    """|x_i - y_j|^2 by one matrix product, centred first: cancellation stays below 1e-14 for standardised inputs."""
+    centre = y.mean(dim=0, keepdim=True) if y.shape[0] else 0.0
+    x, y = x - centre, y - centre
+    return (x.square().sum(-1)[:, None] + y.square().sum(-1)[None, :]).addmm(x, y.mT, alpha=-2.0).clamp_min(0.0)
+
+
+def lengthscale_of(kernel: Kernel) -> Float[Tensor, " d"]:
+    """Its length scales, one or one per feature."""
+    return cast(Tensor, kernel.lengthscale).reshape(-1)
+
+
+def scaled(kernel: Kernel, z: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+    """Features over the length scales of a kernel."""
+    return z / lengthscale_of(kernel)
+
+
+def of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:
+    """The squared exponential (smoothness inf) or a Matern of the distances between points that are scaled already."""
+    if smoothness == math.inf:
+        return torch.exp(-0.5 * squared_distance(left, right))
+    return _matern(distance(left, right), smoothness)
+
+
+def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+    """|x_i - y_j| from the differences themselves: a root would make 1e-8 of what cancels in `squared_distance`."""
+    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _matern(r: Tensor, smoothness: float) -> Tensor:
+    """Rasmussen & Williams (2006), eq. 4.17, with scaled distances r."""
+    a = math.sqrt(2.0 * smoothness) * r
+    polynomial = {0.5: lambda: 1.0, 1.5: lambda: 1.0 + a, 2.5: lambda: 1.0 + a * (1.0 + a / 3.0)}[smoothness]()
+    return polynomial * torch.exp(-a)
+
+
+def _matern_slope(r: Tensor, smoothness: float) -> Tensor:
+    """-2 dk/d(r^2); for smoothness 1/2 it grows as 1/r and counts as 0 where the points coincide."""
+    a = math.sqrt(2.0 * smoothness) * r
+    decay = torch.exp(-a)
+    if smoothness == 0.5:
+        return torch.where(r > NO_DISTANCE, decay / r, torch.zeros_like(r))
+    return 3.0 * decay if smoothness == 1.5 else 5.0 / 3.0 * (1.0 + a) * decay
+
+
+class StationaryMatrix(torch.autograd.Function):
+    """s k(r) with r_ij = |(z_i - z_j) / l|: the squared exponential (smoothness inf) or a Matern.
+
+    Has first derivatives only; saves nothing of size N x N but its result and, for a Matern, the derivative of it.
+    """
+
+    @staticmethod
+    def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor, smoothness: float) -> Tensor:  # type: ignore[override]  # the base takes *args
+        """The matrix (n, n)."""
+        scaled = z / lengthscale
+        if smoothness == math.inf:
+            K = squared_distance(scaled, scaled).mul_(-0.5)
+            K.diagonal().zero_()
+            slope = K.exp_().mul_(outputscale)
+        else:
+            r = distance(scaled, scaled)
+            K = _matern(r, smoothness).mul_(outputscale)
+            slope = _matern_slope(r, smoothness).mul_(outputscale)
+        ctx.save_for_backward(z, lengthscale, outputscale, K, slope)
+        return K
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
+        """Gradients in z, length scales and output scale."""
+        # With create_graph=True: `once_differentiable` would let it pass where upstream is a constant.
+        if torch.is_grad_enabled():
+            raise NotImplementedError(
+                "this kernel matrix has first derivatives only; for a Hessian take finite differences of its gradient"
+            )
+        z, lengthscale, outputscale, K, slope = ctx.saved_tensors
+        weighted = upstream * slope
+        scaled = (z - z.mean(0)) / lengthscale  # centred, or features far from zero cancel below
+        product = weighted @ scaled
+        rows, columns = weighted.sum(1), weighted.sum(0)
+        z_gradient = lengthscale_gradient = outputscale_gradient = None
+        if ctx.needs_input_grad[2]:
+            outputscale_gradient = (weighted.sum() if slope is K else (upstream * K).sum()) / outputscale
+        if ctx.needs_input_grad[1]:
+            # sum_ij G_ij slope_ij (x_id - x_jd)^2 / l_d^3, expanded so that only N x d arrays appear
+            per_input = ((rows + columns)[:, None] * scaled.square()).sum(0) - 2.0 * (scaled * product).sum(0)
+            lengthscale_gradient = per_input / lengthscale
+            if lengthscale.numel() == 1:
+                lengthscale_gradient = lengthscale_gradient.sum().reshape(lengthscale.shape)
+        if ctx.needs_input_grad[0]:
+            transposed = weighted.mT @ scaled
+            z_gradient = (product + transposed - (rows + columns)[:, None] * scaled) / lengthscale
+        return z_gradient, lengthscale_gradient, outputscale_gradient, None
 
 
 class DenseKernel(ABC):
@@ -59,34 +194,30 @@ class DenseKernel(ABC):
 
 def taken_apart(kernel: Kernel) -> DenseKernel:
     """The kernel as sums, products and leaves whose formulas are evaluated here; any other kernel is called."""
-    inner = _inner(kernel)
-    return inner if kernel.active_dims is None or isinstance(inner, _Called) else _Composed([inner], of=kernel)
-
-
-def _inner(kernel: Kernel) -> DenseKernel:
-    """The kernel on the features that it looks at."""
-    if not _is_known(kernel):
+    kind = type(kernel)
+    if kernel.batch_shape or kernel.active_dims is not None:
         return _Called(kernel)
-    if isinstance(kernel, AdditiveKernel | ProductKernel) and type(kernel) in COMBINED:
-        parts = [taken_apart(cast(Kernel, part)) for part in kernel.kernels]
-        return _Composed(parts, add if type(kernel) is AdditiveKernel else mul)
-    if type(kernel) is ScaleKernel:
-        base = kernel.base_kernel
-        # active_dims of the base are those of the scaled kernel, which selects
-        plain = type(base) in (RBFKernel, MaternKernel)
+    if kind in (AdditiveKernel, ProductKernel):  # subclasses may have other formulas
+        parts = [taken_apart(cast(Kernel, part)) for part in cast(AdditiveKernel, kernel).kernels]
+        return _Composed(parts, add if kind is AdditiveKernel else mul)
+    if isinstance(kernel, ScaleKernel) and kind is ScaleKernel:
+        base = kernel.base_kernel  # whose active_dims are those of the scaled kernel
+        plain = type(base) in (RBFKernel, MaternKernel) and not base.batch_shape
         return _OfDistance(base, kernel) if plain else _Composed([taken_apart(base)], scale=kernel)
-    return _Weighted(kernel) if embedding(kernel) is None else _OfDistance(kernel)
+    if embedding(kernel) is not None:
+        return _OfDistance(kernel)
+    return _Called(kernel) if weight_features(kernel) is None else _Weighted(kernel)
 
 
 @dataclass(frozen=True, eq=False)
 class _Called(DenseKernel):
-    """A kernel of which nothing is known: GPyTorch evaluates it, and once more in the backward pass."""
+    """A kernel of which nothing is known: GPyTorch evaluates it."""
 
     kernel: Kernel
 
     @override
     def matrix(self, z: Tensor) -> Tensor:
-        return _recomputed(self.kernel, z) if torch.is_grad_enabled() else self.kernel(z, z).to_dense()
+        return self.cross(z, z)
 
     @override
     def cross(self, z: Tensor, other: Tensor) -> Tensor:
@@ -99,29 +230,26 @@ class _Called(DenseKernel):
 
 @dataclass(frozen=True, eq=False)
 class _Composed(DenseKernel):
-    """A sum or a product of others, times the variance of `scale`, of the features that `of` looks at."""
+    """A sum or a product of others, times the variance of `scale`."""
 
     parts: Sequence[DenseKernel]
     combine: Callable[[Tensor, Tensor], Tensor] = add
     scale: ScaleKernel | None = None
-    of: Kernel | None = None
 
     @override
     def matrix(self, z: Tensor) -> Tensor:
-        return self._composed("matrix", z)
+        return self._composed([part.matrix(z) for part in self.parts])
 
     @override
     def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self._composed("cross", z, other)
+        return self._composed([part.cross(z, other) for part in self.parts])
 
     @override
     def diagonal(self, z: Tensor) -> Tensor:
-        return self._composed("diagonal", z)
+        return self._composed([part.diagonal(z) for part in self.parts])
 
-    def _composed(self, what: str, *points: Tensor) -> Tensor:
-        if self.of is not None:
-            points = tuple(z.index_select(-1, cast(Tensor, self.of.active_dims)) for z in points)
-        value = reduce(self.combine, [getattr(part, what)(*points) for part in self.parts])
+    def _composed(self, values: Sequence[Tensor]) -> Tensor:
+        value = reduce(self.combine, values)
         return value if self.scale is None else self.scale.outputscale * value
 
 
@@ -183,32 +311,6 @@ class _Weighted(DenseKernel):
         features = weight_features(self.kernel)
         assert features is not None, "taken_apart found them"
         return features(z)
-
-
-def _is_known(kernel: Kernel) -> bool:
-    """Whether its formula is evaluated here."""
-    if kernel.batch_shape:
-        return False
-    if type(kernel) is ScaleKernel:
-        # It takes over the `active_dims` of its base, which then does not select again.
-        base = kernel.base_kernel
-        return not base.batch_shape and (type(base) in (RBFKernel, MaternKernel) or kernel.active_dims is None)
-    return type(kernel) in COMBINED or embedding(kernel) is not None or weight_features(kernel) is not None
-
-
-def _recomputed(kernel: Kernel, z: Tensor) -> Tensor:
-    """A kernel of any kind, called now and again in the backward pass, so that nothing of size N x N is kept."""
-    dense = _Call(kernel, lambda z: kernel(z, z).to_dense())
-    # As arguments: by the time of the recomputation `functional_call` has put the module's own parameters back.
-    names, values = zip(*dense.named_parameters(), strict=True) if list(dense.parameters()) else ((), ())
-    # An early stop would leave GPyTorch's call by an exception, before it has put `active_dims` back.
-    with set_checkpoint_early_stop(False):
-        return checkpoint(
-            lambda points, *given: functional_call(dense, dict(zip(names, given, strict=True)), (points,)),
-            z,
-            *values,
-            use_reentrant=False,
-        )
 
 
 class _Call(torch.nn.Module):

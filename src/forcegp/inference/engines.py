@@ -1,11 +1,6 @@
 """Engines: how the posterior of the latents is computed from many rows, what memory that needs, and which one to take.
 
-| engine | posterior | time | memory |
-|---|---|---|---|
-| `Exact` | exact, from the factorised covariance | (rN)^3 | (rN)^2 |
-| `Inducing` | variational, through inducing points, with a bound on what that costs | N P^2 | P^2 |
-
-with N rows, r the rank of the mixing vectors, C latents and P points of all latents together.
+`Exact` takes (rN)^3 time and (rN)^2 memory, `Inducing` N P^2 and P^2, with N rows of rank r and P points.
 """
 
 from abc import ABC, abstractmethod
@@ -74,9 +69,8 @@ class Engine(ABC):
 
     @abstractmethod
     def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
-        """The posterior given the data.
+        """The posterior given the data; `start` is an earlier `solution` of the same engine.
 
-        `start` is an earlier `solution` of the same engine.
         Raises NotEnoughMemory before anything large is allocated, NumericalError where the engine fails.
         """
 
@@ -118,10 +112,8 @@ class Exact(Engine):
 class Inducing(Engine):
     """Variational inducing points: at most `points` for each latent, fewer where they leave out little.
 
-    `tolerance` is what they may leave out of the prior variance of a row in units of its noise, on average.
-
-    With `refine` iterations the hyper-parameters are improved on all rows by the collapsed bound, where the points
-    leave out no more than `tolerance`: elsewhere the bound prefers what few points can describe.
+    `tolerance`: what they may leave out of the prior variance of a row in units of its noise, on average. With `refine`
+    iterations the hyper-parameters are improved on all rows by the collapsed bound, where no more is left out.
     """
 
     name: ClassVar[str] = "inducing"

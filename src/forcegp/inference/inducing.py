@@ -1,20 +1,9 @@
 """Variational inducing points: all data through a few points per latent, with a bound on what that costs.
 
-Gaussian processes are finitely many weights (`WeightSpace`): k_c(z, z') ~ phi_c(z) . phi_c(z'), phi_c(z) = L_c^-1
-k_c(p_c, z), with points p_c of latent c chosen from the training points by pivoted Cholesky and L_c the factor of their
-kernel matrix. With deflated data t_i = sum_c C_ic f_c(z_i) + noise of covariance D_i the weights have the precision
-
-    B = I + Phi^T D^-1 Phi,      Phi[i, (c, p)] = C_ic phi_cp(z_i).
-
-D = I is the variational posterior of Titsias (2009, "Variational learning of inducing variables in sparse Gaussian
-processes"); D_i = I + sum_c C_ic C_ic^T (k_c(z_i, z_i) - |phi_c(z_i)|^2) makes what the weights leave out noise of the
-points, the fully independent training conditional of Snelson & Ghahramani (2006). The bound of Titsias,
-
-    -log p(y) <= -log N(t; 0, Phi Phi^T + I) + 1/2 sum_i sum_c |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2) + the rest,
-
-is, for data as the model draws them, like the divergence of the posteriors, off by the sum at most on average, rows
-times `left_out` (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational inference in Gaussian process
-regression", theorem 4): exact where nothing is left out. The cost is linear in the number of rows.
+Gaussian processes as finitely many weights, k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of posterior precision
+B = I + Phi^T D^-1 Phi. D = I is the posterior of Titsias (2009); with what the weights leave out in D it is the fully
+independent training conditional (Snelson & Ghahramani 2006). N times `left_out` bounds, in nats, what it costs (Burt,
+Rasmussen & van der Wilk 2020, theorem 4).
 """
 
 import math
@@ -42,12 +31,10 @@ ROUNDING = 1e-13
 def pivoted_cholesky(
     kernel: DenseKernel, z: Float[Tensor, "N d"], relevance: Float[Tensor, " N"], most: int, tolerance: float = 0.0
 ) -> Int[Tensor, " m"]:
-    """Numbers of greedy pivots, each where the relevance times what is left of k(z, z) is largest.
+    """Numbers of greedy pivots, each where the relevance times what is left of k(z, z) is largest; O(N m^2).
 
-    At most `most` of them; fewer where the sum of relevance times remainder falls below `tolerance`, but at least one,
-    or nothing but rounding is left. Time O(N m^2), memory O(N m).
-    Source: Fine & Scheinberg (2001), "Efficient SVM training using low-rank kernel representations"; Harbrecht, Peters
-    & Schneider (2012), "On the low-rank approximation by the pivoted Cholesky decomposition".
+    At most `most`; fewer where relevance times remainder falls below `tolerance`, or nothing but rounding is left.
+    Source: Harbrecht, Peters & Schneider (2012), "On the low-rank approximation by the pivoted Cholesky decomposition".
     """
     with torch.no_grad():
         remainder = kernel.diagonal(z).clone()
@@ -75,8 +62,7 @@ def pivoted_cholesky(
 class WeightSpace:
     """The weights of all latents, conditioned on deflated data; the weights of the latents follow each other.
 
-    `points` and `lowers` are p_c and L_c, `precision` the Cholesky factor of B, `mean` the posterior mean of the
-    weights, `left_out` what they leave out of the prior variance of a row in units of the noise: the mean over rows of
+    `points` p_c, `lowers` L_c, `precision` the factor of B, `mean` of the weights; `left_out`: the mean over rows of
     the sum over latents of |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2).
     """
 
@@ -98,11 +84,10 @@ class WeightSpace:
         noise_precision: Float[Tensor, "N r r"] | None = None,
         earlier: tuple[Float[Tensor, "P P"], Float[Tensor, " P"]] | None = None,
     ) -> "WeightSpace":
-        """Condition on all rows; None for the noise precision D^-1 is white noise.
+        """Condition on all rows; None for the noise precision D^-1 is white noise. Time O(N P^2).
 
-        `earlier` are precision (overwritten) and precision times mean of the weights before, None for those of the
-        prior. Time O(N P^2), memory O(P^2) and a block of rows. Raises NumericalError where the kernel matrix of the
-        points cannot be factorised.
+        `earlier`: precision (overwritten) and precision times mean of the weights before, None for those of the prior.
+        Raises NumericalError where the kernel matrix of the points cannot be factorised.
         """
         prior = cls.at(kernels, points, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0))
         white, slices = C if noise_precision is None else noise_precision @ C, prior.slices
@@ -140,10 +125,8 @@ class WeightSpace:
     def learned(self, kept: Sequence[float], terms: Terms) -> "WeightSpace":
         """After forgetting all but a part `kept` of each latent, and conditioning on more rows; time O(P^3 + N P^2).
 
-        f <- kept f + sqrt(1 - kept^2) g, g a new draw from the prior: a step in time of the kernels k_c(z, z')
-        exp(-|t - t'| / horizon_c), which are Markov, by kept_c = exp(-step / horizon_c) (Van Vaerenbergh,
-        Lazaro-Gredilla & Santamaria 2012, "Kernel recursive least-squares tracker for time-varying regression"; Sarkka
-        & Solin 2019, "Applied stochastic differential equations", 12.3). What the weights leave out is noise of a row.
+        f <- kept f + sqrt(1 - kept^2) g, g a new draw from the prior: kernels k_c exp(-|t - t'| / horizon_c), which are
+        Markov (Van Vaerenbergh, Lazaro-Gredilla & Santamaria 2012). What the weights leave out is noise of a row.
         """
         deflation, phis = terms.deflated(), self.columns(terms.features)
         d = torch.cat([self.mean.new_full((len(z),), part) for z, part in zip(self.points, kept, strict=True)])
@@ -269,10 +252,9 @@ def inducing_pivots(
     points: int,
     tolerance: float = 0.0,
 ) -> list[Int[Tensor, " m"]]:
-    """Numbers of the rows that are inducing points of each latent: greedy, at most `points` of them.
+    """Numbers of the rows that are inducing points of each latent, among `CANDIDATES` rows spread evenly over all.
 
-    Fewer where every latent leaves out less than its share of `tolerance`, see `InducingPosterior.left_out`. They are
-    sought among `CANDIDATES` rows at most, spread evenly over all.
+    At most `points`; fewer where every latent leaves out less than its share of `tolerance`.
     """
     count = len(C)
     candidates = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
@@ -287,11 +269,10 @@ def inducing_pivots(
 def collapsed_bound(
     terms: Terms, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
 ) -> Float[Tensor, ""]:
-    """An upper bound of `negative_log_likelihood`, differentiable in every argument but the inducing `points`.
+    """An upper bound of `negative_log_likelihood`, differentiable in all but the inducing `points`; time O(N P^2).
 
-    The kernels are taken at `parameters`. Time O(N P^2) for P points in all, memory O(N C + P^2): blocks of rows are
-    computed again in the backward pass. Raises NumericalError when a covariance cannot be factorised, or where rounding
-    explains more than all of the prior variance, as at length scales of 1e-10: the sum would be no bound there.
+    Blocks of rows are computed again in the backward pass. Raises NumericalError when a covariance cannot be
+    factorised, or where rounding explains more than all of the prior variance: the sum would be no bound there.
     """
     features, W, residual, noise = terms
     count, outputs, _ = W.shape

@@ -1,24 +1,14 @@
-"""Negative log marginal likelihood of the deflated model, with hand-written gradients.
+"""Negative log marginal likelihood of the deflated model y_i = m_i + W_i f(x_i) + noise_i, with hand-written gradients.
 
-The model is y_i = m_i + W_i f(x_i) + noise_i with D outputs, C latent functions and noise covariance R_i = L_i L_i^T.
-In whitened coordinates, y~_i = L_i^-1 (y_i - m_i) and W~_i = L_i^-1 W_i = U_i C_i with orthonormal U_i (D x r). The
-part of y~_i orthogonal to U_i does not depend on the latents and is standard normal; U_i^T y~_i carries everything that
-the data hold about them.
-
-With S~ the whitened covariance, T = (c_ic . c_jc k_c(x_i, x_j))_ij + I its deflated part, alpha = T^-1 t, beta_c =
-sum_a C_iac alpha_ia:
+Whitened, L_i^-1 W_i = U_i C_i with orthonormal U_i. What is orthogonal to U_i is standard normal; t_i = U_i^T y~_i has
+covariance T = (c_ic . c_jc k_c(x_i, x_j))_ij + I. With alpha = T^-1 t, beta_c = sum_a C_iac alpha_ia, V_c = L^-1 C_c,
 
     NLL = 1/2 t^T alpha + 1/2 log|T| + 1/2 |remainder|^2 + sum_i log|L_i| + D N / 2 log 2 pi
-    dNLL/dk_c[i,j] = 1/2 (c_ic^T T^-1_ij c_jc - beta_ci beta_cj)
+    dNLL/dk_c      = 1/2 (V_c^T V_c - beta_c beta_c^T)
     dNLL/dC_iac    = sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] - alpha_ia (K_c beta_c)_i
     dNLL/dW~_i     = U_i dNLL/dC_i - remainder_i (K_c beta_c)_i^T           dNLL/dy~_i = U_i alpha_i + remainder_i
 
-The last line follows from S~^-1 = U T^-1 U^T + (I - U U^T), so nothing is differentiated through the basis U. T lives
-in one buffer of (rN)^2 doubles that becomes its own factor L and L^-1; it is written and read in panels of rows, lower
-triangle only. With V_c = L^-1 C_c, its rows numbered by r,
-
-    dNLL/dk_c = 1/2 (V_c^T V_c - beta_c beta_c^T)
-    sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] = sum_r L^-1_r(ia) (V_c k_c)_ri
+T lives in one buffer of (rN)^2 doubles that becomes its own factor L and L^-1, lower triangle only.
 """
 
 import math
@@ -87,12 +77,10 @@ def whiten(
 
 
 def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> Deflation:
-    """Split whitened data into what depends on the latents and what does not.
+    """Split whitened data into what depends on the latents and what does not, by singular values of W~_i.
 
-    The rank r is found from the data. U_i comes from the singular value decomposition of W~_i. Points of lower rank
-    than the largest keep orthonormal columns with zero rows in C_i, which is exact too. Not differentiable on its own:
-    `negative_log_likelihood` carries the gradients, which do not depend on the choice of basis. Raises
-    NumericalError where W~ or y~ is not finite.
+    Points of lower rank than the largest have zero rows in C_i, which is exact too. Not differentiable on its own.
+    Raises NumericalError where W~ or y~ is not finite.
     """
     with torch.no_grad():
         if not bool(torch.isfinite(W_white).all() & torch.isfinite(y_white).all()):  # one wait for a GPU, not two
@@ -150,10 +138,8 @@ def negative_log_likelihood(
 ) -> Float[Tensor, ""]:
     """Exact -log p(y) of y = m + sum_c W_c f_c + noise, residual = y - m; differentiable in every argument.
 
-    `noise` holds variances (N or 1, D) or covariance matrices (N or 1, D, D); `kernel_matrices` one N x N matrix per
-    latent.
-    Source: Rasmussen & Williams (2006), eq. 2.30, after the change of variables of `deflation`.
-    Raises NumericalError when a covariance cannot be factorised.
+    `noise` holds variances (N or 1, D) or covariances (N or 1, D, D); one N x N kernel matrix per latent (Rasmussen &
+    Williams 2006, eq. 2.30). Raises NumericalError when a covariance cannot be factorised.
     """
     count, outputs, _ = W.shape
     if outputs > 1 and noise.ndim == 2 and not W.requires_grad and _acts_apart(W):
@@ -263,8 +249,7 @@ def _contractions(
 ) -> tuple[Tensor, list[Tensor | None]]:
     """sum_jb T^-1 C k and dNLL/dK from one sweep over L^-1; the factor's memory is used up.
 
-    Where only the noise moves W~_i, to E W~_i, of the first only the part in the space of the rows of C_i counts; and
-    since T = 1 + C K C^T, ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii``, which is cheaper.
+    Where only the noise moves W~_i, ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii`` is cheaper.
     """
     C, beta = system.deflation.C, system.beta
     count, rank, _ = C.shape

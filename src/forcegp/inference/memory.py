@@ -35,11 +35,7 @@ def require_memory(needed: int, what: str, remedy: str, device: torch.device) ->
 
 
 def return_freed_memory() -> None:
-    """Let the C library give the memory that was freed back to the system, where it can (glibc's malloc_trim).
-
-    It keeps blocks below 32 MiB for later; before a large matrix is allocated that is memory which is held twice:
-    measured, 90 of 410 MiB in a fit to 1000 rows.
-    """
+    """Give freed memory back to the system, where it can (malloc_trim): 90 of 410 MiB in a fit to 1000 rows."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)

@@ -4,7 +4,6 @@ static void @NAME@(const double *table, real s, real *f, real *slope) {
   const int knots = (int)table[0], buckets = 2 * knots;
   const double *knot = bucket + buckets + 1;
   for (int k = 0; k < LANES; ++k) {
-    if (!(AT(s, k) >= table[2] && AT(s, k) <= table[3])) AT(s, k) = NAN;
     const double place = (AT(s, k) - table[6]) * table[7];
     const int b = place >= buckets ? buckets - 1 : place > 0.0 ? (int)place : 0;
     int low = (int)bucket[b], high = (int)bucket[b + 1]; /* as many knots are <= s as rows stand before its own */

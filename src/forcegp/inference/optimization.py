@@ -22,6 +22,9 @@ LINE_SEARCH_FAILED = 2
 HALTED = 99
 """The status that scipy gives where its callback ended the search."""
 
+GRADIENT, MEMORY = 1e-4, 200
+"""Largest gradient entry at which a search has converged, and iterations that make up the curvature."""
+
 SLOW_ITERATIONS = 5
 """Iterations over which the progress of a search is judged."""
 
@@ -33,27 +36,22 @@ SOME_FAILURES = 10
 class OptimizerOptions:
     """How to search.
 
-    `iterations`: most L-BFGS iterations; `tolerance`: stop when an iteration lowers the objective by less than this
-    fraction of it; `slow`: stop when `SLOW_ITERATIONS` of them together lower it by less than this (nats), 0 for never;
-    `patience`: stop when so many iterations at the present pace would not reach the best of earlier starts, 0 for
-    never; `gradient_tolerance`: stop when the largest gradient entry is below this; `memory`: iterations that make up
-    the curvature.
+    `iterations`: most of L-BFGS; `tolerance`: of the objective, per iteration; `slow`: stop when `SLOW_ITERATIONS`
+    together lower it by less than this (nats); `patience`: stop when so many iterations at the present pace would not
+    reach the best of earlier starts, 0 for never.
     """
 
     iterations: int = 200
     tolerance: float = 1e-8
-    gradient_tolerance: float = 1e-4
-    memory: int = 200
     slow: float = 0.0
     patience: int = 0
 
     @usable_arguments("OptimizerOptions")
     def __post_init__(self) -> None:
-        if min(map(operator.index, (self.iterations, self.patience, self.memory))) < 0:
-            raise InvalidInput(f"iterations={self.iterations} and patience={self.patience} must be >= 0, memory > 0")
-        tolerances = (self.tolerance, self.slow, self.gradient_tolerance)
-        if not (all(x >= 0 for x in tolerances) and self.memory > 0):
-            raise InvalidInput("tolerances must be >= 0, memory > 0")
+        if min(operator.index(self.iterations), operator.index(self.patience)) < 0:
+            raise InvalidInput(f"iterations={self.iterations} and patience={self.patience} must be >= 0")
+        if not (self.tolerance >= 0 and self.slow >= 0):
+            raise InvalidInput(f"tolerance={self.tolerance} and slow={self.slow} must be >= 0")
 
 
 @dataclass(frozen=True)
@@ -124,11 +122,10 @@ class _Search:
         self.cause = cause
 
     def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Objective and gradient for a line search.
+        """Objective and gradient for a line search; where they do not exist, a parabola about the best point stands in.
 
-        Where they do not exist, a parabola about the best point stands in, which rises by as much as the objective was
-        to fall: the line search then shortens its step, and never accepts the point. (An infinite value would end the
-        whole search.)
+        It rises by as much as the objective was to fall: the line search shortens its step, and never accepts the
+        point.
         """
         evaluated = self.evaluate(point)
         if evaluated is not None:
@@ -145,17 +142,11 @@ def minimize_objective(
     progress: ProgressCallback | None = None,
     rival: float = np.inf,
 ) -> OptimizationResult:
-    """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed).
+    """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed) by L-BFGS-B.
 
-    L-BFGS with a strong-Wolfe line search (scipy's L-BFGS-B). Where the objective cannot be evaluated, the line search
-    shortens its step. If it finds none that helps, the search rolls back to the best point seen and starts again from
-    there with an empty memory, twice at most; then it ends there, with the reason.
-    `progress(iteration, value)` is called after every iteration; `rival` is the best value of earlier starts.
-
-    Raises
-    ------
-    FitError
-        The objective cannot be evaluated at the start.
+    A search that finds no step rolls back to the best point and starts again with an empty memory, twice at most.
+    `progress(iteration, value)` is called after every iteration; `rival` is the best value of earlier starts. Raises
+    FitError where the objective cannot be evaluated at the start.
     """
     options = options or OptimizerOptions()
     start_time = time.process_time()
@@ -193,9 +184,9 @@ def minimize_objective(
             options={
                 "maxiter": remaining,
                 "maxfun": 4 * remaining,
-                "maxcor": options.memory,
+                "maxcor": MEMORY,
                 "ftol": options.tolerance,
-                "gtol": options.gradient_tolerance,
+                "gtol": GRADIENT,
             },
         )
         remaining -= int(result.nit)
@@ -204,7 +195,7 @@ def minimize_objective(
         if result.status == HALTED and pace() >= options.slow:
             converged = False
             status = f"dropped: {options.patience} iterations at its pace would not reach the best of earlier starts"
-        steep = bool(np.abs(search.best_slope).max() > options.gradient_tolerance)
+        steep = bool(np.abs(search.best_slope).max() > GRADIENT)
         if result.status == LINE_SEARCH_FAILED and search.failures > failures_before:
             status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
         elif converged and steep and search.failures > failures_before + SOME_FAILURES:
@@ -229,7 +220,7 @@ def minimize_objective(
 def _sentence(status: int, message: str, options: OptimizerOptions) -> str:
     """The message of scipy's L-BFGS-B, in words that name what to do."""
     if status == 0 and "GRADIENT" in message:
-        return f"converged: the largest gradient entry is below {options.gradient_tolerance:g}"
+        return f"converged: the largest gradient entry is below {GRADIENT:g}"
     if status == 0:
         return f"converged: an iteration lowers the objective by less than {options.tolerance:g} of it"
     if status == HALTED:

@@ -1,41 +1,26 @@
-"""Pathwise conditioning: functions drawn from the posterior, and its mean, evaluated fast at few points many times.
+"""Functions drawn from the posterior (Matheron's rule; Wilson et al. 2020, eq. 10), and its mean, for many calls.
 
-A drawn function is a prior sample plus an update by the data (Matheron's rule; Wilson et al. 2020, "Efficiently
-sampling functions from Gaussian process posteriors", eq. 10), with the centres z_j of the posterior:
-
-    f_s(z) = g_s(z) + sum_j k(z, z_j) beta_s,j
-
-with g_s a sum of random cosines (Rahimi & Recht 2007). Every drawn function has frequencies of its own, so that over
-many functions mean and covariance are exactly those of the posterior; only the shape of the distribution is
-approximate, and the better the more cosines there are. Squared exponentials of all latents are one batched operation
-(`FunctionSamples`); sums and products of other kernels are drawn term by term (`ComposedSamples`).
-
-Kernels are multiplied out into terms. A term is s (phi . phi') k_1 k_2 ... with finitely many features phi and
-functions k_i of the distance in embeddings e_i. Its functions are sqrt(s) sum_p phi_p(z) g_p(z), each g_p a sum of
-random cosines with phase sum_i omega_i . e_i(z) (Rahimi & Recht 2007), for the spectrum of a product is the convolution
-of the spectra. That of the squared exponential is normal; those of a Matern and of the rational quadratic are normal
-with a random, Gamma distributed scale (Rasmussen & Williams 2006, sections 4.2.1 and 5.4.3). Terms without any k_i are
-drawn exactly.
+A drawn function is a sum of random cosines (Rahimi & Recht 2007), with frequencies of its own, and an update by the
+data. Squared exponentials of all latents are one batched operation (`FunctionSamples`); other kernels are multiplied
+out into terms, features times a function of a distance, and drawn term by term (`ComposedSamples`).
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import cast
 
 import numpy as np
 import torch
-from gpytorch.kernels import AdditiveKernel, Kernel, ProductKernel, RQKernel, ScaleKernel
+from gpytorch.kernels import AdditiveKernel, Kernel, ProductKernel, ScaleKernel
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import (
+from forcegp.inference.dense_kernels import (
     PointMap,
     embedding,
-    scaled,
     squared_exponential_parameters,
     weight_features,
 )
@@ -46,8 +31,7 @@ from forcegp.inference.posterior import LatentPosterior
 class SpectralFactor:
     """A function of the distance in e(z), by its spectrum: omega = g^power n with n ~ N(0, I), g ~ Gamma(shape, shape).
 
-    The squared exponential has power 0, a Matern of smoothness nu shape nu and power -1/2 (a Student t distribution),
-    the rational quadratic shape alpha and power 1/2.
+    The squared exponential has power 0, a Matern of smoothness nu shape nu and power -1/2 (a Student t distribution).
     """
 
     embedding: PointMap
@@ -109,15 +93,13 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
     kind = f"{type(kernel).__name__}{'' if whole else ' with active_dims or a batch'}"
     raise InvalidInput(
         f"no functions can be drawn for a {kind}; they can for sums and products of squared exponential, Matern, "
-        "rational quadratic, periodic, linear and constant kernels, and of those that have the method "
+        "periodic, linear and constant kernels, and of those that have the method "
         "`squared_exponential_embedding`, `matern_embedding` or `weight_features`, all without active_dims; use such "
         "kernels, or ask for no samples."
     )
 
 
 def _spectral_factor(kernel: Kernel) -> SpectralFactor | None:
-    if type(kernel) is RQKernel:
-        return SpectralFactor(partial(scaled, kernel), 0.5, float(kernel.alpha.detach()))
     found = embedding(kernel)
     if found is None:
         return None
@@ -131,10 +113,10 @@ GRID = 4096
 
 @dataclass(frozen=True, eq=False)
 class DrawnTerm:
-    """S functions of one term; `weights` are those of its columns, or those of cosines and of sines for each column.
+    """S functions of one term; `weights` are those of its columns, or of cosines and of sines for each column.
 
-    A Matern 1/2 has frequencies without bound. Of one input it is drawn at the points of an even `grid` instead, which
-    reaches 3 length scales beyond the centres; `weights` are its values there, and elsewhere it is their expectation.
+    A Matern 1/2 of one input is drawn on an even `grid` 3 length scales beyond the centres; elsewhere it is its
+    expectation.
     """
 
     term: KernelTerm
@@ -206,8 +188,7 @@ BLOCK_BYTES = 16 * 2**20
 class StackedKernels:
     """The squared exponentials of all latents as one batched operation, with the centres of the posterior.
 
-    Features are divided by their length scales; latents with fewer features are padded with zeros, which changes no
-    distance, and latents with fewer centres with some at zero, whose weights must be 0 (`stacked`).
+    Features are over their length scales; fewer features and centres are padded with zeros (`stacked`).
     """
 
     lengthscales: tuple[Float[Tensor, " _"], ...]
@@ -253,8 +234,7 @@ def mean_function(latent: LatentPosterior) -> Callable[[Sequence[Tensor]], Tenso
 class FunctionSamples:
     """S functions drawn from the posterior of the latents; the same points always give the same values.
 
-    `frequencies` are those of the scaled features; `amplitudes` hold the weights of cosines and sines, `beta` those of
-    the training points.
+    `frequencies` of the scaled features, `amplitudes` of cosines and sines, `beta` the weights of the centres.
     """
 
     kernels: StackedKernels
@@ -297,15 +277,6 @@ class FunctionSamples:
         prior = _cosines(points, self.frequencies, self.amplitudes)
         return prior.movedim(1, -1) + update.permute(1, 2, 0)
 
-    def one(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "S n"]:
-        """All functions of one latent at the same points."""
-        kernels, own, d = self.kernels, slice(index, index + 1), z.shape[-1]
-        kernels = StackedKernels(
-            kernels.lengthscales[own], kernels.variances[own], kernels.centers[own, :, :d], kernels.training[own, :, :d]
-        )
-        alone = FunctionSamples(kernels, self.frequencies[:, own, :d], self.amplitudes[:, :, own], self.beta[:, own])
-        return alone([z.expand(len(self.beta), -1, -1)])[..., 0]
-
 
 @dataclass(frozen=True, eq=False)
 class ComposedSamples:
@@ -338,10 +309,6 @@ class ComposedSamples:
         """Every function at points of its own: f_s,c(z_s,i)."""
         return torch.stack([self._at(index, z) for index, z in enumerate(features)], dim=-1)
 
-    def one(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, "S n"]:
-        """All functions of one latent at the same points."""
-        return self._at(index, z.expand(len(self.beta[index]), -1, -1))
-
     def _at(self, index: int, z: Float[Tensor, "S n d"]) -> Float[Tensor, "S n"]:
         flat = z.flatten(0, 1)
         cross = self.latent.kernels.dense[index].cross(flat, self.latent.features[index]).unflatten(0, z.shape[:2])
@@ -352,9 +319,8 @@ class ComposedSamples:
 def draw_functions(
     latent: LatentPosterior, samples: int, seed: int, widening: float = 1.0
 ) -> FunctionSamples | ComposedSamples:
-    """Functions drawn from the posterior of the latents, `widening` times as far from its mean.
+    """Functions drawn from the posterior of the latents, `widening` times as far from its mean; the same for a seed.
 
-    The same seed gives the same ones.
     Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
     """
     with torch.no_grad():

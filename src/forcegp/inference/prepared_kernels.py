@@ -1,29 +1,10 @@
 """Posterior means of all latents as sums for C, and their covariance compressed, for many calls with few points.
 
-Scaled squared exponentials of latents that share their centres are one product and one exponential (the formula stands
-in `kernel_sums`). Every other kernel is summed by itself.
+The kernel of one pair (z, z_j) is traced as a graph and taken apart: what depends on the centre alone becomes a table,
+what depends on z alone is computed once per state, only the rest in the loop of the C function.
 
-The exact covariance of the latents is k(z, z) - V^T V with V = L^-1 K(z), where K(z) (n, C) is the covariance of the
-whitened data with f(z) and L L^T = T theirs. With orthonormal columns B (n, R),
-
-    k(z, z) - (B^T V)^T (B^T V)
-
-is the covariance given only the R numbers (L^-T B)^T t of the data t: that of a Gaussian process which has seen less.
-So it is never below the exact one (the difference V^T (I - B B^T) V is positive semidefinite) and needs R instead of n
-numbers per latent and centre. B holds leading left singular vectors of V at sample states, each weighted by what it
-does to the standard deviations there, found a block at a time, where most is missing, until they are enough: up to a
-tenth more than the best ones, in a third of the time that a singular value decomposition takes.
-
-Posterior means of latents as C: sums over the centres, f_c(z) = sum_j w_cj k_c(z, z_j), for kernels of any kind.
-The kernel of one pair (z, z_j) is traced as a graph (`codegen.tracing`) and taken apart: what depends on the centre
-alone is computed once, when the sums are made, and becomes a table; what depends on z alone is computed once per state
-and is an operand of the C function; only what depends on both is computed in its loop. Of scaled squared exponentials
-of latents that share their centres
-
-    log k_c(z, z_j) = log s_c - 1/2 |z / l_c|^2 + (z / l_c^2) . z_j - 1/2 |z_j / l_c|^2
-
-that is one product per feature, and one exponential. Several states stand in the lanes of vector registers, or, where
-there is only one, several centres.
+The covariance k(z, z) - (B^T V)^T (B^T V) with V = L^-1 K(z) is that of a process which has seen only R combinations of
+the data: never below the exact one. B holds leading left singular vectors of V at sample states.
 """
 
 import math
@@ -39,7 +20,7 @@ from torch import Tensor
 from forcegp.codegen.c_writer import c_text, c_value, filled, sections
 from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated, gradients
 from forcegp.codegen.tracing import trace
-from forcegp.inference.kernel_matrices import squared_exponential_parameters
+from forcegp.inference.dense_kernels import squared_exponential_parameters
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior
 
 PADDING = 8

@@ -19,7 +19,6 @@ from forcegp.codegen.c_writer import c_text, filled, head, sections, write_funct
 from forcegp.codegen.library import compile_library, compiler
 from forcegp.data import units_for
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, require_type
-from forcegp.inference.one_input_calls import OneInputCall
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor import Predictor
@@ -162,15 +161,8 @@ class CFiles:
         if self.reference.inflation is not None:
             wider = float(self.reference.inflation.max())
             lines.append(f"standard deviations: never below those of predict, at most {wider:.1%} above at its checks")
-        if self.table_error:
-            lines.append(f"tables of one input, relative error {self.table_error:.1e}, NaN outside their range")
         lines += [f"a step lasts {self.dt!r} s, by {self.integrator}"] if self.dt is not None else []
         return "\n".join(f"   {_plain(line)}" for line in [*lines, said])
-
-    @property
-    def table_error(self) -> float:
-        """The largest relative one; 0 without tables."""
-        return max((part.functions.error for part in self.code.sums if isinstance(part, OneInputCall)), default=0.0)
 
     def _stored(self, checks: Sequence[Check]) -> tuple[str, str]:
         """Arrays and calls of the self-test."""
@@ -210,8 +202,8 @@ def _plain(line: str) -> str:
 
 STATES = 300
 """States at which the program is compared."""
-MEAN_TOLERANCE, TABLE_TOLERANCE = 5e-12, 1e-7
-"""Largest difference relative to the largest value: of sums, unless `rounding` is larger, and of tables."""
+MEAN_TOLERANCE = 5e-12
+"""Largest difference relative to the largest value, unless `rounding` is larger."""
 LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3}
 """How many times as much as the mean these may differ: more cancels in them."""
 BETWEEN = ("linearize", "step", "step_jacobian")
@@ -314,7 +306,7 @@ def _checks(export: CFiles) -> list[Check]:
         moved[:, : sizes[0]] = space.normalized(moved[:, : sizes[0]])
     between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
     lost = rounding(own, *sampled[finite].split(sizes, dim=-1))
-    tolerance = TABLE_TOLERANCE if export.table_error else max(MEAN_TOLERANCE, lost)
+    tolerance = max(MEAN_TOLERANCE, lost)
     found = []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]

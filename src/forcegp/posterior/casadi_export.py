@@ -19,7 +19,7 @@ from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
 from forcegp.codegen.tracing import trace
 from forcegp.errors import NumericalError, require_type, required_extra
-from forcegp.inference.one_input_calls import OneInputCall
+from forcegp.inference.one_input import OneInputCall
 from forcegp.inference.prepared_kernels import KernelSum
 from forcegp.integration import integrator_named
 from forcegp.posterior.c_export import identifier, rounding

@@ -23,9 +23,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import UnknownName, require_known
-from forcegp.evidence.identifiability import BaseParameters
-from forcegp.evidence.likelihood import MarginalLikelihood
-from forcegp.evidence.training_data import TrainingData
+from forcegp.evidence.bodies import BaseParameters
+from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.forces import IndependentAccelerations, JointAccelerations, JointForces
 from forcegp.inference import (
     Engine,
@@ -384,7 +383,7 @@ class Fitted(Summary):
         return {
             "model": self.description,
             "robot": f"{self.model.robot.name!r}, {self.model.robot.nv} joints, {len(self.model.contacts)} contacts",
-            "learned from": f"{len(rows)} {'rows' if rows.weights is None else 'windows'}",
+            "learned from": f"{len(rows)} rows",
             "noise std": rounded(self.noise_std.tolist()),
             "search": f"{'converged' if result.converged else 'not converged'}, {result.status}",
         }

@@ -13,7 +13,7 @@ from forcegp.data.filters import episodes_in_order, sums_before
 from forcegp.data.wind import steady_forces
 from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
-from forcegp.forces.thrusters import FADES
+from forcegp.forces.actuation import FADES
 from forcegp.model import Model
 from forcegp.posterior.prediction import ROWS_PER_BLOCK
 

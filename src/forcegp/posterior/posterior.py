@@ -12,7 +12,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
-from forcegp.evidence.training_data import second_moments, shrunk
+from forcegp.evidence.likelihood import second_moments, shrunk
 from forcegp.forces import Force
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Feedback, check_time_step
@@ -245,23 +245,21 @@ class Posterior(Fitted):
     def update(
         self,
         rows: Dataset,
-        budget: int | None = None,
         *,
         horizon: float | Mapping[str, float] | None = None,
     ) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
         Parameters, noise level and standardization stay, so it is that of conditioning on all rows at once, in O(N^2).
-        With a `budget` it keeps so many rows, those that it would change most without (docs/how-to/incremental.md);
-        with a `horizon` in s, for all terms or by name, it forgets. Raises InvalidInput for rows that do not fit and
+        With a `horizon` in s, for all terms or by name, it forgets. Raises InvalidInput for rows that do not fit and
         models that would have to be trained again, ContactError for rows at which the contacts cannot hold.
         """
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, rows)
         if horizon is None:
-            return replace(learn_more_rows(own, rows, budget), target=self.target)
-        return replace(learn_and_forget(own, rows, budget, horizon), target=self.target)
+            return replace(learn_more_rows(own, rows), target=self.target)
+        return replace(learn_and_forget(own, rows, horizon), target=self.target)
 
     def with_model(self, model: Model) -> "Posterior":
         """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.

@@ -280,7 +280,7 @@ class Predictor(Summary):
         return outputs
 
     def _repair(self, kind: str, states: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
-        """By torch what a program leaves NaN: states outside of a table."""
+        """By torch what a program leaves NaN, with its errors."""
         bad = torch.nonzero(~torch.isfinite(outputs[-1]).all(1))[:, 0]
         for output, rows in zip(outputs, self._by_torch(kind, [x[bad] for x in states]), strict=True):
             output[bad] = rows

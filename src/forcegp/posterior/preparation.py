@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.evidence.training_data import TrainingData
+from forcegp.evidence.likelihood import TrainingData
 from forcegp.forces import ObservedWrench
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress

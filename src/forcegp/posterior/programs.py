@@ -18,9 +18,9 @@ from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph, jacobian
 from forcegp.codegen.library import RowFunction, aligned, load_library, vector_unit
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
-from forcegp.evidence.training_data import Standardization
+from forcegp.evidence.likelihood import Standardization
 from forcegp.forces import Actuation, RigidBodies, UnknownForces
-from forcegp.inference.one_input_calls import LatentCall, drawn_calls, latent_calls, refreshed_calls
+from forcegp.inference.one_input import LatentCall, drawn_calls, latent_calls, refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance
 from forcegp.integration.integrators import SPEED_LIMIT, check_time_step, integrator_named

@@ -112,7 +112,7 @@ def fused(
 ) -> Trajectory:
     """`integrate`, by compiled loops; each takes as many motions as the others, one after the other.
 
-    Those that a loop cannot carry to the end (they diverge, Newton's method fails, a table ends) are integrated again
+    Those that a loop cannot carry to the end (they diverge, Newton's method fails) are integrated again
     by torch, with those of the other loops from the same place.
     """
     check_start(v, dt)

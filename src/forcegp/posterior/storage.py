@@ -18,7 +18,7 @@ from forcegp import __version__
 from forcegp.atomic_files import added_files, atomic_folder, require_unchanged, write_digests
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_arguments
-from forcegp.evidence.training_data import TrainingData
+from forcegp.evidence.likelihood import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.model import Model
 from forcegp.posterior.fitted import Estimates
@@ -28,7 +28,7 @@ KIND = "forcegp posterior"
 FORMAT_VERSION = 1
 RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "evaluations": int, "cpu_seconds": float}
 """What is stored of a search."""
-ROWS = ("q", "v", "u", "a", "noise_std", "weights")
+ROWS = ("q", "v", "u", "a")
 SETTINGS: dict[str, tuple[int | str, ...]] = {
     **dict.fromkeys(("widening", "correlated_rows", "rows_added", "learned_until"), ()),
     "data.episodes": ("episodes",),
@@ -150,11 +150,8 @@ def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> Tra
     given: dict[str, Any] = {name: tensors[prefix + name] for name in ROWS if prefix + name in tensors}
     count, columns = len(given["q"]), dict(zip("qvu", model.sizes, strict=True))
     for name, value in given.items():
-        fits = value.shape == (count, columns.get(name, model.robot.nv))
-        if not (value.dim() == 2 and value.numel() == count if name == "weights" else fits):
+        if value.shape != (count, columns.get(name, model.robot.nv)):
             raise ValueError(f"{prefix}{name} has shape {tuple(value.shape)}, which is not that of {count} rows")
-        if name == "noise_std" and bool((value <= 0.0).any()):
-            raise ValueError(f"{prefix}{name} has values that are not positive")
     return TrainingData(**given)
 
 

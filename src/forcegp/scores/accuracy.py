@@ -37,7 +37,7 @@ ROUNDING = 1e-9
 """Relative to the size of the truth: widths of intervals below it are none."""
 ROWS_PER_BLOCK = 4096
 
-AT_THE_TOOL = ("tool-friction", "tool-forces", "contact-friction", "load-friction", "friction-map")
+AT_THE_TOOL = ("tool-friction", "tool-forces", "contact-friction", "load-friction")
 TRUE_NAMES: dict[str, str] = dict.fromkeys(AT_THE_TOOL, "tool-friction")
 """Component of a model -> what a Dataset calls that force (`Q_U.<name>`, `force.<name>`), where it is not the same."""
 
@@ -117,7 +117,7 @@ def _against_measurements(
         "noise_std": posterior.noise_std.detach().cpu().numpy(),
     }
     if test.noise_std is not None:
-        acceleration["noise_floor"] = np.atleast_2d(test.noise_std).mean(axis=0) * np.sqrt(2.0 / np.pi)
+        acceleration["noise_floor"] = test.noise_std * np.sqrt(2.0 / np.pi)
     return {
         ACCELERATION: {name: plain(values) for name, values in acceleration.items()},
         ALL_JOINTS: {"nlpd": [float(predicted.negative_log_density.mean())]},

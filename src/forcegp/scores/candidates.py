@@ -13,7 +13,7 @@ from typing import Any
 
 from forcegp.data import Dataset, thruster_columns
 from forcegp.errors import FitError, InvalidInput
-from forcegp.evidence import Accelerations, Evidence, Motions, Torques, Windows, parse_evidence
+from forcegp.evidence import Accelerations, Evidence, Motions, Torques, parse_evidence
 from forcegp.fit import fit, held_out_noise
 from forcegp.forces import IndependentAccelerations, JointAccelerations, has_few_inputs
 from forcegp.model import Model
@@ -247,11 +247,10 @@ def _fit_named(
 
 
 def _fit_model(model: Model, others: Sequence[Evidence], motions: Sequence[Evidence], given: Training) -> Posterior:
-    """The posterior: functions of few inputs and laws from all rows, windows and motions from the whole recording."""
+    """The posterior: functions of few inputs and laws from all rows, motions from the whole recording."""
     few = bool(model.unknown_forces) and has_few_inputs(model.unknown, model.robot)
     every = few or (model.is_open and not model.unknown_forces)
-    windows = any(isinstance(each, Windows) for each in others)
-    rows = given.recording if windows else given.all_rows if every else given.rows
+    rows = given.all_rows if every else given.rows
     how: dict[str, Any] = {"seed": given.seed, "restarts": given.restarts}
     how |= {"iterations": None} if few else {"iterations": given.iterations, "points": len(given.rows)}
     posterior: Any = learn(model, rows, others, **how)[0]

@@ -9,7 +9,7 @@ import torch
 
 from forcegp.data import Dataset, thruster_columns
 from forcegp.errors import InvalidInput
-from forcegp.evidence import Accelerations, Evidence, Motions, Torques, Windows
+from forcegp.evidence import Accelerations, Evidence, Motions, Torques
 from forcegp.evidence.least_squares import ROUNDS, correlation_time
 from forcegp.evidence.recorded_rows import slides
 from forcegp.fit import ALL_ROWS, calibrated, default_options, default_restarts, fit
@@ -108,17 +108,16 @@ def learn(
     first, notes = others[0], []
     if motions and any(isinstance(force, IndependentAccelerations) for force in model.unknown_forces):
         raise InvalidInput("motions refine physics, and gp:independent has none; leave them out.")
-    if not model.unknown_forces and (isinstance(first, Torques) or (model.is_open and not isinstance(first, Windows))):
+    if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):
         posterior = fit(model, dataset, others, baseline=baseline, progress=_progress(report, 1, ROUNDS))
     else:
-        windows = isinstance(first, Windows)
         few = bool(model.unknown_forces) and has_few_inputs(model.unknown, model.robot)
-        everything = few and not windows and points is None and engine in ("auto", "inducing")
-        count = first.count(dataset) if isinstance(first, Windows) else len(dataset)
+        everything = few and points is None and engine in ("auto", "inducing")
+        count = len(dataset)
         points = count if everything else min(POINTS if points is None else points, count)
         options = default_options(points)
         options = options if iterations is None else replace(options, iterations=iterations)
-        how: dict[str, Any] = {} if windows else {"engine": engine, "learning_points": learning_points}
+        how: dict[str, Any] = {"engine": engine, "learning_points": learning_points}
         if everything:
             model = with_force_noise(model, dataset)
             how |= all_rows_at_once(points, model.robot.nv)

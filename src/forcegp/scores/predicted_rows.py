@@ -94,7 +94,7 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     covariance, force, multiplier = prediction.covariance, prediction.unknown_force, prediction.multiplier
     assert covariance is not None, "predict computes the covariance unless asked not to"
     covariance = _array(covariance)
-    measurement = covariance + _noise_covariance(posterior, prediction, dataset, block)
+    measurement = covariance + _noise_covariance(prediction, dataset)
     mean, mass = _array(prediction.mean), _array(dynamics.M)
     alone = u.clone()
     alone[:, list(posterior.model.held_inputs)] = 0.0  # what an observer reports is no part of the known physics
@@ -117,25 +117,17 @@ def _predict_block(posterior: Posterior, dataset: Dataset, block: slice) -> Pred
     )
 
 
-def _noise_covariance(
-    posterior: Posterior, prediction: Prediction, dataset: Dataset, block: slice
-) -> Float[np.ndarray, "*rows nv nv"]:
+def _noise_covariance(prediction: Prediction, dataset: Dataset) -> Float[np.ndarray, "*rows nv nv"]:
     """Of the measurements compared with: the model's, or the Dataset's where that is larger.
 
     The measurements may be noisier than those learned from; and a model that has learned a level of noise counts to it
-    what it cannot explain otherwise. Where the Dataset states the noise of every row, that is the noise of the
-    acceleration, times what the model's level exceeds the stated one by.
+    what it cannot explain otherwise.
     """
     noise = _array(prediction.noise_covariance)
     if dataset.noise_std is None:
         return noise
-    identity = np.eye(noise.shape[-1])
-    if dataset.noise_std.ndim == 1:
-        missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
-        return noise + np.maximum(missing, 0.0)[..., None] * identity
-    model = _array(posterior.noise_std)
-    rows = np.maximum(model / dataset.noise_level, 1.0) * dataset.noise_std[block]
-    return noise + (np.square(rows) - np.square(model))[..., None] * identity
+    missing = np.square(dataset.noise_std) - np.diagonal(noise, axis1=-2, axis2=-1)
+    return noise + np.maximum(missing, 0.0)[..., None] * np.eye(noise.shape[-1])
 
 
 def _array(values: Tensor) -> np.ndarray:

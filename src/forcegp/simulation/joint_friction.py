@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.forces.columns import LazyState
 from forcegp.forces.force import JointLaw, Law
-from forcegp.forces.friction import Viscous
+from forcegp.forces.joint_laws import LazyState, Viscous
 from forcegp.forces.registry import parse_forces
 from forcegp.robots import Robot
 

@@ -1,13 +1,12 @@
 """Latents with one input as functions in pieces, whose cost does not depend on the number of training points.
 
-A sum of Matern kernels of smoothness n - 1/2 is, between neighbouring centres, e^-u and e^-v times polynomials of
-degree n - 1, with u and v the scaled distances from the centres on both sides, for it is Markov. The same holds for
-envelopes e(s) e(s') times a Matern of a monotone curve of s; products phi(s) phi(s') need no centres at all. So the
-friction kernel and Materns have an exact form, which two passes over the sorted centres prepare; others get a table.
+Between neighbouring centres a sum of Materns is e^-u and e^-v times polynomials, for it is Markov. So the friction
+kernel and Materns have an exact form, which two passes over the sorted centres prepare; others have none.
 """
 
+import hashlib
 import math
-import sys
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,13 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.codegen.c_writer import c_text, filled
+from forcegp.codegen.graph import Graph
 from forcegp.errors import InvalidInput
-from forcegp.inference.kernel_matrices import PointMap
-from forcegp.inference.pathwise import ComposedSamples, DrawnTerm, FunctionSamples, kernel_terms
+from forcegp.inference.dense_kernels import PointMap
+from forcegp.inference.pathwise import ComposedSamples, DrawnTerm, FunctionSamples, draw_functions, kernel_terms
 from forcegp.inference.posterior import LatentPosterior
-
-MOST_INTERVALS = 2**15
-AT_ONCE = 256  # points at which a function is differentiated together: its kernel functions are kept until then
+from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum, kernel_sums
 
 CURVES: dict[str, tuple[Callable[[Tensor], Tensor], str, str]] = {
     "identity": (lambda z: z, "{z}", "{rate}"),
@@ -47,11 +45,7 @@ class OneInputFunctions:
         f_r(s) = sum_e envelope_e(s) (c_re + sum_i w_ri(u_i) exp(-u_i)),   u_i = rate_i (y_i(s) - start_i)
 
     An envelope is a product of curves y(s) (`CURVES`). Every segment has its own starts and polynomials w; a bucket and
-    a search within it find it. Without the exponential, and with w of degree 3, it is a cubic table.
-    Known from `low` to `high` and NaN elsewhere, where the caller has to evaluate.
-
-    A side is (envelope, curve, number of coefficients of w, whether it decays). `error` is the largest that was found
-    while a table was made, relative to the largest value.
+    a search within it find it. A side is (envelope, curve, number of coefficients of w).
     """
 
     knots: Float[Tensor, " K"]
@@ -61,21 +55,17 @@ class OneInputFunctions:
     constants: Float[Tensor, "R E"]
     curves: tuple[str, ...]
     envelopes: tuple[tuple[int, ...], ...]
-    sides: tuple[tuple[int, int, int, bool], ...]
-    low: float = -sys.float_info.max
-    high: float = sys.float_info.max
-    error: float = 0.0
+    sides: tuple[tuple[int, int, int], ...]
 
     def values(self, s: Float[Tensor, " n"]) -> Float[Tensor, "n R"]:
         """The functions, differentiable in s."""
         segment, first = torch.searchsorted(self.knots, s.detach().contiguous(), right=True), 0
-        s = s * torch.where((s >= self.low) & (s <= self.high), 1.0, torch.nan).to(s)
         y = [CURVES[kind][0](rate * s) for kind, rate in zip(self.curves, self.rates, strict=False)]
         levels = list(self.constants.mT[:, None].unbind())
-        for i, (envelope, curve, size, decays) in enumerate(self.sides):
+        for i, (envelope, curve, size) in enumerate(self.sides):
             # Beyond the outermost centres of a Matern one side has none, and coefficients of zero.
             u = (self.rates[len(y) + i] * (y[curve] - self.starts[segment, i])).clamp_min(0.0)
-            powers = torch.stack([u**a for a in range(size)], dim=-1) * ((-u).exp()[:, None] if decays else 1.0)
+            powers = torch.stack([u**a for a in range(size)], dim=-1) * (-u).exp()[:, None]
             w = self.polynomials[segment, :, first : first + size]
             levels[envelope] = levels[envelope] + (w @ powers[..., None])[..., 0]
             first += size
@@ -87,37 +77,37 @@ class OneInputFunctions:
         return replace(self, polynomials=self.polynomials[:, r : r + 1], constants=self.constants[r : r + 1])
 
     def table(self) -> Float[np.ndarray, " _"]:
-        """All numbers, finite: 8 of the header, rates and constants, buckets, knots, one row for every segment."""
+        """All numbers: 8 of the header, rates and constants, buckets, knots, one row for every segment."""
         parameters = torch.cat([self.rates, self.constants.flatten()]).cpu().numpy()
         rows = torch.cat([self.starts, self.polynomials.flatten(1)], dim=1).cpu().numpy()
         knots, count = self.knots.cpu().numpy(), 2 * len(self.knots)
         per_unit = count / (knots[-1] - knots[0]) if knots[-1] > knots[0] else 0.0
         # by the arithmetic of the C text, which is monotone: no rounding moves a point into a wrong bucket
         bucket = np.clip((knots - knots[0]) * per_unit, 0, count - 1).astype(int)
-        sizes = [len(knots), len(self.constants), self.low, self.high, rows.shape[1], len(parameters)]
+        sizes = [len(knots), len(self.constants), 0, 0, rows.shape[1], len(parameters)]
         parts = [[*sizes, knots[0], per_unit], parameters, bucket.searchsorted(np.arange(count + 1)), knots]
         return np.concatenate([*parts, rows.ravel()])
 
     def c_source(self, name: str) -> str:
         """`static void name(const double *table, real s, real *f, real *slope)`, R entries of f and of slope or NULL.
 
-        Functions of the same text differ by their tables only. Plain C99 for one state, where `real` is double and
-        AT(x, k) is x, and for several in the lanes of a GCC vector; needs <math.h>, r_exp, r_tanh, r_asinh, r_sqrt.
+        C99 for one state (real is double, AT(x, k) is x) or several in the lanes of a GCC vector; needs <math.h>,
+        r_exp, ....
         """
         n, E, first = len(self.curves), range(len(self.envelopes)), 0
         names = [{"z": f"(p[{i}] * s)", "y": f"y{i}", "rate": f"p[{i}]"} for i in range(n)]
         ready = [f"const real y{i} = {CURVES[kind][1].format(**names[i])};" for i, kind in enumerate(self.curves)]
         slopes = [f"({CURVES[kind][2].format(**names[i])})" for i, kind in enumerate(self.curves)]
         found, values, lanes, changes = [], [], [f"AT(g{e}, k) = c[{e}];" for e in E], [[] for _ in E]
-        for i, (envelope, curve, size, decays) in enumerate(self.sides):
-            w, rate, decay = [f"w{first + a}" for a in range(size)], f"p[{n + i}]", f"exp{i}" if decays else "1.0"
+        for i, (envelope, curve, size) in enumerate(self.sides):
+            w, rate = [f"w{first + a}" for a in range(size)], f"p[{n + i}]"
             found += [f"AT(u{i}, k) = {rate} * (AT(y{curve}, k) - row[k][{i}]);", f"AT(u{i}, k) *= AT(u{i}, k) > 0.0;"]
             lanes += [f"AT({c}, k) = row[k][{len(self.sides)} + {self.polynomials.shape[2]} * r + {c[1:]}];" for c in w]
-            values.append(f"const real a{i} = {_horner(w, f'u{i}')} * {decay}; g{envelope} = g{envelope} + a{i};")
+            values.append(f"const real a{i} = {_horner(w, f'u{i}')} * exp{i}; g{envelope} = g{envelope} + a{i};")
             change = _horner([f"{a}.0 * {w[a]}" for a in range(1, size)] or ["0.0"], f"u{i}")
-            changes[envelope].append(f"{rate} * {slopes[curve]} * ({change} * {decay}{f' - a{i}' * decays})")
+            changes[envelope].append(f"{rate} * {slopes[curve]} * ({change} * exp{i} - a{i})")
             first += size
-        decaying = [f"const real exp{i} = r_exp(-u{i});" for i, side in enumerate(self.sides) if side[3]]
+        decaying = [f"const real exp{i} = r_exp(-u{i});" for i in range(len(self.sides))]
         slope = [_times(self.envelopes[e], f"({' + '.join(part)})") for e, part in enumerate(changes) if part]
         for e, factors in enumerate(self.envelopes):
             slope += [f"{slopes[i]} * {_times(factors[:k] + factors[k + 1 :], f'g{e}')}" for k, i in enumerate(factors)]
@@ -130,61 +120,13 @@ class OneInputFunctions:
         return filled(c_text(__name__, "one_input.c"), words)
 
 
-def cubic_table(
-    function: Callable[[Tensor], Tensor], centers: Float[Tensor, " N"], margin: float, tolerance: float
-) -> OneInputFunctions | None:
-    """Cubic polynomials between values and slopes of `function`, s (n,) -> (n, R), with a continuous derivative.
-
-    They reach `margin` times the range of the centres beyond these. Intervals are halved until the error at five points
-    of each, and at the centres, near which functions may be narrow, is at most half of `tolerance` times the largest
-    value. None where `MOST_INTERVALS` do not suffice.
-    """
-    places = centers.unique()
-    more = margin * float(places[-1] - places[0] or places[0].abs().clamp_min(1.0))
-    x = torch.linspace(float(places[0]) - more, float(places[-1]) + more, 33).to(places)
-    inner, done, error = x.new_tensor([0.11, 0.3, 0.5, 0.71, 0.88]), x[1:] < x[0], x.new_zeros(())
-    f, d = value_and_slope(function, x)
-    while len(x) <= MOST_INTERVALS:
-        table = _hermite(x, f, d)
-        points = torch.cat([(x[:-1, None] + inner * x.diff()[:, None])[~done].flatten(), places])
-        inside = torch.searchsorted(x[1:-1].contiguous(), points, right=True)
-        points, inside = points[~done[inside]], inside[~done[inside]]
-        with torch.no_grad():
-            exact = torch.cat([function(part) for part in points.split(AT_ONCE)])
-        largest = torch.cat([f, exact]).abs().max().clamp_min(sys.float_info.min)
-        worst = x.new_zeros(len(done)).scatter_reduce(0, inside, (table.values(points) - exact).abs().amax(1), "amax")
-        done |= worst <= 0.5 * tolerance * largest  # half, for between the points it may be larger
-        error = torch.maximum(error, (worst * done).max() / largest)
-        if done.all():
-            return replace(table, error=float(error))
-        x, order = torch.cat([x, (0.5 * (x[:-1] + x[1:]))[~done]]).sort()
-        new_f, new_d = value_and_slope(function, x[order >= len(f)])
-        f, d = torch.cat([f, new_f])[order], torch.cat([d, new_d])[order]
-        done = done.repeat_interleave(2 - done.int())
-    return None
-
-
 def value_and_slope(function: Callable[[Tensor], Tensor], s: Float[Tensor, " n"]) -> tuple[Tensor, Tensor]:
     """R functions (n, R) of one input and their derivatives, by automatic differentiation."""
-    found = []
-    for part in s.detach().split(AT_ONCE):
-        with torch.enable_grad():
-            at = part.clone().requires_grad_()
-            f = function(at)
-            sums = (f + 0.0 * at[:, None]).sum(0).unbind()  # constants have a derivative, too
-            found.append(
-                (f.detach(), torch.stack([torch.autograd.grad(y, at, retain_graph=True)[0] for y in sums], -1))
-            )
-    return torch.cat([f for f, _ in found]), torch.cat([slope for _, slope in found])
-
-
-def _hermite(x: Float[Tensor, " K"], f: Float[Tensor, "K R"], d: Float[Tensor, "K R"]) -> OneInputFunctions:
-    h, left, right = x.diff()[:, None], d[:-1], d[1:]
-    step = (f[1:] - f[:-1]) / h
-    w = torch.stack([f[:-1], left, (3.0 * step - 2.0 * left - right) / h, (left + right - 2.0 * step) / h**2], dim=-1)
-    starts, w = (torch.cat([part[:1], part, part[-1:]]) for part in (x[:-1, None], w))  # at its ends it is still known
-    curves, sides, none = ("identity",), ((0, 0, 4, False),), 0.0 * f[0, :, None]
-    return OneInputFunctions(x, starts, w, x.new_ones(2), none, curves, ((),), sides, float(x[0]), float(x[-1]))
+    with torch.enable_grad():
+        at = s.detach().clone().requires_grad_()
+        f = function(at)
+        sums = (f + 0.0 * at[:, None]).sum(0).unbind()  # constants have a derivative, too
+        return f.detach(), torch.stack([torch.autograd.grad(y, at, retain_graph=True)[0] for y in sums], -1)
 
 
 def _horner(coefficients: list[str], u: str) -> str:
@@ -198,44 +140,31 @@ def _times(factors: tuple[int, ...], value: str) -> str:
 MATERN = {0.5: (1.0,), 1.5: (1.0, 1.0), 2.5: (1.0, 1.0, 1.0 / 3.0)}
 """Smoothness nu -> p with k = sum_a p_a u^a e^-u, u = sqrt(2 nu) r (Rasmussen & Williams 2006, eq. 4.17)."""
 
-TOLERANCE = 1e-8
-MARGIN = 0.25  # of a table beyond the centres, as a fraction of their range
 FAR = 1e30  # there tanh(s / w) is 1, and s times the derivative of asinh(s / w), for any width w
 
 
 def one_input_form(
-    latent: LatentPosterior,
-    index: int,
-    coefficients: Float[Tensor, "N R"] | None = None,
+    latent: LatentPosterior, index: int, coefficients: Float[Tensor, "N R"] | None = None
 ) -> OneInputFunctions | None:
-    """sum_j k(z, z_j) c_jr of one latent in the form that suits its kernel; without coefficients, its posterior mean.
-
-    A table is at most `TOLERANCE` of the largest value from the sum and reaches `MARGIN` beyond the centres. None for
-    several inputs and where `MOST_INTERVALS` do not suffice.
-    """
-    centers, kernel = latent.features[index].detach(), latent.kernels.dense[index]
-    if centers.shape[-1] != 1:
-        return None
-    weights = latent.weights[index].detach()[:, None] if coefficients is None else coefficients.detach()
-    exact = markov_functions(latent.kernels[index], centers[:, 0], weights)
-    if exact is not None:
-        return exact
-    return cubic_table(lambda s: kernel.cross(s[:, None], centers) @ weights, centers[:, 0], MARGIN, TOLERANCE)
-
-
-def drawn_form(
-    drawn: FunctionSamples | ComposedSamples, latent: LatentPosterior, index: int, tolerance: float = TOLERANCE
-) -> OneInputFunctions | None:
-    """S drawn functions of one latent: exact where without cosines, else a table. None as in `one_input_form`."""
+    """sum_j k(z, z_j) c_jr of one latent; without coefficients, its posterior mean. None for kernels without a form."""
     centers = latent.features[index].detach()
     if centers.shape[-1] != 1:
         return None
-    if isinstance(drawn, ComposedSamples) and not any(term.frequencies for term in drawn.terms[index]):
-        beta, terms = drawn.beta[index].mT, drawn.terms[index]
-        exact = markov_functions(latent.kernels[index], centers[:, 0], beta, terms, drawn.widening)
-        if exact is not None:
-            return exact
-    return cubic_table(lambda s: drawn.one(index, s[:, None]).mT, centers[:, 0], MARGIN, tolerance)
+    weights = latent.weights[index].detach()[:, None] if coefficients is None else coefficients.detach()
+    return markov_functions(latent.kernels[index], centers[:, 0], weights)
+
+
+def drawn_form(
+    drawn: FunctionSamples | ComposedSamples, latent: LatentPosterior, index: int
+) -> OneInputFunctions | None:
+    """S drawn functions of one latent; None as in `one_input_form`, and for functions that have cosines."""
+    centers = latent.features[index].detach()
+    if centers.shape[-1] != 1 or not isinstance(drawn, ComposedSamples):
+        return None
+    terms = drawn.terms[index]
+    if any(term.frequencies for term in terms):
+        return None
+    return markov_functions(latent.kernels[index], centers[:, 0], drawn.beta[index].mT, terms, drawn.widening)
 
 
 def markov_functions(
@@ -285,7 +214,7 @@ def markov_functions(
             own = slice(first, first := first + len(grids[number]))
             weights[own] += root * _news(drawn[number]).mT
         polynomial, rate = MATERN[factor.shape], math.sqrt(2.0 * factor.shape) * abs(amplitude)
-        side = list(constants).index(key), curves.setdefault(curve, len(curves)), len(polynomial), True
+        side = list(constants).index(key), curves.setdefault(curve, len(curves)), len(polynomial)
         y = CURVES[curve[0]][0](curve[1] * knots)
         at_knots = torch.zeros_like(weights[: len(knots)]).index_add_(0, place, weights).cpu().numpy()
         h = rate * y.diff().cpu().numpy()
@@ -359,3 +288,129 @@ def _curve(points: PointMap, centers: Float[Tensor, " N"]) -> tuple[float, tuple
             if amplitude and bool(((points(probes[:, None])[:, 0] - expected).abs() <= 1e-13 * expected.abs()).all()):
                 return amplitude, curve
     return 0.0, None
+
+
+@dataclass(frozen=True, eq=False)
+class OneInputCall:
+    """One latent by the pieces of its mean; `summed` is the same latent as a sum, of which its prior variance is taken.
+
+    `roots` are the functions of the compressed covariance, filled up to whole vectors.
+    """
+
+    summed: KernelSum
+    functions: OneInputFunctions
+    roots: OneInputFunctions | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the C function."""
+        return self.summed.name
+
+    @property
+    def latents(self) -> tuple[int, ...]:
+        """Its number."""
+        return self.summed.latents
+
+    @property
+    def operands(self) -> list[int]:
+        """As many as `given` returns."""
+        return [0]
+
+    def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
+        """The feature itself."""
+        return list(z)
+
+    def variance(self, graph: Graph, z: Sequence[int]) -> list[int]:
+        """Its prior variance at the feature z."""
+        return self.summed.variance(graph, z)
+
+    def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
+        """The node of E f at the feature z."""
+        return graph.call(self.name + ("_slopes" if slopes else ""), z, 1, {(0, 0): 1} if slopes else None)
+
+    def table(self) -> np.ndarray:
+        """Of the mean."""
+        return self.functions.table()
+
+    def root_table(self) -> np.ndarray:
+        """Of the roots."""
+        assert self.roots is not None, "asked for with a compressed covariance only"
+        return self.roots.table()
+
+    def c_source(self, lanes: int, slopes: bool) -> str:
+        """`NAME(table, live, z, f)`, or NAME_slopes with the derivative after the value."""
+        name = self.name + ("_slopes" if slopes else "")
+        pieces, called = _once(self.functions, "pieces", 1)
+        call = f"(void)live; {called}(t, z[0], f, {'f + 1' if slopes else '0'});"
+        return f"{pieces}static APART void {name}(const double *t, long live, const real *z, real *f) {{ {call} }}"
+
+    def roots_source(self, lanes: int, rank: int) -> str:
+        """`NAME_roots(t, F, z, P)`: P (rank) from the table F, for one state."""
+        assert self.roots is not None, "asked for with a compressed covariance only"
+        pieces, called = _once(self.roots, "roots", lanes)
+        head = f"static void {self.name}_roots(const double *t, const double *F, const double *z, double *P)"
+        return f"{pieces}{head} {{ (void)t; {called}(F, z[0], P, 0); }}"
+
+
+LatentCall = KernelSum | OneInputCall
+
+
+def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | None) -> tuple[LatentCall, ...]:
+    """The processes as C functions, in the form that suits each. Raises InvalidInput for an untraceable kernel."""
+    found: list[LatentCall] = []
+    sums = kernel_sums(latent)
+    factors = [None] * len(sums) if compressed is None else compressed.factors
+    for part, F in zip(sums, factors, strict=True):
+        rank = 0 if F is None else F.shape[-1]
+        roots = None if F is None else torch.nn.functional.pad(F, (0, -rank % PADDING))
+        index = part.latents[0]
+        functions = one_input_form(latent, index) if len(part.latents) == 1 else None
+        if functions is None:
+            found.append(replace(part, roots=roots))
+        else:
+            found.append(
+                OneInputCall(part, functions, None if roots is None else one_input_form(latent, index, roots[0]))
+            )
+    return tuple(found)
+
+
+def refreshed_calls(calls: Sequence[LatentCall], latent: LatentPosterior) -> tuple[LatentCall, ...]:
+    """The same C functions with the tables of another posterior with the same kernels. Raises InvalidInput if none."""
+    found: list[LatentCall] = []
+    for part in calls:
+        index = part.latents[0]
+        if isinstance(part, OneInputCall) and (form := one_input_form(latent, index)) is not None:
+            found.append(replace(part, functions=form))
+        elif isinstance(part, KernelSum) and part.level == (0.0,):  # else its program holds sums of the weights
+            found.append(replace(part, centers=latent.features[index], weights=latent.weights[index].detach()[None]))
+    if [part.c_source(1, True) for part in found] != [part.c_source(1, True) for part in calls]:
+        raise InvalidInput(
+            "the predictor's programs hold numbers of the posterior, as of squared exponential kernels of latents with "
+            "the same features; make a new one by posterior.predictor()."
+        )
+    return tuple(found)
+
+
+def drawn_calls(
+    latent: LatentPosterior, calls: Sequence[LatentCall], samples: int, seed: int, widening: float
+) -> list[tuple[LatentCall, ...]] | None:
+    """The functions that `draw_functions` draws, in the forms that `calls` have; None where one has no such form."""
+    drawn = draw_functions(latent, samples, seed, widening)
+    forms = []
+    for part in calls:
+        index = part.latents[0]
+        form = drawn_form(drawn, latent, index)
+        if form is None:
+            return None
+        forms.append((part.summed if isinstance(part, OneInputCall) else part, form))
+    return [tuple(OneInputCall(summed, form.only(r)) for summed, form in forms) for r in range(samples)]
+
+
+def _once(functions: OneInputFunctions, purpose: str, lanes: int) -> tuple[str, str]:
+    """The C text, which is skipped where it stands already, and the name of its function."""
+    text = functions.c_source("NAME").replace("static void", "static APART void", 1)
+    if purpose == "roots" and lanes > 1:  # one state is a double
+        text = re.sub(r"AT\((\w+), k\)", r"\1", re.sub(r"\breal\b", "double", text))
+        text = re.sub(r"\br_(exp|tanh|asinh|sqrt)\b", r"\1", text.replace("LANES", "1"))
+    name = f"{purpose}_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    return f"#ifndef {name}_\n#define {name}_\n{text.replace('NAME', name)}#endif\n", name

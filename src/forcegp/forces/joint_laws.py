@@ -1,0 +1,249 @@
+"""Laws that act in every joint by itself: friction, offsets, springs, rotors; and what each needs of the torque."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput
+from forcegp.forces.force import Coefficient, JointLaw, Law, Number, as_numbers
+from forcegp.mechanics.gauss_principle import State
+from forcegp.robots import Kinematics, Robot
+
+
+@dataclass(frozen=True, eq=False)
+class Viscous(JointLaw):
+    """-d v with d in Nms/rad or Ns/m: one number, one per joint, or by joint name (joints not named have none)."""
+
+    damping: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {"damping": Coefficient("force/velocity")}
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return -parameters["damping"] * features[0]
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionalFriction(JointLaw):
+    """-e |v| with e in Nms/rad or Ns/m, of either sign: viscous friction that differs by e from its mean by direction.
+
+    With `Viscous` d it is d + e forwards and d - e backwards; `Offset` does the same for dry friction.
+    """
+
+    difference: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {"difference": Coefficient("force/velocity", lowest=-np.inf)}
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        return (state.v.abs(),)
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return -parameters["difference"] * features[0]
+
+
+DRY = "dry friction"
+VELOCITY_SCALE = Coefficient("velocity", 0.01, 0.1, 0.03, 20.0, logarithm=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Coulomb(JointLaw):
+    """-c tanh(v / w): dry friction of `level` c in Nm or N, smoothed below `velocity_scale` w (rad/s or m/s)."""
+
+    level: Number = None
+    velocity_scale: Number = None
+    part: ClassVar[str] = DRY
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {"level": Coefficient(), "velocity_scale": VELOCITY_SCALE}
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return -parameters["level"] * torch.tanh(features[0] / parameters["velocity_scale"])
+
+
+@dataclass(frozen=True, eq=False)
+class Stribeck(JointLaw):
+    """-(c + b exp(-(v / v_s)^2)) tanh(v / w): dry friction that falls from c + b near rest to c in motion.
+
+    `level` c, `breakaway` b in Nm or N, `stribeck_velocity` v_s, `velocity_scale` w in rad/s or m/s (Olsson et al.
+    1998, eq. 4, with a smooth sign).
+    """
+
+    level: Number = None
+    breakaway: Number = None
+    stribeck_velocity: Number = None
+    velocity_scale: Number = None
+    part: ClassVar[str] = DRY
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {
+        "level": Coefficient(),
+        "breakaway": Coefficient(),
+        "stribeck_velocity": Coefficient("velocity", 0.1, 0.3, 0.1, 10.0, logarithm=True),
+        "velocity_scale": VELOCITY_SCALE,
+    }
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        c, b, v_s, w = (parameters[name] for name in self.coefficients)
+        return -(c + b * torch.exp(-((features[0] / v_s) ** 2))) * torch.tanh(features[0] / w)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadFriction(JointLaw):
+    """-(c + mu |u|) tanh(v / w): dry friction of a gear, which grows with the torque of the actuator.
+
+    `level` c in Nm or N, `factor` mu without unit, `velocity_scale` w in rad/s or m/s (Hamon, Gautier & Garrec, IROS
+    2010, with the output torque).
+    """
+
+    level: Number = None
+    factor: Number = None
+    velocity_scale: Number = None
+    part: ClassVar[str] = DRY
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {
+        "level": Coefficient(),
+        "factor": Coefficient("1", highest=0.9),
+        "velocity_scale": VELOCITY_SCALE,
+    }
+    under_load: ClassVar[bool] = True
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        return state.v, state.delivered.abs()
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        c, mu, w = (parameters[name] for name in self.coefficients)
+        return -(c + mu * features[1]) * torch.tanh(features[0] / w)
+
+
+@dataclass(frozen=True, eq=False)
+class Offset(JointLaw):
+    """A constant of either sign in Nm or N: the offset of a torque sensor, or friction that differs by direction."""
+
+    value: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {"value": Coefficient(lowest=-np.inf)}
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return parameters["value"] + torch.zeros_like(features[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Spring(JointLaw):
+    """-k (q - q0): a spring of `stiffness` k (Nm/rad or N/m) in each joint, at rest at the position `rest` q0."""
+
+    stiffness: Number = None
+    rest: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {
+        "stiffness": Coefficient("force/position"),
+        "rest": Coefficient("position", factor=1.0, lowest=-np.inf),
+    }
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        return (state.positions,)
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return -parameters["stiffness"] * (features[0] - parameters["rest"])
+
+
+@dataclass(frozen=True, eq=False)
+class Rotor(JointLaw):
+    """Rotor inertia seen at the joint (kg m^2 or kg), added to the mass matrix on top of the robot's own `armature`."""
+
+    inertia: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {"inertia": Coefficient("inertia")}
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return torch.zeros_like(features[0])
+
+    @override
+    def inertia_basis(self, robot: Robot) -> Tensor:
+        T = self._turning(robot)
+        return T[:, :, None] * T[:, None, :]
+
+    def _turning(self, robot: Robot) -> Tensor:
+        return torch.eye(robot.nv, dtype=torch.float64, device=robot.device)
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledRotors(Rotor):
+    """Rotors that turn with several joints: T^T diag(I) T added to the mass matrix, for rotor speeds T v.
+
+    `inertia` I: one rotor per joint (kg m^2); `transmission` T (nv, nv): how fast each turns about its axis, in a frame
+    that does not, per joint velocity; None: the identity. A motor on a moving link also turns with that link.
+    Gyroscopic forces are left out. Source: Murphy, Wen & Saridis, ICRA 1990.
+    """
+
+    transmission: Sequence[Sequence[float]] | Tensor | None = None
+
+    @override
+    def bound_to(self, robot: Robot) -> "CoupledRotors":
+        given = torch.eye(robot.nv).tolist() if self.transmission is None else self.transmission
+        matrix = as_numbers("CoupledRotors transmission", given, robot, f"{robot.nv} rows of numbers")
+        if matrix.shape != (robot.nv, robot.nv) or not bool(torch.isfinite(matrix).all()):
+            raise InvalidInput(
+                f"CoupledRotors transmission has shape {tuple(matrix.shape)}; {robot.name} needs a finite matrix "
+                f"({robot.nv}, {robot.nv}): a row per rotor, a column per joint {', '.join(robot.joint_names)}."
+            )
+        return replace(super().bound_to(robot), transmission=matrix)
+
+    @override
+    def _turning(self, robot: Robot) -> Tensor:
+        return torch.as_tensor(self.transmission)
+
+
+Values = Float[np.ndarray, "rows nv"]
+Inputs = Float[np.ndarray, "rows nu"]
+
+
+class LazyState(State):
+    """A state, unchecked, whose kinematics are computed where a law asks for them: most laws of joints do not."""
+
+    def __init__(self, robot: Robot, q: Tensor, v: Tensor, u: Tensor) -> None:
+        given = {"q": q, "v": v, "u": u, "robot": robot, "bodies": None, "inputs": (), "delivered_by": None}
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def kinematics(self) -> Kinematics:  # type: ignore[override]  # a field of a `State`
+        """Of all bodies."""
+        return self.robot.kinematics(self.q, self.v)
+
+
+def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: Inputs, a: Values) -> list[Values]:
+    """The torque [Nm or N] that each law of joints needs at these states, of numbers that it is given.
+
+    Laws without numbers count as 1: of a law that is linear in its first coefficient the column is the regressor.
+    """
+    state = LazyState(robot, *(torch.tensor(np.array(x), device=robot.device) for x in (q, v, u)))
+    out = []
+    for law in laws:
+        if not isinstance(law, JointLaw):
+            continue
+        first = next(iter(law.coefficients))
+        own = (law.with_values({first: 1.0}) if first in law.learned else law).bound_to(robot)  # type: ignore[dict-item]  # a number is one of what coefficients take
+        with torch.no_grad():
+            needed = -own.force(state).cpu().numpy()
+            inertia = own.added_inertia(robot)
+        out.append(needed if inertia is None else needed + a @ inertia.cpu().numpy().T)
+    return out
+
+
+def usual_columns(
+    robot: Robot, q: np.ndarray, v: Values, u: Values, a: Values, widths: Iterable[float]
+) -> list[Values]:
+    """Of a rotor, viscous friction, dry friction of several widths, and an offset.
+
+    Widths are relative to the root mean square velocity; several of them together are nearly any curve of friction.
+    """
+    speed = np.square(v).mean(axis=0) ** 0.5 + 1e-12
+    dry = (Coulomb(1.0, torch.tensor(width * speed)) for width in widths)
+    return law_columns([Rotor(), Viscous(), *dry, Offset(-1.0)], robot, q, v, u, a)

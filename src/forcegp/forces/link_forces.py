@@ -1,0 +1,381 @@
+"""Unknown forces on one link: at a point of it (`ToolForces`), on a base that moves, and those of air."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.forces.actuation import ObservedWind
+from forcegp.forces.unknown import SharedInputs
+from forcegp.mechanics import ConstrainedDynamics, Contact, LoopClosure, State, surface_axes
+from forcegp.mechanics.gauss_principle import placed
+from forcegp.robots import Robot
+from forcegp.robots.manifold import VELOCITIES
+
+
+@dataclass(frozen=True, eq=False)
+class ToolPoint:
+    """A point fixed in a link: world position [m], Jacobian (linear; angular) and orientation of the link's axes."""
+
+    position: Float[Tensor, "*batch 3"]
+    jacobian: Float[Tensor, "*batch 6 nv"]
+    orientation: Float[Tensor, "*batch 3 3"]
+
+    @classmethod
+    def of(cls, dynamics: ConstrainedDynamics, frame: str, point: Sequence[float]) -> "ToolPoint":
+        """At every state of the dynamics. Raises UnknownFrame."""
+        kinematics = dynamics.state.kinematics
+        axes, position = placed(kinematics, frame, point)
+        return cls(position, kinematics.frame_jacobian(frame, tuple(point)), axes)
+
+    @classmethod
+    def of_contact(cls, dynamics: ConstrainedDynamics, contact: int) -> "ToolPoint":
+        """The point that touches."""
+        touching = dynamics.contacts[contact]
+        return cls.of(dynamics, touching.frame, touching.point)
+
+    def velocity(self, v: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch 6"]:
+        """Linear [m/s] and angular velocity [rad/s] in world axes."""
+        return (self.jacobian @ v[..., None])[..., 0]
+
+
+def contact_axes(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch 3 3"]:
+    """Tangents t1, t2 and normal n of a contact's surface, as columns in world axes."""
+    return surface_axes(dynamics.normals[..., contact, :])
+
+
+def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch"]:
+    """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
+    size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
+    return size * dynamics.multiplier_map().offset[..., contact].abs()
+
+
+def finite_numbers(given: object) -> tuple[float, ...] | None:
+    """`given` as finite floats, None where it is anything else."""
+    try:
+        numbers = tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
+    except (TypeError, ValueError):
+        return None
+    return numbers if not isinstance(given, str) and all(map(math.isfinite, numbers)) else None
+
+
+def is_contact_number(value: object) -> bool:
+    """Whether it can be the number of a contact, counted from 0."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> None:
+    """Raise InvalidInput if there is no such contact to slide on."""
+    sliding = (not isinstance(each, LoopClosure) for each in contacts)
+    numbers = [index for index, slides in enumerate(sliding) if slides]
+    if contact not in numbers:
+        have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
+        raise InvalidInput(
+            f"{force} acts at contact {contact}, but the model has {have}; give the contact (`contacts`), or use a "
+            "force that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."
+        )
+
+
+def require_moving(prior: str, frame: str, robot: Robot) -> None:
+    """Raise UnknownFrame for a frame that does not exist, InvalidInput for one that is fixed in the world."""
+    body, _ = robot.frame(frame)
+    if body < 0:
+        moving = [name for name in robot.link_names if robot.frame(name)[0] >= 0]
+        raise InvalidInput(
+            f"{prior} acts on frame {frame!r}, which is fixed in the world and never moves, so its forces move "
+            f"nothing; give a frame of a moving link: {', '.join(moving)}."
+        )
+
+
+AXES = {"world": ("x", "y", "z"), "tool": ("tool-x", "tool-y", "tool-z"), "surface": ("tangent-1", "tangent-2")}
+"""Axes of a force at the tool, and what they are called."""
+SMALLEST_SPEED = 1e-6
+"""m/s, below which a direction of motion means nothing: far below any velocity scale of friction."""
+
+
+@dataclass(frozen=True)
+class ToolForces(SharedInputs):
+    """Q_U = J_p^T E f(z): a force (N) with components f along the axes E at a point.
+
+    frame, point: the link and the point in it (m). Without a frame: where contact number `contact` touches, whatever it
+        is.
+    axes: "world", "tool" (those of the link) or "surface": the two tangents of the contact's surface. Along its normal
+        an ideal contact takes every force, so there is no such latent; without the contact the force is zero.
+    inputs: "velocity" and "position" of the point along the same axes ("tool": the position along those of the world).
+        Velocities are only scaled, so that a linear kernel is viscous friction.
+    kernel: an expression of `forcegp.forces.kernel_of`.
+    """
+
+    frame: str | None = None
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axes: str = "surface"
+    inputs: tuple[str, ...] = ("velocity",)
+    contact: int = 0
+    kernel: str = "linear + squared-exponential"
+    allowed: ClassVar[tuple[str, ...]] = ("velocity", "position")
+    from_zero: ClassVar[tuple[str, ...]] = ("velocity",)
+
+    @usable_arguments("ToolForces")
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.frame is None or isinstance(self.frame, str)):
+            raise InvalidInput(f"ToolForces frame is {self.frame!r}; give the name of a link, or None for the contact.")
+        point = finite_numbers(self.point)
+        if self.axes not in AXES or point is None or len(point) != 3 or not is_contact_number(self.contact):
+            raise InvalidInput(
+                f"ToolForces has axes {self.axes!r}, point {self.point!r} and contact {self.contact!r}; give axes "
+                f"{' or '.join(map(repr, AXES))}, a point of three numbers in m, and a contact's number from 0."
+            )
+        object.__setattr__(self, "point", point)
+
+    @property
+    @override
+    def title(self) -> str:
+        return "tool-forces" if "position" in self.inputs else "tool-friction"
+
+    @property
+    def _needs_contact(self) -> bool:
+        return self.frame is None or self.axes == "surface"
+
+    @override
+    def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
+        if self._needs_contact:
+            require_contact(f"ToolForces(frame={self.frame!r}, axes={self.axes!r})", self.contact, contacts)
+        if self.frame is not None:
+            require_moving("ToolForces", self.frame, robot)
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        return tuple(f"force-{name}" for name in AXES[self.axes])
+
+    @override
+    def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        where = self._point(dynamics)
+        if where is None:
+            return torch.zeros_like(dynamics.H[..., :1]).expand(*dynamics.H.shape[:-1], len(AXES[self.axes]))
+        return where.jacobian[..., :3, :].mT @ self._directions(dynamics, where)
+
+    @override
+    def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
+        where = self._point(dynamics)
+        if where is None:
+            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, len(AXES[self.axes]))
+        return self._directions(dynamics, where)
+
+    @override
+    def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
+        state, where = dynamics.state, self._point(dynamics)
+        if where is None:  # the force is zero whatever its features are
+            nothing = {name: state.q.new_zeros(*state.q.shape[:-1], len(x)) for name, x in self._sizes.items()}
+            return {name: lambda zeros=zeros: zeros for name, zeros in nothing.items()}
+        axes = self._directions(dynamics, where)
+        return {
+            "velocity": lambda: _along(axes, where.velocity(state.v)[..., :3]),
+            "position": lambda: _along(axes, where.position) if self.axes == "surface" else where.position,
+        }
+
+    @property
+    def _sizes(self) -> dict[str, Sequence[str]]:
+        return {"velocity": AXES[self.axes], "position": AXES[self.axes] if self.axes == "surface" else "xyz"}
+
+    @override
+    def labels(self, robot: Robot) -> dict[str, Sequence[str]]:
+        units = {"velocity": "m/s", "position": "m"}
+        return {what: [f"tool {what} along {x} [{units[what]}]" for x in along] for what, along in self._sizes.items()}
+
+    @override
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
+        return ("N",) * len(AXES[self.axes])
+
+    def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint | None:
+        """None where the force belongs to a contact that the constraint does not have."""
+        if self._needs_contact and self.contact >= len(dynamics.contacts):
+            return None
+        if self.frame is None:
+            return ToolPoint.of_contact(dynamics, self.contact)
+        return ToolPoint.of(dynamics, self.frame, self.point)
+
+    def _directions(self, dynamics: ConstrainedDynamics, where: ToolPoint) -> Float[Tensor, "*batch 3 k"]:
+        if self.axes == "surface":
+            return _containing(contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3])
+        if self.axes == "tool":
+            return where.orientation
+        identity = torch.eye(3, dtype=where.position.dtype, device=where.position.device)
+        return identity.expand_as(where.orientation)
+
+
+def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 2"]:
+    """Tangents t + n (t v_t) v_n / |v|^2, since what resists a point resists its drift off the surface, too."""
+    tangents, normal = axes[..., :2], axes[..., 2:]
+    along, off = _along(tangents, velocity), _along(normal, velocity)
+    tilt = along * off / velocity.square().sum(-1, keepdim=True).clamp_min(SMALLEST_SPEED**2)
+    return tangents + normal * tilt[..., None, :]
+
+
+def _along(axes: Float[Tensor, "*batch 3 k"], vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch k"]:
+    return (axes.mT @ vector[..., None])[..., 0]
+
+
+BASE_INPUTS = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation", "height", "attitude")
+
+
+@dataclass(frozen=True)
+class BaseWrench(SharedInputs):
+    """Q_U = J^T E f(z): a force [N] and a torque [Nm] on a link, along the link's own axes E and about its origin.
+
+    frame: the link; None stands for the first that moves freely, the trunk or body of the robot.
+    inputs: "velocity" (along the link's axes), "drag" (|velocity| velocity), "rotor-drag" (the root of the thrust times
+        velocity), "angular-velocity", "actuation" (force and torque of all actuators on the free base) or "thrust"
+        (those along z and about all axes), "height" of the link, "attitude" (the world's axes in those of the link).
+    kernel: an expression of `forcegp.forces.kernel_of`.
+    """
+
+    frame: str | None = None
+    inputs: tuple[str, ...] = ("velocity", "angular-velocity", "attitude")
+    kernel: str = "linear + squared-exponential"
+    allowed: ClassVar[tuple[str, ...]] = BASE_INPUTS
+    from_zero: ClassVar[tuple[str, ...]] = BASE_INPUTS[:-2]
+
+    @usable_arguments("BaseWrench")
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.frame is None or isinstance(self.frame, str)):
+            raise InvalidInput(f"{type(self).__name__} frame is {self.frame!r}; give the name of a link, or None.")
+
+    @override
+    def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
+        require_moving(type(self).__name__, self.link(robot), robot)
+
+    def link(self, robot: Robot) -> str:
+        """The link that the force acts on. Raises InvalidInput where none is named and none moves freely."""
+        if self.frame is not None:
+            return self.frame
+        if not robot.layout.groups:
+            raise InvalidInput(
+                f"{type(self).__name__} acts on a base that moves, and {robot.name} is fixed to the world; read it "
+                "with base='floating', or name a link: frame=..."
+            )
+        body = robot.layout.groups[0].bodies.stop - 1
+        return next(name for name in robot.link_names if robot.frame(name)[0] == body)
+
+    @override
+    def latent_names(self, robot: Robot) -> tuple[str, ...]:
+        return tuple(f"{what}-{axis}" for what in ("force", "torque") for axis in "xyz")
+
+    @override
+    def latent_units(self, robot: Robot) -> tuple[str, ...]:
+        return ("N",) * 3 + ("Nm",) * 3
+
+    @override
+    def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
+        where = self._point(dynamics)
+        parts = where.jacobian[..., :3, :], where.jacobian[..., 3:, :]
+        return torch.cat([part.mT @ where.orientation for part in parts], dim=-1)
+
+    @override
+    def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
+        axes = self._point(dynamics).orientation
+        return torch.cat([axes, torch.zeros_like(axes)], dim=-1)
+
+    @override
+    def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
+        state, where = dynamics.state, self._point(dynamics)
+        moving, turning = where.velocity(state.v).split(3, dim=-1)
+        linear, angular = (
+            (where.orientation.mT @ part[..., None])[..., 0] for part in (moving - self._flow(state), turning)
+        )
+        return {
+            "velocity": lambda: linear,
+            "drag": lambda: (linear.square().sum(-1, keepdim=True) + 1e-12).sqrt() * linear,
+            "rotor-drag": lambda: _root_of_thrust(state) * linear,
+            "angular-velocity": lambda: angular,
+            "thrust": lambda: state.delivered[..., _base_rows(state.robot)][..., _thrust(state.robot)],
+            "actuation": lambda: state.delivered[..., _base_rows(state.robot)],
+            "height": lambda: where.position[..., 2:],
+            "attitude": lambda: where.orientation.flatten(-2),
+        }
+
+    def _flow(self, state: State) -> Tensor | float:
+        """The velocity of what the link moves through, along the axes of the world."""
+        return 0.0
+
+    @override
+    def labels(self, robot: Robot) -> dict[str, Sequence[str]]:
+        link, groups = self.link(robot), robot.layout.groups
+        parts = VELOCITIES if groups else robot.joint_names
+        units = ["N" if part in "xyz" else "Nm" for part in parts]
+        pushes = [f"actuation along {part} [{unit}]" for part, unit in zip(parts, units, strict=True)]
+        return {
+            "velocity": [f"velocity of {link} along its {axis} [m/s]" for axis in "xyz"],
+            "drag": [f"speed times velocity of {link} along its {axis} [m^2/s^2]" for axis in "xyz"],
+            "rotor-drag": [f"root of thrust times velocity of {link} along its {axis} [N^1/2 m/s]" for axis in "xyz"],
+            "angular-velocity": [f"angular velocity of {link} about its {axis} [rad/s]" for axis in "xyz"],
+            "thrust": pushes[_thrust(robot)],
+            "actuation": pushes,
+            "height": [f"height of {link} [m]"],
+            "attitude": [f"world {world} along {axis} of {link}" for world in AXES for axis in "xyz"],
+        }
+
+    def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint:
+        return ToolPoint.of(dynamics, self.link(dynamics.state.robot), (0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class AerodynamicForce(BaseWrench):
+    """What air does to a body that flies: drag, changes of thrust with the flow and near the ground, and wind.
+
+    A linear kernel of the inputs holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018); "deviation"
+    beside it is what they leave. Velocities are those against the air: the fit finds the wind of its rows, and where u
+    has no columns of an `ObservedWind`, it is `wind` [m/s, world]. `observe` is the time in s that the observer of the
+    force that stays unexplained looks back (`forcegp.posterior.observing`); None follows the recording, 0 observes
+    nothing.
+    """
+
+    inputs: tuple[str, ...] = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "height", "attitude")
+    kernel: str = "linear + deviation"
+    observe: float | None = None
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @override
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wind = finite_numbers(self.wind)
+        if wind is None or len(wind) != 3:
+            raise InvalidInput(f"AerodynamicForce wind is {self.wind!r}; give its velocity along x, y and z in m/s.")
+        object.__setattr__(self, "wind", wind)
+        if self.observe is None:
+            return
+        try:  # files and commands hold text
+            seconds = float(self.observe)
+        except (TypeError, ValueError):
+            seconds = -1.0
+        if not 0.0 <= seconds < 1e6:
+            raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, 0, or None.")
+        object.__setattr__(self, "observe", seconds)
+
+    @override
+    def _flow(self, state: State) -> Tensor | float:
+        wind = ObservedWind.at(state)
+        return state.v.new_tensor(self.wind) if wind is None else wind
+
+
+def _base_rows(robot: Robot) -> slice:
+    return robot.layout.groups[0].rows if robot.layout.groups else slice(0, robot.nv)
+
+
+def _root_of_thrust(state: State) -> Float[Tensor, "*batch 1"]:
+    """Of the force along z of a base that flies; of all that actuators deliver where there is none."""
+    groups, push = state.robot.layout.groups, state.delivered[..., _base_rows(state.robot)]
+    push = push[..., 2:3] if groups and groups[0].kind == "floating" else push
+    return (push.square().sum(-1, keepdim=True) + 1e-4).sqrt().sqrt()  # smooth where rotors stand
+
+
+def _thrust(robot: Robot) -> slice:
+    """Which of the base rows thrusters that point up can drive; all where the base has no such rows."""
+    return slice(2, None) if robot.layout.groups else slice(None)
