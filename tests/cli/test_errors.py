@@ -218,21 +218,3 @@ def test_noise_is_learned_or_given(folder, noise, learned, file):
     assert posterior.model.noise.learn is learned
     if not learned:
         np.testing.assert_allclose(posterior.noise_std, 0.2)
-
-
-@pytest.mark.parametrize("noise", ["dataset", "learned"])
-def test_noise_of_forces_beside_that_of_every_row(folder, capfd, noise):
-    data = Dataset.load("arm.h5")
-    stated = 0.05 * np.arange(1.0, 61.0).reshape(20, 3)
-    dataclasses.replace(data, noise_std=stated).save("uneven.h5")
-    words = ["fit", "uneven.h5", *QUICK, "--noise", noise, "--force-noise", "0.03", "--out", "run"]
-    assert main(words) == 0
-    assert "noise std of forces" in capfd.readouterr().out
-    posterior = load_posterior("run")
-    level = posterior.training.noise_std.square().mean(0).sqrt()
-    learned = noise == "learned"
-    assert posterior.model.noise.learn is learned
-    force = posterior.hyperparameters["noise.log_force"].exp().numpy()
-    assert np.allclose(force, 0.03, rtol=1e-6) != learned
-    if not learned:
-        np.testing.assert_allclose(posterior.noise_std, level)

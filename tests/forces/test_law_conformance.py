@@ -11,6 +11,7 @@ from forcegp.forces import (
     Coefficient,
     Coulomb,
     DirectionalFriction,
+    GearFriction,
     JointLaw,
     Offset,
     Spring,
@@ -35,6 +36,10 @@ class TestCoulomb(LawConformance):
 
 class TestDryFrictionThatFalls(LawConformance):
     law = Stribeck(THREE, [0.7, 0.4, 0.9], 0.6, 0.2)
+
+
+class TestGearFriction(LawConformance):
+    law = GearFriction(THREE, 0.1, 0.2, [0.2, -0.05, 0.1])
 
 
 class TestSpring(LawConformance):

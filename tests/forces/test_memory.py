@@ -80,7 +80,7 @@ def test_the_scan_begins_anew_in_every_episode(log):
     found = with_memory(log, model)
     expected = np.concatenate([bristles_by_hand(log.q[:300]), bristles_by_hand(log.q[300:])])
     np.testing.assert_allclose(found.u[:, 3:], expected, atol=1e-12)
-    assert with_memory(found, model) is found
+    np.testing.assert_array_equal(with_memory(found.rows(slice(0, 600, 7)), model).u, found.u[::7])
     residual = model.dynamics(*map(torch.tensor, (log.q, log.v, found.u))).acceleration_map().offset.numpy() - log.a
     assert abs(residual).max() < 1e-9
 

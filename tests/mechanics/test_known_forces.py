@@ -16,6 +16,7 @@ from forcegp.forces import (
     Coulomb,
     CoupledRotors,
     DirectionalFriction,
+    GearFriction,
     Law,
     LoadFriction,
     Offset,
@@ -34,6 +35,7 @@ JOINTS = ("slide", "spin", "skew", "tilt")
 NUMBERS = [0.5, 1.5, 0.0, 2.0]
 TENSOR = torch.tensor(NUMBERS, dtype=torch.float64)
 TENTHS = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+ROOTS = torch.tensor([0.2, -0.1, 0.3, 0.0], dtype=torch.float64)
 TRANSMISSION = ((6.0, 0.0, 0.0, 0.0), (-1.0, 6.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 1.0, -1.0))
 
 FORMULAS = {
@@ -51,6 +53,10 @@ FORMULAS = {
     "load": (
         lambda: LoadFriction(0.7, [0.5, 0.8, 0.0, 0.2], 0.02),
         lambda q, v, u: -(0.7 + torch.tensor([0.5, 0.8, 0.0, 0.2], dtype=torch.float64) * u.abs()) * (v / 0.02).tanh(),
+    ),
+    "gear": (
+        lambda: GearFriction(0.7, 0.5, 0.02, [0.2, -0.1, 0.3, 0.0]),
+        lambda q, v, u: -(0.7 + 0.5 * u.abs() + ROOTS * v.abs().sqrt()) * (v / 0.02).tanh(),
     ),
     "spring": (lambda: Spring(NUMBERS, 0.3), lambda q, v, u: -TENSOR * (q - 0.3)),
     "constant": (lambda: Offset(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),

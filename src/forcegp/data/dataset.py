@@ -57,6 +57,7 @@ class Dataset(Summary):
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: anything that JSON can hold; frozen.
+    strokes: what rows know of the motion before them (`forcegp.data.strokes`), for friction that remembers; not stored.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 
     Raises DatasetError naming the array, row and column that break this, and what to do.
@@ -75,6 +76,7 @@ class Dataset(Summary):
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
     time_ordered: bool = True
+    strokes: Float[np.ndarray, "rows nv strokes"] | None = None
 
     @usable_arguments("Dataset")
     def __post_init__(self) -> None:
@@ -171,7 +173,8 @@ class Dataset(Summary):
         """
         chosen = _row_numbers(index, len(self))
         truth = {name: values[chosen] for name, values in self.truth.items()}
-        arrays = {name: getattr(self, name)[chosen] for name in ("q", "v", "u", "a", "time", "episode")}
+        names = ("q", "v", "u", "a", "time", "episode", "strokes")
+        arrays = {name: values[chosen] for name in names if (values := getattr(self, name)) is not None}
         ordered = _first_disorder(arrays["time"], arrays["episode"]) is None
         return replace(self, **arrays, truth=truth, time_ordered=ordered)
 

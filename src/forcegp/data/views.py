@@ -76,26 +76,35 @@ def window_means(values: Float[np.ndarray, "rows k"], first: np.ndarray, width: 
 
 
 def with_memory(dataset: Dataset, model: Model) -> Dataset:
-    """The log with the columns of u that `model.memory` names: one scan over each episode, from where it begins.
+    """The log with the columns of u that `model.memory` names, as its laws have them at their numbers.
 
-    Rows before the first reversal depend on that beginning, which no log tells. Raises InvalidInput for rows that are
-    not in order of time, since a sample has no past.
+    Rows before the first reversal depend on where the episode began, which no log tells. Raises InvalidInput for rows
+    that are not in order of time and do not carry their past, since a sample has none.
     """
-    memory = model.memory
-    if not memory.names or dataset.u.shape[1] == len(model.inputs):
+    from forcegp.data.strokes import strokes  # of views
+
+    memory, own = model.memory, () if dataset.model is None else dataset.model.memory.names
+    if not memory.names or (own == memory.names and dataset.strokes is None):
         return dataset
-    if not dataset.time_ordered:
+    if dataset.strokes is None and not dataset.time_ordered:
         raise InvalidInput(
             f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
         )
+    past = strokes(dataset) if dataset.strokes is None else dataset.strokes
+    remembered = np.isin(() if dataset.model is None else dataset.model.inputs, own)
+    bare, stated = (dataset.u[:, ~remembered], dataset.u[:, remembered]) if own else (dataset.u, None)
+    stated = stated if own == memory.names else None
     columns = np.zeros((len(dataset), len(memory.names)))
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
-        q, time = (torch.as_tensor(np.array(x[rows]), device=model.robot.device) for x in (dataset.q, dataset.time))
-        columns[rows] = memory.along(q, time).cpu().numpy()
+        given = (
+            None if x is None else torch.as_tensor(np.array(x[rows]), device=model.robot.device)
+            for x in (dataset.q, dataset.time, past, stated)
+        )  # fmt: skip
+        columns[rows] = memory.along(*given).cpu().numpy()
     first = model.inputs.index(memory.names[0])
-    u = np.concatenate([dataset.u[:, :first], columns, dataset.u[:, first:]], axis=1)
-    return replace(dataset, u=u, model=model.known)
+    u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
+    return replace(dataset, u=u, model=model.known, strokes=past)
 
 
 @dataclass(frozen=True, eq=False)

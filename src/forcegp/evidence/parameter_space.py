@@ -377,7 +377,7 @@ def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
                     center = start = of(given.mean) / size
                     std = of(np.nan if given.std is None else given.std) / size
                     spread = np.where(np.isnan(std), spread, std)
-            open_ = spread > 0.0
+            open_ = (spread > 0.0) & (law.acts_on(name, robot)[joints] if per_joint else True)
             start = np.clip(start, low, high)
             size, start, center, spread, low, high = (x[open_] for x in (size, start, center, spread, low, high))
             places = tuple(joints[open_].tolist()) if per_joint else None

@@ -92,11 +92,13 @@ class RecordedRows:
         u: Inputs,
         loaded: bool = True,
         any_contact: bool = False,
+        strokes: Float[np.ndarray, "rows nv strokes"] | None = None,
     ) -> None:
         model, robot = space.model, space.model.loaded_robot
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
         self.space, self.loaded, self.v = space, loaded, np.array(v)
-        self.state = model.state(at_q, at_v, at_u)
+        past = None if strokes is None else torch.as_tensor(np.array(strokes), device=robot.device)
+        self.state = replace(model.state(at_q, at_v, at_u), strokes=past)
         self.kinematics = self.state.kinematics
         self.delivered = self.state.delivered.cpu().numpy()
         self.load = abs(self.delivered)

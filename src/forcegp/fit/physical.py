@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.data import Dataset, evenly
+from forcegp.data import Dataset, evenly, with_memory
 from forcegp.doubts import Doubt, Doubts
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
@@ -40,7 +40,9 @@ class Equations:
 
     def __init__(self, space: ParameterSpace, logs: Sequence[Dataset], evidence: Torques | Accelerations) -> None:
         self.space, self.evidence, self.logs = space, evidence, logs
-        self.parts = [RecordedRows(space, log.q, log.v, log.u, loaded=not k) for k, log in enumerate(logs)]
+        self.parts = [
+            RecordedRows(space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes) for k, log in enumerate(logs)
+        ]
         self.a = np.concatenate([log.a for log in logs])
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
@@ -237,7 +239,7 @@ def fit_physical(
     if level is None or level.learn or level.acceleration is None:
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
-    return Solution(found, estimates, level, logs[0], tuple(history) or (0.0,), fit.x)
+    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x)
 
 
 def _with_noise_in_both(

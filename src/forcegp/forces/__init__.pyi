@@ -12,8 +12,8 @@ from .joint_forces import (
 from .kernels import KERNELS as KERNELS, kernel_of as kernel_of
 from .joint_laws import (
     Coulomb as Coulomb, CoupledRotors as CoupledRotors, DirectionalFriction as DirectionalFriction,
-    LoadFriction as LoadFriction, Offset as Offset, Rotor as Rotor, Spring as Spring, Stribeck as Stribeck,
-    Viscous as Viscous,
+    DryFriction as DryFriction, GearFriction as GearFriction, LoadFriction as LoadFriction, Offset as Offset,
+    Rotor as Rotor, Spring as Spring, Stribeck as Stribeck, Viscous as Viscous,
 )
 from .force import (
     Body as Body, Coefficient as Coefficient, LogNormal as LogNormal, Normal as Normal, Parameter as Parameter,

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
@@ -239,6 +239,10 @@ class Law(Force):
         """The memory after the joints have moved by `step` (..., nv) in dt: exact and differentiable."""
         return memory
 
+    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Float[Tensor, "*batch m"] | None:
+        """The memory after displacements of the joints, the last one first; None where these do not tell it."""
+        return None
+
     @property
     def values(self) -> dict[str, Tensor]:
         """Coefficients by name; of those that are to be estimated the start: what a prior expects, else a default."""
@@ -284,6 +288,10 @@ class Law(Force):
                 std = torch.where(std == 0.0, 0.0, torch.nan)
             opened[name] = Normal(value, std)
         return self.with_values(opened)
+
+    def acts_on(self, name: str, robot: Robot) -> Bool[np.ndarray, " nv"]:
+        """In which joints a coefficient does anything, so that data can tell it."""
+        return np.ones(robot.nv, dtype=bool)
 
     def unit(self, name: str, joint: str, robot: Robot) -> str:
         """Of a coefficient, at a joint that turns or slides."""
@@ -358,10 +366,7 @@ def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:
 
 
 class Memory:
-    """The numbers that all laws of a model remember, side by side; `names` are their columns of u.
-
-    None of the laws that forcegp brings remembers anything (`tests/forces/test_memory.py` has one that does).
-    """
+    """The numbers that all laws of a model remember, side by side; `names` are their columns of u."""
 
     def __init__(self, forces: Sequence[Force], robot: Robot) -> None:
         laws = [force for force in forces if isinstance(force, Law)]
@@ -384,10 +389,23 @@ class Memory:
         parts = memory.split([size for _, size in self._laws], dim=-1)
         return torch.cat([law.remember(x, step, dt) for (law, _), x in zip(self._laws, parts, strict=True)], dim=-1)
 
-    def along(self, q: Float[Tensor, "T nq"], time: Float[Tensor, " T"]) -> Float[Tensor, "T m"]:
-        """The memory at every row of one episode, from `start` at the first."""
-        steps = self.robot.difference(q[:-1], q[1:])
-        rows = [self.start]
-        for step, dt in zip(steps, time.diff().tolist(), strict=True):
-            rows.append(self.after(rows[-1], step, dt))
+    def along(
+        self,
+        q: Float[Tensor, "T nq"],
+        time: Float[Tensor, " T"],
+        strokes: Float[Tensor, "T nv strokes"],
+        stated: Float[Tensor, "T m"] | None,
+    ) -> Float[Tensor, "T m"]:
+        """The memory at every row of one episode: from its strokes, as `stated`, or by a scan from `memory_start`."""
+        parts = [None] * len(self._laws) if stated is None else stated.split([size for _, size in self._laws], dim=-1)
+        found = [self._of(law, q, time, strokes, part) for (law, _), part in zip(self._laws, parts, strict=True)]
+        return torch.cat(found, dim=-1)
+
+    def _of(self, law: Law, q: Tensor, time: Tensor, strokes: Tensor, stated: Tensor | None) -> Tensor:
+        past = law.past_of(strokes)
+        if past is not None or stated is not None:
+            return stated if past is None else past  # type: ignore[return-value]  # one of them is not None
+        rows = [law.memory_start(self.robot)]
+        for step, dt in zip(self.robot.difference(q[:-1], q[1:]), time.diff().tolist(), strict=True):
+            rows.append(law.remember(rows[-1], step, dt))
         return torch.stack(rows)

@@ -1,18 +1,20 @@
 """Laws that act in every joint by itself: friction, offsets, springs, rotors; and what each needs of the torque."""
 
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 from forcegp.forces.force import Coefficient, JointLaw, Law, Number, as_numbers
+from forcegp.forces.presliding import after_step, after_strokes
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Kinematics, Robot
 
@@ -49,76 +51,174 @@ class DirectionalFriction(JointLaw):
 
 
 DRY = "dry friction"
-VELOCITY_SCALE = Coefficient("velocity", 0.01, 0.1, 0.03, 20.0, logarithm=True)
+Memory = bool | tuple[str, ...] | tuple[bool, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Coulomb(JointLaw):
-    """-c tanh(v / w): dry friction of `level` c in Nm or N, smoothed below `velocity_scale` w (rad/s or m/s)."""
+class DryFriction(JointLaw):
+    """-(level) s: dry friction, whose sign s is tanh(v / w), or with `memory` a state that remembers reversals.
 
-    level: Number = None
-    velocity_scale: Number = None
+    `velocity_scale` w in rad/s or m/s smooths the sign. With `memory` (True, or the names of the joints that have it)
+    s is z of `forces.presliding`, which a reversal turns over a displacement of 1 / `sigma` (sigma in 1/rad or 1/m).
+    """
+
+    sigma: Number = field(default=None, kw_only=True)
+    memory: Memory = field(default=False, kw_only=True)
     part: ClassVar[str] = DRY
-    coefficients: ClassVar[Mapping[str, Coefficient]] = {"level": Coefficient(), "velocity_scale": VELOCITY_SCALE}
+    sign: ClassVar[Mapping[str, Coefficient]] = {
+        "velocity_scale": Coefficient("velocity", 0.01, 0.1, 0.03, 20.0, logarithm=True),
+        "sigma": Coefficient("1/position", 1000.0, 500.0, 0.02, 50.0, logarithm=True),
+    }
+
+    @abstractmethod
+    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Float[Tensor, "*batch nv"]:
+        """The friction of a joint that slides, from the velocity and what else `features` gives before the past."""
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        own = (state.v, state.delivered.abs()) if self.under_load else (state.v,)
+        return (*own, self._past(state)) if self.memory else own
+
+    def _past(self, state: State) -> Tensor:
+        """Strokes (..., nv, strokes) where the state has them, else the memory (..., nv)."""
+        if state.strokes is not None:
+            return state.strokes
+        z = iter(self.remembered(state).unbind(-1))
+        return torch.stack([next(z) if own else 0.0 * state.v[..., j] for j, own in enumerate(self._mask)], dim=-1)
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        return -parameters["level"] * torch.tanh(features[0] / parameters["velocity_scale"])
+        v = features[0]
+        s = torch.tanh(v / parameters["velocity_scale"])
+        if self.memory:
+            past = features[-1]
+            z = past if past.dim() == v.dim() else after_strokes(past, parameters["sigma"])
+            s = torch.stack([(z if own else s)[..., j] for j, own in enumerate(self._mask)], dim=-1)
+        return -self.level_at(features, parameters) * s
+
+    @override
+    def bound_to(self, robot: Robot) -> "DryFriction":
+        given = self.memory if isinstance(self.memory, bool) else tuple(self.memory)
+        single = np.isin(robot.joint_names, robot.single_joint_names)
+        if isinstance(given, tuple) and not all(isinstance(each, bool) for each in given):
+            if wrong := [name for name in given if name not in robot.single_joint_names]:
+                own = ", ".join(robot.single_joint_names)
+                raise InvalidInput(f"{type(self).__name__} memory names {wrong}; {robot.name} has {own}.")
+            given = tuple(name in given for name in robot.joint_names)
+        elif given is True:
+            given = tuple(single.tolist())
+        if isinstance(given, tuple) and len(given) != robot.nv:
+            raise InvalidInput(f"{type(self).__name__} memory has {len(given)} entries; give names of joints.")
+        return super(DryFriction, replace(self, memory=any(given) and given if given else False)).bound_to(robot)
+
+    @override
+    def acts_on(self, name: str, robot: Robot) -> Bool[np.ndarray, " nv"]:
+        acts = super().acts_on(name, robot)
+        remembers = np.array(self._mask or [False] * robot.nv)
+        return acts & (remembers == (name == "sigma")) if name in self.sign else acts
+
+    @override
+    def memory_names(self, robot: Robot) -> tuple[str, ...]:
+        return tuple(f"presliding of {robot.joint_names[j]}" for j in self._places)
+
+    @override
+    def remember(self, memory: Tensor, step: Tensor, dt: float) -> Tensor:
+        return after_step(memory, step[..., self._places], self._sigma(step)[self._places])
+
+    @override
+    def past_of(self, strokes: Tensor) -> Tensor:
+        return after_strokes(strokes, self._sigma(strokes[..., 0]))[..., self._places]
+
+    def _sigma(self, like: Tensor) -> Tensor:
+        return self.values["sigma"].to(like.device).expand(like.shape[-1])
+
+    @property
+    def _mask(self) -> tuple[bool, ...]:
+        """Of a bound law, which joints remember."""
+        return self.memory if isinstance(self.memory, tuple) else ()  # type: ignore[return-value]  # it is bound
+
+    @property
+    def _places(self) -> list[int]:
+        return [j for j, own in enumerate(self._mask) if own]
 
 
 @dataclass(frozen=True, eq=False)
-class Stribeck(JointLaw):
-    """-(c + b exp(-(v / v_s)^2)) tanh(v / w): dry friction that falls from c + b near rest to c in motion.
+class Coulomb(DryFriction):
+    """-c s: dry friction of `level` c in Nm or N."""
 
-    `level` c, `breakaway` b in Nm or N, `stribeck_velocity` v_s, `velocity_scale` w in rad/s or m/s (Olsson et al.
-    1998, eq. 4, with a smooth sign).
+    level: Number = None
+    velocity_scale: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {"level": Coefficient(), **DryFriction.sign}
+
+    @override
+    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return parameters["level"]
+
+
+@dataclass(frozen=True, eq=False)
+class Stribeck(DryFriction):
+    """-(c + b exp(-(v / v_s)^2)) s: dry friction that falls from c + b near rest to c in motion.
+
+    `level` c, `breakaway` b in Nm or N, `stribeck_velocity` v_s in rad/s or m/s (Olsson et al. 1998, eq. 4).
     """
 
     level: Number = None
     breakaway: Number = None
     stribeck_velocity: Number = None
     velocity_scale: Number = None
-    part: ClassVar[str] = DRY
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
         "breakaway": Coefficient(),
         "stribeck_velocity": Coefficient("velocity", 0.1, 0.3, 0.1, 10.0, logarithm=True),
-        "velocity_scale": VELOCITY_SCALE,
+        **DryFriction.sign,
     }
 
     @override
-    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        c, b, v_s, w = (parameters[name] for name in self.coefficients)
-        return -(c + b * torch.exp(-((features[0] / v_s) ** 2))) * torch.tanh(features[0] / w)
+    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        c, b, v_s = (parameters[name] for name in ("level", "breakaway", "stribeck_velocity"))
+        return c + b * torch.exp(-((features[0] / v_s) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
-class LoadFriction(JointLaw):
-    """-(c + mu |u|) tanh(v / w): dry friction of a gear, which grows with the torque of the actuator.
+class LoadFriction(DryFriction):
+    """-(c + mu |u|) s: dry friction of a gear, which grows with the torque of the actuator.
 
-    `level` c in Nm or N, `factor` mu without unit, `velocity_scale` w in rad/s or m/s (Hamon, Gautier & Garrec, IROS
-    2010, with the output torque).
+    `level` c in Nm or N, `factor` mu without unit (Hamon, Gautier & Garrec, IROS 2010, with the output torque).
     """
 
     level: Number = None
     factor: Number = None
     velocity_scale: Number = None
-    part: ClassVar[str] = DRY
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
         "factor": Coefficient("1", highest=0.9),
-        "velocity_scale": VELOCITY_SCALE,
+        **DryFriction.sign,
     }
     under_load: ClassVar[bool] = True
 
     @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        return state.v, state.delivered.abs()
+    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return parameters["level"] + parameters["factor"] * features[1]
+
+
+@dataclass(frozen=True, eq=False)
+class GearFriction(LoadFriction):
+    """-(c + mu |u| + r sqrt|v|) s: dry friction of a gear under load, with lubricant that builds up with speed.
+
+    `root` r in Nm (s/rad)^.5 or N (s/m)^.5, of either sign.
+    """
+
+    root: Number = None
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {
+        "level": Coefficient(),
+        "factor": Coefficient("1", highest=0.9),
+        "root": Coefficient("force/velocity^.5", lowest=-np.inf),
+        **DryFriction.sign,
+    }
 
     @override
-    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        c, mu, w = (parameters[name] for name in self.coefficients)
-        return -(c + mu * features[1]) * torch.tanh(features[0] / w)
+    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        return super().level_at(features, parameters) + parameters["root"] * features[0].abs().sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +308,16 @@ class LazyState(State):
     """A state, unchecked, whose kinematics are computed where a law asks for them: most laws of joints do not."""
 
     def __init__(self, robot: Robot, q: Tensor, v: Tensor, u: Tensor) -> None:
-        given = {"q": q, "v": v, "u": u, "robot": robot, "bodies": None, "inputs": (), "delivered_by": None}
+        given = {
+            "q": q,
+            "v": v,
+            "u": u,
+            "robot": robot,
+            "bodies": None,
+            "inputs": (),
+            "delivered_by": None,
+            "strokes": None,
+        }
         for name, value in given.items():
             object.__setattr__(self, name, value)
 

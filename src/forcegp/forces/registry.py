@@ -25,6 +25,7 @@ FORCES: dict[str, str | type[Force]] = {
     "coulomb": "joint_laws.Coulomb",
     "stribeck": "joint_laws.Stribeck",
     "load": "joint_laws.LoadFriction",
+    "gear": "joint_laws.GearFriction",
     "offset": "joint_laws.Offset",
     "spring": "joint_laws.Spring",
     "rotor": "joint_laws.Rotor",
@@ -172,7 +173,9 @@ def called(what: str, make: Callable[..., Any], options: Sequence[str], fixed: M
     allowed = signature(make).parameters
     for option in options:
         key, equals, value = (part.strip() for part in option.partition("="))
-        if not equals and option is options[0]:
+        if not equals and key in allowed and allowed[key].default is False:
+            value = "true"
+        elif not equals and option is options[0]:
             key, value = next(iter(allowed), ""), option.strip()
         if key not in allowed or not value:
             close = difflib.get_close_matches(key, allowed, n=1)
@@ -207,6 +210,8 @@ def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Para
     default = field.default
     if key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None"):
         default = 0.0
+    if key == "memory" and text not in ("true", "false"):
+        return tuple(part.strip() for part in text.split("/"))
     if isinstance(default, bool):
         if text not in ("true", "false"):
             raise InvalidInput(f"{what} has {key}={text}; give true or false")

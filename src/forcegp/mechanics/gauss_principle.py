@@ -149,7 +149,8 @@ def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tup
 class State:
     """Positions, velocities and inputs of equal batch, and the standard parameters of `bodies` (None: the robot's).
 
-    `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators.
+    `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators, `strokes` the
+    displacements of each joint from reversal to reversal before the state, the last one first, where they are known.
     """
 
     q: Float[Tensor, "*batch nq"]
@@ -160,6 +161,7 @@ class State:
     bodies: Float[Tensor, "bodies 10"] | None = None
     inputs: tuple[str, ...] = ()
     delivered_by: "Callable[[State], Tensor] | None" = None
+    strokes: Float[Tensor, "*batch nv strokes"] | None = None
 
     @property
     def positions(self) -> Float[Tensor, "*batch nv"]:

@@ -1,0 +1,78 @@
+"""Strokes of joints, from reversal to reversal: what friction with memory needs of the past, in every row by itself."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from forcegp.data.dataset import Dataset
+
+COUNT = 12
+"""Strokes that a row remembers: of more, what friction still feels is smaller than 12 encoder steps times sigma."""
+STEPS = 2.0
+"""Steps of an encoder within which a reversal counts as none."""
+ON_GRID, MOSTLY = 0.1, 0.9
+"""Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
+
+
+def strokes(dataset: Dataset, count: int = COUNT) -> Float[np.ndarray, "rows nv count"]:
+    """Displacements (rad or m) of each joint up to every row: since the last reversal, of the stroke before, and so on.
+
+    They alternate in sign; those before the first row of an episode are 0. Of joints of several degrees of freedom all
+    are. Only positions count, so pauses and thinned rows do no harm while no reversal is lost.
+    """
+    out = np.zeros((len(dataset), dataset.nv, count))
+    positions = joint_positions(dataset)
+    for joint in range(dataset.nv):
+        least = STEPS * encoder_step(dataset, positions[:, joint])
+        for episode in dataset.episodes:
+            rows = np.flatnonzero(dataset.episode == episode)
+            q = positions[rows, joint]
+            turns = turning_points(q, least)
+            last = np.searchsorted(turns, np.arange(len(q)), side="right") - 1
+            last = np.where((turns[last] == np.arange(len(q))) & (last > 0), last - 1, last)  # a stroke has its end
+            at = q[turns]
+            out[rows, joint, 0] = q - at[last]
+            between = np.diff(at, prepend=at[0])
+            for k in range(1, count):
+                place = last - k + 1
+                out[rows, joint, k] = np.where(place > 0, between[np.maximum(place, 0)], 0.0)
+    return out
+
+
+def joint_positions(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
+    """Positions of joints of one degree of freedom; 0 for the others."""
+    model = dataset.model
+    if model is None or model.robot.space.is_vector_space:
+        return np.asarray(dataset.q)
+    robot, out = model.robot, np.zeros((len(dataset), dataset.nv))
+    out[:, np.isin(robot.joint_names, robot.single_joint_names)] = robot.space.singles(dataset.q)
+    return out
+
+
+def encoder_step(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
+    """The step of an encoder [rad or m] in the positions of a joint; 0 where they are as good as continuous."""
+    moved = np.abs(np.diff(q))[dataset.episode[1:] == dataset.episode[:-1]]
+    some = moved[moved > 1e-9 * max(float(np.abs(q).max()), 1e-12)]
+    if not len(some):
+        return 0.0
+    steps = some / some.min()
+    return float(some.min()) if (abs(steps - steps.round()) < ON_GRID).mean() > MOSTLY else 0.0
+
+
+def turning_points(q: Float[np.ndarray, " rows"], least: float) -> Int[np.ndarray, " turns"]:
+    """Rows at which the motion turns back by more than `least`, after the first row."""
+    steps = np.diff(q)
+    moving = np.flatnonzero(steps)
+    turned = moving[1:][np.sign(steps[moving[1:]]) != np.sign(steps[moving[:-1]])] if len(moving) else moving
+    extremes = [0, *turned.tolist(), len(q) - 1]
+    turns, extreme, direction = [0], 0, 0.0
+    for row in extremes[1:]:
+        ahead = q[row] - q[extreme]
+        if direction == 0.0:
+            if abs(ahead) > least:
+                direction, extreme = np.sign(ahead), row
+        elif direction * ahead >= 0.0:
+            extreme = row
+        elif abs(ahead) > least:
+            turns.append(extreme)
+            direction, extreme = -direction, row
+    return np.array(turns)

@@ -1,0 +1,183 @@
+"""Friction that remembers: its state against Dahl's equation, its strokes, its stiffness from logs of another law."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from tests.posterior.arm import arm_model
+
+from forcegp import Accelerations, Dataset, Torques, fit
+from forcegp.data import with_memory
+from forcegp.data.strokes import encoder_step, strokes, turning_points
+from forcegp.errors import InvalidInput
+from forcegp.evidence import motion_residuals
+from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
+from forcegp.forces.presliding import after_step, after_strokes, forgotten
+
+DT, SIGMA = 0.002, torch.tensor([300.0, 900.0, 2000.0], dtype=torch.float64)
+JOINTS = ("pan", "lift", "bend")
+
+
+def motion(rows: int, seed: int, slow: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time, and q, v, a of sines with many reversals."""
+    rng, time = np.random.default_rng(seed), DT * np.arange(rows)
+    w, phase, size = rng.uniform(1.0, 5.0, (3, 3)), rng.uniform(0.0, 6.0, (3, 3)), rng.uniform(0.05, 0.3, (3, 3))
+    at = slow * w * time[:, None, None] + phase
+    w = slow * w
+    return time, (size * np.sin(at)).sum(1), (size * w * np.cos(at)).sum(1), -(size * w * w * np.sin(at)).sum(1)
+
+
+def dahl(time: np.ndarray, q: np.ndarray, v: np.ndarray, sigma: float) -> np.ndarray:
+    """dz/dt = sigma (v - z |v|) by an ordinary solver."""
+
+    def rate(t, z):
+        speed = np.interp(t, time, v)
+        return sigma * (speed - z * abs(speed))
+
+    return solve_ivp(rate, time[[0, -1]], [0.0], t_eval=time, method="LSODA", rtol=1e-9, atol=1e-10, max_step=DT).y[0]
+
+
+def log_of(q, v, a, u, time) -> Dataset:
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=arm_model(0))
+
+
+def lugre(time: np.ndarray, v: np.ndarray, stiffness: float, level: float, breakaway: float) -> np.ndarray:
+    """Friction of the LuGre model (Canudas de Wit et al. 1995), with viscous bristles and a Stribeck curve."""
+    damping = 0.5 * np.sqrt(stiffness)
+    z, out = 0.0, np.zeros_like(v)
+    for k, speed in enumerate(v):
+        for _ in range(20):
+            g = level + breakaway * np.exp(-((speed / 0.05) ** 2))
+            rate = speed - stiffness * abs(speed) / g * z
+            z += DT / 20 * rate
+        out[k] = stiffness * z + damping * rate * 1e-2
+    return out
+
+
+@pytest.fixture(scope="module")
+def lugre_log() -> Dataset:
+    """A log whose friction is not of the form that is fitted."""
+    time, q, v, a = motion(6000, 0)
+    friction = np.stack([lugre(time, v[:, j], (800.0, 500.0, 300.0)[j], (0.8, 0.5, 0.3)[j], 0.1) for j in range(3)], 1)
+    u = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + friction
+    return log_of(q, v, a, u + 0.01 * np.random.default_rng(1).standard_normal(u.shape), time)
+
+
+def test_it_is_the_solution_of_dahls_equation():
+    time, q, v, a = motion(1500, 3)
+    past = torch.tensor(strokes(log_of(q, v, a, a, time)))
+    for j in range(3):
+        expected = dahl(time, q[:, j], v[:, j], float(SIGMA[j]))
+        found = after_strokes(past[:, j], SIGMA[j]).numpy()
+        np.testing.assert_allclose(found, expected, atol=0.01)  # the reversal lies between two rows
+        by_steps, z = np.zeros(len(q)), torch.zeros(1, dtype=torch.float64)
+        for k in range(1, len(q)):
+            z = after_step(z, torch.tensor(q[k : k + 1, j] - q[k - 1 : k, j]), SIGMA[j])
+            by_steps[k] = float(z)
+        np.testing.assert_allclose(found, by_steps, atol=1e-12)
+
+
+def test_it_is_smooth_in_sigma_and_bounded():
+    past = torch.tensor(np.random.default_rng(0).normal(0.0, 1e-3, (4, 3, 6)))
+    sigma = SIGMA.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda s: after_strokes(past, s), sigma)
+    assert float(after_strokes(past, SIGMA).abs().max()) < 1.0
+    between = after_strokes(past, SIGMA, 1.0) - after_strokes(past, SIGMA, -1.0)
+    torch.testing.assert_close(between, 2.0 * forgotten(past, SIGMA))  # what a start of either sign leaves
+
+
+def test_a_thinned_log_has_the_same_past():
+    time, q, v, a = motion(3000, 4)
+    log = log_of(q, v, a, a, time)
+    model = log.model.with_forces(Coulomb(1.0, sigma=SIGMA.tolist(), memory=True))
+    whole = with_memory(log, model)
+    some = np.sort(np.random.default_rng(0).choice(3000, 300, replace=False))
+    np.testing.assert_array_equal(with_memory(whole.rows(some), model).u, whole.rows(some).u)
+    shuffled = whole.rows(np.random.default_rng(1).permutation(some))
+    np.testing.assert_array_equal(with_memory(shuffled, model).u, shuffled.u)
+    gaps = with_memory(log.rows(some), model).u[:, 3:]  # steps of 20 ms: only the rows about reversals differ
+    assert np.median(abs(gaps - whole.u[some, 3:])) < 1e-6
+    with pytest.raises(InvalidInput, match="remembers, and the rows are not in order of time"):
+        with_memory(log.rows(some[::-1]), model)
+
+
+def test_steps_of_an_encoder_are_no_reversals():
+    time, q, v, a = motion(3000, 5, slow=0.3)
+    step = 2e-4
+    noise = 0.25 * step * np.random.default_rng(0).standard_normal(q.shape)
+    coarse = log_of(np.round((q + noise) / step) * step, v, a, a, time)
+    assert encoder_step(coarse, coarse.q[:, 0]) == pytest.approx(step)
+    assert encoder_step(log_of(q, v, a, a, time), q[:, 0]) == 0.0
+    smooth = strokes(log_of(q, v, a, a, time))
+    sigma = torch.tensor(0.1 / step)
+    apart = after_strokes(torch.tensor(strokes(coarse)), sigma) - after_strokes(torch.tensor(smooth), sigma)
+    assert float(apart.abs().mean()) < 0.05
+    jitter = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 2.0, 3.0, 2.0, 3.0, 9.0, 2.0])
+    assert turning_points(jitter, 2.0).tolist() == [0, 10]
+    assert turning_points(jitter, 0.5).tolist() == [0, 1, 2, 3, 4, 7, 8, 10]
+
+
+@pytest.mark.parametrize("evidence", [Torques(), Accelerations()], ids=str)
+def test_a_gear_with_bristles_is_explained_better_and_its_numbers_are_near(lugre_log, evidence):
+    train, test = lugre_log.rows(slice(0, 4000)), lugre_log.rows(slice(4000, 6000))
+    left = {}
+    for law in (Stribeck(), Coulomb(), Coulomb(memory=True)):
+        found = fit(arm_model(0).with_forces(Viscous(), law), train, evidence, rows=1500)
+        force, _ = motion_residuals(with_memory(test, found.model), found.model)
+        left[bool(law.memory), type(law).__name__] = float(np.sqrt((force**2).mean()))
+    assert left[True, "Coulomb"] < 0.5 * min(left[False, "Coulomb"], left[False, "Stribeck"])
+    values = {name: each.value for name, each in found.parameters.items()}
+    np.testing.assert_allclose([values[f"coulomb.level.{joint}"] for joint in JOINTS], [0.8, 0.5, 0.3], rtol=0.1)
+    expected = np.array([800.0, 500.0, 300.0]) / [
+        0.8,
+        0.5,
+        0.3,
+    ]  # stiffness over level: the slope at a reversal, halved
+    np.testing.assert_allclose([values[f"coulomb.sigma.{joint}"] for joint in JOINTS], expected, rtol=0.5)
+
+
+def test_memory_is_a_matter_of_joints(lugre_log):
+    model = arm_model(0).with_forces(Coulomb(memory=("lift",)))
+    assert model.inputs == (*JOINTS, "presliding of lift")
+    found = fit(model, lugre_log, Torques(), rows=1000)
+    names = set(found.parameters)
+    assert names == {f"coulomb.level.{joint}" for joint in JOINTS} | {
+        "coulomb.sigma.lift", "coulomb.velocity_scale.pan", "coulomb.velocity_scale.bend"
+    }  # fmt: skip
+    law = found.model.laws[-1]
+    seen = with_memory(lugre_log, found.model)
+    state = found.model.state(*(torch.tensor(np.array(x[:50])) for x in (seen.q, seen.v, seen.u)))
+    expected = torch.tanh(state.v / law.values["velocity_scale"])
+    expected[:, 1] = state.u[:, 3]
+    torch.testing.assert_close(law.force(state), -law.values["level"] * expected)
+
+
+@pytest.mark.parametrize("law", [LoadFriction, GearFriction])
+def test_load_and_speed_change_its_level(law, lugre_log):
+    given = {"level": [0.3, 0.2, 0.1], "factor": [0.1, 0.05, 0.2], "sigma": SIGMA.tolist(), "memory": True}
+    if law is GearFriction:
+        given["root"] = [0.2, -0.05, 0.1]
+    model = arm_model(0).with_forces(law(**given))
+    z = torch.tensor(with_memory(lugre_log, model).u[:, 3:])
+    rigid = torch.tensor(lugre_log.u[:, :3])
+    torch_of = partial(torch.tensor, dtype=torch.float64)
+    level = torch_of(given["level"]) + torch_of(given.get("root", 0.0)) * torch.tensor(lugre_log.v).abs().sqrt()
+    u = rigid + level * z  # solve u = rigid + (level + mu |u|) z
+    u = u / (1.0 - torch_of(given["factor"]) * z * u.sign())
+    q, v = (torch.tensor(np.array(x)) for x in (lugre_log.q, lugre_log.v))
+    a = model.robot.forward_dynamics(q, v, rigid)
+    loaded = replace(lugre_log, u=u.numpy(), a=a.numpy())
+    seen = with_memory(loaded, model)
+    expected = model.dynamics(q, v, torch.tensor(seen.u)).acceleration_map().offset
+    torch.testing.assert_close(expected, a, rtol=1e-8, atol=1e-8)
+    found = fit(arm_model(0).with_forces(law(memory=True)), loaded, Torques(), rows=1000)
+    for name in ("level", "factor"):
+        np.testing.assert_allclose(found.model.laws[-1].values[name], given[name], atol=0.01)
+
+
+def test_joints_that_are_not_there_are_refused():
+    with pytest.raises(InvalidInput, match=r"Coulomb memory names \['wrist'\]; "):
+        arm_model(0).with_forces(Coulomb(memory=("wrist",)))
