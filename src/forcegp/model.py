@@ -227,6 +227,11 @@ class Model(Summary):
         return Memory(self.forces, self.robot)
 
     @property
+    def memory_column(self) -> int:
+        """The first column of u that holds what laws remember."""
+        return self.inputs.index(self.memory.names[0]) if self.memory.names else 0
+
+    @property
     def actuators(self) -> tuple[str, ...]:
         """Names of the first columns of u, those that are commanded: of `Actuation`, then of `Thrusters`."""
         thrusters = (force.names for force in self.forces if isinstance(force, Thrusters))

@@ -9,13 +9,14 @@ import torch
 from scipy.integrate import solve_ivp
 from tests.posterior.arm import arm_model
 
-from forcegp import Accelerations, Dataset, Torques, fit
+from forcegp import Accelerations, Dataset, Torques, fit, score
 from forcegp.data import with_memory
 from forcegp.data.strokes import encoder_step, strokes, turning_points
 from forcegp.errors import InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
 from forcegp.forces.presliding import after_step, after_strokes, forgotten
+from forcegp.noise import Noise
 
 DT, SIGMA = 0.002, torch.tensor([300.0, 900.0, 2000.0], dtype=torch.float64)
 JOINTS = ("pan", "lift", "bend")
@@ -181,3 +182,38 @@ def test_load_and_speed_change_its_level(law, lugre_log):
 def test_joints_that_are_not_there_are_refused():
     with pytest.raises(InvalidInput, match=r"Coulomb memory names \['wrist'\]; "):
         arm_model(0).with_forces(Coulomb(memory=("wrist",)))
+
+
+def test_scores_and_motions_know_the_past(lugre_log):
+    few = lugre_log.rows(slice(0, 6000, 2))
+    scores = score(
+        ["viscous+coulomb", "viscous+coulomb:memory"], few, split="blocks:4:2", horizons=(0.1,), starts=5, seeds=1,
+        identification="viscous+coulomb",
+    )  # fmt: skip
+    without, remembering = (scores.runs[name][0]["table"] for name in list(scores.runs)[1:])
+    for quantity, most in (("acceleration", 0.5), ("position after 0.1 s", 0.8)):
+        ratio = np.array(remembering[quantity]["rmse"]) / without[quantity]["rmse"]
+        assert ratio.max() < most, quantity
+
+
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
+def test_compiled_motions_carry_the_state_along(integrator, lugre_log):
+    model = arm_model(0).with_forces(
+        Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend")), noise=Noise(0.1)
+    )  # fmt: skip
+    posterior = fit(model, lugre_log.rows(slice(0, 200)))
+    u = np.zeros((4, 60, 5))
+    u[..., :3] = lugre_log.u[None, :60] * np.array([1.0, 0.5, -0.5, 0.2])[:, None, None]
+    u[:, 0, 3:] = np.random.default_rng(0).uniform(-0.9, 0.9, (4, 2))
+    given = lugre_log.q[0], 0.1 * lugre_log.v[0], u, DT
+    compiled, by_torch = (
+        posterior.predictor(compile=how).rollouts(*given, integrator=integrator) for how in (True, False)
+    )
+    torch.testing.assert_close(compiled.q, by_torch.q, rtol=1e-9, atol=1e-11)
+    again = posterior.rollout(*given, integrator=integrator)
+    torch.testing.assert_close(again.q, by_torch.q, rtol=1e-9, atol=1e-11)
+    other = u.copy()
+    other[:, 0, 3:] = 0.0
+    assert float((posterior.rollout(*given[:2], other, DT).q - again.q).abs().max()) > 1e-5
+    other[:, 0], other[:, 1:, 3:] = u[:, 0], 0.7  # only the first row holds a state
+    torch.testing.assert_close(posterior.rollout(*given[:2], other, DT, integrator=integrator).q, again.q)

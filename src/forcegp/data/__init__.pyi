@@ -16,6 +16,7 @@ from .hdf5 import is_dataset as is_dataset
 from .preparation import Preparation as Preparation, preparation_report as preparation_report
 from .spectrum import MotionSpectrum as MotionSpectrum, motion_spectrum as motion_spectrum
 from .stance import Stance as Stance, estimate_stance as estimate_stance
+from .strokes import strokes as strokes, with_strokes as with_strokes
 from .views import (
     RecordedMotions as RecordedMotions, Select as Select, evenly as evenly, farthest as farthest,
     farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,

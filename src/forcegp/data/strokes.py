@@ -1,5 +1,7 @@
 """Strokes of joints, from reversal to reversal: what friction with memory needs of the past, in every row by itself."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -11,6 +13,13 @@ STEPS = 2.0
 """Steps of an encoder within which a reversal counts as none."""
 ON_GRID, MOSTLY = 0.1, 0.9
 """Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
+
+
+def with_strokes(dataset: Dataset) -> Dataset:
+    """The log whose rows know the motion before them, whichever of them are chosen; as it is where it has no order."""
+    if dataset.strokes is not None or not dataset.time_ordered:
+        return dataset
+    return replace(dataset, strokes=strokes(dataset))
 
 
 def strokes(dataset: Dataset, count: int = COUNT) -> Float[np.ndarray, "rows nv count"]:

@@ -102,9 +102,10 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
             for x in (dataset.q, dataset.time, past, stated)
         )  # fmt: skip
         columns[rows] = memory.along(*given).cpu().numpy()
-    first = model.inputs.index(memory.names[0])
+    first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
-    return replace(dataset, u=u, model=model.known, strokes=past)
+    known = model.known if dataset.model is None else replace(dataset.model, forces=model.laws)
+    return replace(dataset, u=u, model=known, strokes=past)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,7 @@ class TrainingData:
     a: Float[Tensor, "N nv"]
     reference: "TrainingData | None" = None
     correlated_rows: float = 1.0
+    strokes: Float[Tensor, "N nv strokes"] | None = None
 
     def __len__(self) -> int:
         return len(self.q)
@@ -56,7 +57,7 @@ class TrainingData:
     def of(cls, rows: Dataset, device: torch.device) -> "TrainingData":
         """Copies of all rows of a Dataset."""
         q, v, u, a = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
-        return cls(q, v, u, a)
+        return cls(q, v, u, a, strokes=None if rows.strokes is None else torch.tensor(rows.strokes, device=device))
 
     def to(self, device: torch.device) -> "TrainingData":
         """The same rows on another device."""

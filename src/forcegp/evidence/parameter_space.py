@@ -321,7 +321,10 @@ def _derivatives(
         out = []
         for term in terms:
             if term.joints is not None:  # amplitude j depends on entry j alone
-                slope = torch.autograd.grad(amplitude.sum(), numbers[term.name], retain_graph=True)[0]
+                found = torch.autograd.grad(
+                    amplitude.sum(), numbers[term.name], retain_graph=True, materialize_grads=True
+                )
+                slope = found[0]
                 if B is None:
                     out.append(-slope.cpu().numpy())
                     continue

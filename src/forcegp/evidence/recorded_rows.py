@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, with_memory
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.evidence.bodies import standard_parameters
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
@@ -37,7 +37,7 @@ def motion_residuals(
     Forces of feet that stand and of loops are left out; those of contacts that slide are not. Under friction
     that grows with |u| the force is what u exceeds the u by that the model needs.
     """
-    require_type("dataset", dataset, Dataset)
+    dataset = with_memory(require_type("dataset", dataset, Dataset), model)
     q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=model.robot.device) for x in ("q", "v", "u", "a"))
     dynamics = model.dynamics(q, v, u)
     force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]

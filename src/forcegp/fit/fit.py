@@ -260,7 +260,7 @@ class _Functions:
         fitted = widened(own._with_numbers(rows, dataset))
         warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
         report = None if progress is None else partial(progress, ALL_ROWS)
-        return on_all_rows(fitted, all_rows, chosen, described, report)
+        return on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described, report)
 
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
@@ -305,7 +305,9 @@ class _Functions:
     def _beside_numbers(self, rows: Dataset, dataset: Dataset, space: ParameterSpace, x: np.ndarray) -> Posterior:
         """One search with the numbers about x free."""
         here = replace(space.model_at(x), noise=self.model.noise)
-        return replace(self, model=here)._search(rows, dataset, lambda given: with_free_numbers(given, space, x))
+        return replace(self, model=here)._search(
+            with_memory(rows, here), dataset, lambda given: with_free_numbers(given, space, x)
+        )
 
     def _with_loads(self, rows: Dataset, dataset: Dataset) -> Posterior:
         """One search, or more under the normal force that friction changes."""

@@ -61,7 +61,8 @@ class Slopes:
     def __init__(self, training: TrainingData, space: ParameterSpace) -> None:
         self.space = space
         q, v, u = (x.cpu().numpy() for x in (training.q, training.v, training.u))
-        self.rows = RecordedRows(space, q, v, u, any_contact=True)
+        strokes = None if training.strokes is None else training.strokes.cpu().numpy()
+        self.rows = RecordedRows(space, q, v, u, any_contact=True, strokes=strokes)
         self.a = training.a.cpu().numpy()
         self.device = training.a.device
 

@@ -193,6 +193,7 @@ def fit_physical(
     robot, thick = thickened(model.robot) if bodies else (model.robot, ())
     model = replace(model, robot=robot)
     most = rows_at_most(robot) if rows is None else rows
+    logs = [with_memory(log, model) for log in logs]
     logs = [log.rows(evenly(log, most)) for log in logs]
     typical = typical_sizes(model, logs)
     model = with_payloads_placed(model, logs, typical)
@@ -425,7 +426,7 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
         kept = np.ones(len(dataset), dtype=bool)
         kept[left_out] = False
         found = fit_physical(model, [dataset.rows(kept)], evidence).model
-        rows = dataset.rows(left_out)
+        rows = with_memory(dataset.rows(left_out), found)
         q, v, u = (torch.tensor(x, device=found.robot.device) for x in (rows.q, rows.v, rows.u))
         dynamics = found.dynamics(q, v, u)
         residuals.append(rows.a - dynamics.acceleration_map().offset.cpu().numpy())

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from forcegp.data import AirLaw, Dataset, find_wind, with_wind
+from forcegp.data import AirLaw, Dataset, find_wind, with_memory, with_wind
 from forcegp.data.filters import episodes_in_order, sums_before
 from forcegp.data.wind import steady_forces
 from forcegp.errors import InvalidInput
@@ -36,10 +36,11 @@ def observing(
     e in `seconds`: what a first-order disturbance observer reports in flight (Chen et al., IEEE TIE 2016). Rows with a
     shorter past are left out unless `whole`. By default the prior's `AerodynamicForce` gives link and time; where it
     leaves the time open, each component takes that of .02 to 1 s which missed least in the second before, and six more
-    columns hold what will last of it. Without such a prior both come back as they are. Calibrated intervals go along
-    unless `seconds` is given. Raises InvalidInput for a time that is not positive, models that cannot carry their
-    forces along, and recordings that are too short or not in order of time.
+    columns hold what will last of it. What laws remember has its columns, too. Without such a prior both come back as
+    they are. Calibrated intervals go along unless `seconds` is given. Raises InvalidInput for a time that is not
+    positive, models that cannot carry their forces along, and recordings that are too short or not in order of time.
     """
+    dataset = with_memory(dataset, posterior.model)
     own = next((term for term in posterior.trained.unknown_forces if isinstance(term, AerodynamicForce)), None)
     times = TRIED if seconds is None else (seconds,)
     # calibrated widths are of what is observed by default

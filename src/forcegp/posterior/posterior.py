@@ -41,7 +41,7 @@ from forcegp.posterior.prediction import (
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
-from forcegp.posterior.rollout import AccelerationFunction, Rollout, accelerations, remembering, roll_out
+from forcegp.posterior.rollout import AccelerationFunction, Rollout, accelerations, roll_out
 from forcegp.posterior.update import learn_and_forget, learn_more_rows
 from forcegp.robots import Robot
 
@@ -231,9 +231,6 @@ class Posterior(Fitted):
         if self.model.held_inputs:
             check_time_step(dt)
             u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device), dt)
-        if self.model.memory.names:
-            given = state_tensor("u", u, self.model.sizes[2], self.model.robot.device)
-            u, feedback = remembering(self.model, given, dt, feedback)
         how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed}
         moved = roll_out(self, model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
         return replace(moved, intervals=self.motion_intervals)

@@ -212,8 +212,8 @@ class Predictor(Summary):
     ) -> Motions:
         """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast, without a graph.
 
-        As `posterior.rollout`, under the mean, or with `functions` under each of so many drawn ones, which are the
-        first dimension; `divided` takes motions (functions, ..., nv), each under its own. Compiled, many steps are done
+        As `posterior.rollout`, where of what laws remember the first row of u counts, under the mean, or with
+        `functions` under each of so many drawn ones, which are the first dimension; `divided` takes motions (functions, ..., nv), each under its own. Compiled, many steps are done
         at once on `threads` threads (None: as torch has). Raises InvalidInput for arguments that do not fit.
         """
         threads = None if threads is None else whole_number("threads", threads, 1)
@@ -221,10 +221,6 @@ class Predictor(Summary):
         start, v, forces, batch = checked_start(
             self.sizes, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
         )
-        if titles := self.posterior.model.memory.titles:
-            raise InvalidInput(
-                f"{', '.join(titles)} remembers, and compiled motions carry no memory; call posterior.rollout."
-            )
         method = integrator_named(integrator, self.posterior.model)
         check_time_step(dt)
         loops, acceleration = None, self.mean
@@ -241,7 +237,9 @@ class Predictor(Summary):
             elif tuple(batch[:1]) != (functions,):
                 raise InvalidInput(f"divided motions need a first dimension of {functions} functions; given: {batch}.")
         with torch.no_grad():
-            return moved(batch, loops, method, acceleration, start, v, forces, dt, threads=threads)
+            return moved(
+                batch, loops, method, acceleration, self.posterior.model, start, v, forces, dt, threads=threads
+            )
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""

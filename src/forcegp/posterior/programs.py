@@ -255,7 +255,9 @@ class Programs:
             words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
             words |= {"OUTPUTS": len(program.nodes), "LIMIT": SPEED_LIMIT}
             words["STEP"] = self.step_source(integrator, "program")
-            text += [*self.motion_source(lanes), ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
+            remember, words["REMEMBER"] = self.memory_source(lanes)
+            words |= {"MEMORY": len(self.physics.model.memory.names), "COLUMN": self.physics.model.memory_column}
+            text += [*self.motion_source(lanes), *remember, ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
         else:
             text.append(entry or write_entry(program, "program", finish))
         return "\n".join(text)
@@ -273,6 +275,24 @@ class Programs:
         made = {"moved": trace(lambda q, step: [self.space.integrate(q, step)], [q, step])}
         made["step_rate"] = trace(lambda step, v: [self.space.chart_velocity(step, v)], [step, step])
         return [write_function(name, graph, x.tolist(), lanes) for name, (graph, (x,)) in made.items()]
+
+    def memory_source(self, lanes: int) -> tuple[list[str], str]:
+        """The C function of what laws remember after a step from q to q1, and its call."""
+        memory, space = self.physics.model.memory, self.space
+        if not memory.names:
+            return [], ""
+
+        def after(z: Tensor, q: Tensor, q1: Tensor, dt: Tensor) -> list[Tensor]:
+            return [memory.after(z, space.difference(q, q1), dt)]  # type: ignore[arg-type]  # a number of the graph
+
+        q = space.neutral()
+        graph, (z,) = trace(after, [q.new_zeros(len(memory.names)), q, q, q.new_ones(1)])
+        call = (
+            "for (int j = 0; j < M; j++) w[j] = x[FIRST + j];\n"
+            "      for (int j = 0; j < NQ; j++) { w[M + j] = qs[j]; w[M + NQ + j] = q1[j]; }\n"
+            "      w[M + 2 * NQ] = R(dt);\n      remember(t, live, w, z);"
+        )
+        return [write_function("remember", graph, z.tolist(), lanes)], call
 
     def covariance_source(self) -> str:
         """The C function that makes the covariance of the outputs of its program."""

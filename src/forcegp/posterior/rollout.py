@@ -85,16 +85,22 @@ def moved(
     loops: Sequence[RowFunction] | None,
     method: Integrator,
     acceleration: AccelerationFunction,
-    *given: Any,
+    model: Model,
+    q: Float[Tensor, "n nq"],
+    v: Float[Tensor, "n nv"],
+    u: Float[Tensor, "T n nu"],
+    dt: float,
+    *,
+    feedback: Feedback | None = None,
     threads: int | None = None,
     what: str = "motions",
-    **how: Any,
 ) -> Motions:
-    """`integrate` with these batch dimensions, by compiled loops where there are some."""
+    """`integrate` with these batch dimensions, by compiled loops where there are some; laws of the model remember."""
     if loops is None:
-        found = integrate(method, acceleration, *given, what=what, **how)
+        u, feedback = remembering(model, u, dt, feedback)
+        found = integrate(method, acceleration, q, v, u, dt, feedback=feedback, what=what)
     else:
-        found = fused(loops, method, acceleration, *given, threads=threads, what=what)
+        found = fused(loops, method, acceleration, model, q, v, u, dt, threads=threads, what=what)
     q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (found.q, found.v, found.a))
     return Motions(q, v, a, found.diverged_at.reshape(tuple(batch)))
 
@@ -103,6 +109,7 @@ def fused(
     loops: Sequence[RowFunction],
     method: Integrator,
     acceleration: AccelerationFunction,
+    model: Model,
     q: Float[Tensor, "n nq"],
     v: Float[Tensor, "n nv"],
     u: Float[Tensor, "steps n nu"],
@@ -132,7 +139,8 @@ def fused(
         rows = (own * torch.arange(len(loops))[:, None] + left).flatten()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NumericalWarning)  # given below, of all motions
-            again = integrate(method, acceleration, q[rows], v[rows], u[:, rows], dt)
+            some, feedback = remembering(model, u[:, rows], dt, None)
+            again = integrate(method, acceleration, q[rows], v[rows], some, dt, feedback=feedback)
         for kept, found in ((Q, again.q), (V, again.v), (A, again.a)):
             kept[rows] = found.movedim(0, 1)
         ended[rows], not_found[rows] = again.diverged_at, again.not_found
@@ -239,12 +247,13 @@ def roll_out(
     def run(copies: int, what: str) -> Rollout:
         shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
         given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
-        loops, how = None, {}
+        loops = added = None
         if feedback is None and not grad:
             loops = _loops(posterior, model, integrator, steps, copies, seed)
         if feedback is not None:
-            how["feedback"] = _flat_feedback(feedback, shape, forces.shape[-1])
-        found = moved(shape, loops, method, accelerations(posterior, model, copies, seed), *given, what=what, **how)
+            added = _flat_feedback(feedback, shape, forces.shape[-1])
+        work = accelerations(posterior, model, copies, seed)
+        found = moved(shape, loops, method, work, model, *given, feedback=added, what=what)
         time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
         return Rollout(time, *found, integrator, model)
 
@@ -254,25 +263,26 @@ def roll_out(
 
 
 def remembering(
-    model: Model, u: Tensor, dt: float, feedback: Feedback | None
-) -> tuple[Float[Tensor, "*batch T nu"], Feedback]:
+    model: Model, u: Float[Tensor, "T n nu"], dt: float, feedback: Feedback | None
+) -> tuple[Float[Tensor, "T n nu"], Feedback | None]:
     """u without memory but in its first row, and feedback that adds what laws remember of the motion since then."""
-    memory = model.memory
-    first = model.inputs.index(memory.names[0])
+    memory, first = model.memory, model.memory_column
+    if not memory.names:
+        return u, feedback
     columns = slice(first, first + len(memory.names))
-    begin, u = u[..., 0, columns].clone(), u.clone()
+    begin, u = u[0, :, columns].clone(), u.clone()
     u[..., columns] = 0.0
     last: list[tuple[Tensor, Tensor]] = []
 
     def added(k: int, q: Tensor, v: Tensor) -> Tensor:
-        now = begin.expand(*v.shape[:-1], -1)
+        now = begin
         if k == 0:
             last.clear()
         else:
             before, was = last.pop()
             now = memory.after(was, model.robot.difference(before, q), dt)
         last.append((q, now))
-        other = v.new_zeros(*v.shape[:-1], u.shape[-1]) if feedback is None else feedback(k, q, v).clone()
+        other = v.new_zeros(len(v), u.shape[-1]) if feedback is None else feedback(k, q, v).clone()
         return torch.cat([other[..., : columns.start], now, other[..., columns.stop :]], dim=-1)
 
     return u, added

@@ -3,12 +3,12 @@
 int evaluate(long first, long last, const double *const *t, const double *start_q, long s0, const double *start_v, long s1,
              const double *u, long s2, const double *seconds, long s3, double *Q, long r0, double *V, long r1, double *A,
              long r2, double *ended, long r3) {
-  enum {N = @JOINTS@, NQ = @POSITIONS@, NU = @GIVEN@, ROUNDS = 60};
+  enum {N = @JOINTS@, NQ = @POSITIONS@, NU = @GIVEN@, M = @MEMORY@, FIRST = NQ + N + @COLUMN@, ROUNDS = 60};
   const double dt = seconds[0];
   const long steps = r2 / N;
   (void)s0; (void)s1; (void)s2; (void)s3; (void)r0; (void)r1; (void)r3;
-  real x[NQ + N + NU], y[@OUTPUTS@], q1[NQ], v1[N], a[N], q0[NQ], v0[N], m[N], d[N];
-  (void)q0; (void)v0; (void)m; (void)d;
+  real x[NQ + N + NU], y[@OUTPUTS@], q1[NQ], v1[N], a[N], q0[NQ], v0[N], m[N], d[N], z[M + 1], w[M + 2 * NQ + 1];
+  (void)q0; (void)v0; (void)m; (void)d; (void)z; (void)w;
   for (long i = first; i < last; i += LANES) {
     const long live = last - i < LANES ? last - i : LANES;
     int going = 0;
@@ -28,10 +28,12 @@ int evaluate(long first, long last, const double *const *t, const double *start_
     for (long s = 0; s < steps && going; s++) {
       stopped = s + 1;
       rows_read(u + (i * steps + s) * NU, steps * NU, NU, live, x + NQ + N);
+      for (int j = 0; j < M && s; j++) x[FIRST + j] = z[j];
       real qs[NQ], vs[N];
       for (int j = 0; j < NQ; j++) qs[j] = x[j];
       for (int j = 0; j < N; j++) vs[j] = x[NQ + j];
       { @STEP@ }
+      @REMEMBER@
       real fast = R(0.0), none = R(0.0);
       for (int j = 0; j < N; j++) fast += v1[j] * v1[j];
       for (int j = 0; j < NQ; j++) none += q1[j] - q1[j];

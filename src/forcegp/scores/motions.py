@@ -42,7 +42,7 @@ class HeldOutMotions:
         """The posterior, and the motions with what its observers have seen before each of them."""
         assert self.motions is not None, "there are motions"
         pairs = [observing(posterior, rows, whole=True) for rows, _ in self.stretches]
-        if not pairs or pairs[0][0] is posterior:
+        if all(seen is rows for (_, seen), (rows, _) in zip(pairs, self.stretches, strict=True)):
             return posterior, self.motions
         seconds = self.horizons[-1]
         u = [recorded_motions(seen, at, seconds).u for (_, seen), (_, at) in zip(pairs, self.stretches, strict=True)]

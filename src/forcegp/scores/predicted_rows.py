@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, with_memory
 from forcegp.errors import NumericalError
 from forcegp.inference.memory import blas_threads
 from forcegp.posterior.posterior import Posterior
@@ -60,6 +60,7 @@ def predict_rows(
     posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
 ) -> PredictedRows:
     """Predict all rows. The constraint is that of the Dataset's own system if it has one, else the model's."""
+    dataset = with_memory(dataset, posterior.model)
     blocks = in_blocks(posterior, dataset, lambda block: _predict_block(posterior, dataset, block), progress)
     joined: dict[str, Any] = {}
     for field in fields(PredictedRows):

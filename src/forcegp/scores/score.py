@@ -12,7 +12,7 @@ import numpy as np
 
 from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
-from forcegp.data import Dataset
+from forcegp.data import Dataset, with_strokes
 from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
@@ -91,7 +91,8 @@ def score(
     InvalidInput: an argument is out of range, the log is of another robot, nothing is held out, no stretch lasts for a
         horizon, the folder holds something else, or another process is at work there.
     """
-    require_type("log", log, Dataset)
+    log = with_strokes(require_type("log", log, Dataset))
+    recording = None if recording is None else with_strokes(recording)
     wrong = isinstance(models, str) or not isinstance(models, Posterior | Mapping | Sequence)
     given: Any = {"model": models} if isinstance(models, Posterior) else models
     if models is not None and wrong:
