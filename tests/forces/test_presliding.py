@@ -1,5 +1,6 @@
 """Friction that remembers: its state against Dahl's equation, its strokes, its stiffness from logs of another law."""
 
+import subprocess
 from dataclasses import replace
 from functools import partial
 
@@ -9,7 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 from tests.posterior.arm import arm_model
 
-from forcegp import Accelerations, Dataset, Torques, fit, score
+from forcegp import Accelerations, Dataset, Torques, export_c, fit, score
 from forcegp.data import with_memory
 from forcegp.data.strokes import encoder_step, strokes, turning_points
 from forcegp.errors import InvalidInput
@@ -17,6 +18,7 @@ from forcegp.evidence import motion_residuals
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
 from forcegp.forces.presliding import after_step, after_strokes, forgotten
 from forcegp.noise import Noise
+from forcegp.posterior import casadi_function
 
 DT, SIGMA = 0.002, torch.tensor([300.0, 900.0, 2000.0], dtype=torch.float64)
 JOINTS = ("pan", "lift", "bend")
@@ -217,3 +219,29 @@ def test_compiled_motions_carry_the_state_along(integrator, lugre_log):
     assert float((posterior.rollout(*given[:2], other, DT).q - again.q).abs().max()) > 1e-5
     other[:, 0], other[:, 1:, 3:] = u[:, 0], 0.7  # only the first row holds a state
     torch.testing.assert_close(posterior.rollout(*given[:2], other, DT, integrator=integrator).q, again.q)
+
+
+def test_programs_carry_the_state_along(lugre_log, tmp_path):
+    casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
+    law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"))
+    model = arm_model(0).with_forces(law, noise=Noise(0.1))
+    posterior = fit(model, lugre_log.rows(slice(0, 200)))
+    q, v = lugre_log.q[0], 0.3 * lugre_log.v[0]
+    u = np.concatenate([lugre_log.u[0], [0.4, -0.7]])
+    there = posterior.rollout(q, v, u[None], DT)
+    z = model.laws[-1].remember(torch.tensor(u[3:]), there.q[1] - torch.tensor(q), DT).numpy()
+    step = casadi_function(posterior, steps=DT)
+    np.testing.assert_allclose(np.array(step(q, v, u)[2]).ravel(), z, rtol=1e-9)
+    assert isinstance(step, casadi.Function)
+    export_c(posterior, tmp_path / "made", name="arm", steps=DT)
+    (tmp_path / "main.c").write_text(
+        '#include "arm.h"\n#include <stdio.h>\n'
+        f"int main(void) {{ const double q[3] = {{{', '.join(map(repr, q.tolist()))}}}, z[2] = {{0.4, -0.7}};\n"
+        f"const double to[3] = {{{', '.join(map(repr, there.q[1].tolist()))}}}; double out[2];\n"
+        f'if (arm_remember(z, q, to, {DT}, out)) return 1;\n printf("%.17g %.17g", out[0], out[1]); return 0; }}\n'
+    )
+    words = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-I", str(tmp_path / "made")]
+    words += [str(tmp_path / "main.c"), str(tmp_path / "made" / "arm.c"), "-lm", "-o", str(tmp_path / "main")]
+    subprocess.run(words, check=True)
+    printed = subprocess.run([str(tmp_path / "main")], check=True, capture_output=True, text=True).stdout
+    np.testing.assert_allclose([float(x) for x in printed.split()], z, rtol=1e-12)

@@ -95,7 +95,9 @@ class CFiles:
         if "covariance" in self.kinds:
             words["GIVEN"] = len(self.code.program("covariance").nodes)
         words = {word: filled(str(value), words) for word, value in words.items()}
-        kinds = (*(("integrate",) if moving else ()), *self.kinds)
+        memory = self.posterior.model.memory.names
+        words["MEMORY"] = len(memory)
+        kinds = (*(("integrate",) if moving else ()), *(("remember",) if memory else ()), *self.kinds)
         functions = filled("".join(program[kind] for kind in kinds), words)
         prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
         words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
@@ -138,6 +140,7 @@ class CFiles:
             yield from (part.roots_source(1, code.rank) for part in code.sums)
             yield code.covariance_source().replace("void covariance(", "void covariance_of(")
         yield from code.motion_source(1)
+        yield from code.memory_source(1)
         for kind, function in wanted.items():
             program = code.program(kind)
             called = [part.name + ("_slopes" if kind == "linearize" else "") for part in code.sums]
@@ -158,6 +161,9 @@ class CFiles:
         for k, name in enumerate(robot.joint_names if self.code.space.is_vector_space else ()):
             own = (f"{key} in {units[key] if isinstance(units[key], str) else units[key][k]}" for key in "qvua")
             lines.append(f"joint {k}: {name}, {', '.join(own)}")
+        if memory := self.posterior.model.memory.names:
+            column = self.posterior.model.memory_column
+            lines.append(f"u[{column}] and on: {', '.join(memory)}, which {self.name}_remember carries along")
         if self.reference.inflation is not None:
             wider = float(self.reference.inflation.max())
             lines.append(f"standard deviations: never below those of predict, at most {wider:.1%} above at its checks")
@@ -237,8 +243,9 @@ def export_c(
 
     `covariance` adds NAME_mean_covariance (the compressed one), `jacobian` NAME_linearize, `steps` NAME_step of so many
     seconds by the `integrator` ("symplectic-euler", "rk4", "implicit-midpoint") and its Jacobian; a base that moves
-    adds NAME_integrate, and derivatives in a step from q. `name` of files and functions is by default the robot's,
-    `source` what the header names as the model's origin; `unchecked` neither compiles nor compares.
+    adds NAME_integrate, and derivatives in a step from q, friction that remembers NAME_remember. `name` of files and
+    functions is by default the robot's, `source` what the header names as the model's origin; `unchecked` neither
+    compiles nor compares.
 
     Raises InvalidInput for what cannot be exported and a folder that has files, CompilerError where the compiler fails,
     NumericalError where the program and `predict` differ, OSError.

@@ -41,7 +41,7 @@ def casadi_function(
     """The mean acceleration as a `casadi.Function` (q, v, u) -> a, (nq,), (nv,), (nu,) -> (nv,) in units of `predict`.
 
     With `steps` (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`: "symplectic-euler",
-    "rk4", or "implicit-midpoint" by CasADi's Newton method. Where a base moves steps are explicit, a second result of
+    "rk4", or "implicit-midpoint" by CasADi's Newton method; and memory_next where laws remember, for columns of u. Where a base moves steps are explicit, a second result of
     the acceleration is q_dot (nq,), and quaternions count as their directions. Raises MissingExtra without CasADi,
     InvalidInput for operations that no graph holds, steps that are no positive number, and other integrators.
     """
@@ -62,7 +62,14 @@ def casadi_function(
         return casadi.Function(name, x, [*results, moved(*x[:2])], ["q", "v", "u"], [*names, "q_dot"])
     require_step(steps, integrator, posterior.model)
     there = _stepped(casadi, code, acceleration, x, float(steps), integrator)
-    return casadi.Function(name, x, there, ["q", "v", "u"], ["q_next", "v_next"])
+    names = ["q_next", "v_next"]
+    if code.remembered is not None:
+        graph, nodes, sizes = code.remembered
+        first = posterior.model.memory_column
+        z = x[2][first : first + sizes[0]]
+        there.append(_function(casadi, "remember", graph, nodes, sizes)(z, x[0], there[0], float(steps)))
+        names.append("memory_next")
+    return casadi.Function(name, x, there, ["q", "v", "u"], names)
 
 
 def export_casadi(

@@ -213,8 +213,9 @@ class Predictor(Summary):
         """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast, without a graph.
 
         As `posterior.rollout`, where of what laws remember the first row of u counts, under the mean, or with
-        `functions` under each of so many drawn ones, which are the first dimension; `divided` takes motions (functions, ..., nv), each under its own. Compiled, many steps are done
-        at once on `threads` threads (None: as torch has). Raises InvalidInput for arguments that do not fit.
+        `functions` under each of so many drawn ones, which are the first dimension; `divided` takes motions (functions,
+        ..., nv), each under its own. Compiled, many steps are done at once on `threads` threads (None: as torch has).
+        Raises InvalidInput for arguments that do not fit.
         """
         threads = None if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)

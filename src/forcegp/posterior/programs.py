@@ -255,9 +255,10 @@ class Programs:
             words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
             words |= {"OUTPUTS": len(program.nodes), "LIMIT": SPEED_LIMIT}
             words["STEP"] = self.step_source(integrator, "program")
-            remember, words["REMEMBER"] = self.memory_source(lanes)
+            memory = self.memory_source(lanes)
             words |= {"MEMORY": len(self.physics.model.memory.names), "COLUMN": self.physics.model.memory_column}
-            text += [*self.motion_source(lanes), *remember, ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
+            words["REMEMBER"] = "remember(t, live, w, z);" if memory else ""
+            text += [*self.motion_source(lanes), *memory, ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
         else:
             text.append(entry or write_entry(program, "program", finish))
         return "\n".join(text)
@@ -276,23 +277,27 @@ class Programs:
         made["step_rate"] = trace(lambda step, v: [self.space.chart_velocity(step, v)], [step, step])
         return [write_function(name, graph, x.tolist(), lanes) for name, (graph, (x,)) in made.items()]
 
-    def memory_source(self, lanes: int) -> tuple[list[str], str]:
-        """The C function of what laws remember after a step from q to q1, and its call."""
+    @cached_property
+    def remembered(self) -> tuple[Graph, list[int], list[int]] | None:
+        """What laws remember after a step, as nodes of a graph of the memory, q, q after it, and dt: these sizes."""
         memory, space = self.physics.model.memory, self.space
         if not memory.names:
-            return [], ""
+            return None
 
         def after(z: Tensor, q: Tensor, q1: Tensor, dt: Tensor) -> list[Tensor]:
             return [memory.after(z, space.difference(q, q1), dt)]  # type: ignore[arg-type]  # a number of the graph
 
         q = space.neutral()
-        graph, (z,) = trace(after, [q.new_zeros(len(memory.names)), q, q, q.new_ones(1)])
-        call = (
-            "for (int j = 0; j < M; j++) w[j] = x[FIRST + j];\n"
-            "      for (int j = 0; j < NQ; j++) { w[M + j] = qs[j]; w[M + NQ + j] = q1[j]; }\n"
-            "      w[M + 2 * NQ] = R(dt);\n      remember(t, live, w, z);"
-        )
-        return [write_function("remember", graph, z.tolist(), lanes)], call
+        given = [q.new_zeros(len(memory.names)), q, q, q.new_ones(1)]
+        graph, (z,) = trace(after, given)
+        return graph, z.tolist(), [len(each) for each in given]
+
+    def memory_source(self, lanes: int) -> list[str]:
+        """The C function `remember`, where laws do."""
+        if self.remembered is None:
+            return []
+        graph, nodes, _ = self.remembered
+        return [write_function("remember", graph, nodes, lanes)]
 
     def covariance_source(self) -> str:
         """The C function that makes the covariance of the outputs of its program."""

@@ -33,6 +33,9 @@ int evaluate(long first, long last, const double *const *t, const double *start_
       for (int j = 0; j < NQ; j++) qs[j] = x[j];
       for (int j = 0; j < N; j++) vs[j] = x[NQ + j];
       { @STEP@ }
+      for (int j = 0; j < M; j++) w[j] = x[FIRST + j];
+      for (int j = 0; j < NQ && M; j++) { w[M + j] = qs[j]; w[M + NQ + j] = q1[j]; }
+      w[M + 2 * NQ * (M > 0)] = R(dt);
       @REMEMBER@
       real fast = R(0.0), none = R(0.0);
       for (int j = 0; j < N; j++) fast += v1[j] * v1[j];

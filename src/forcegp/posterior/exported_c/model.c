@@ -30,6 +30,17 @@ int @NAME@_integrate(const double q[@NQ@], const double step[@NV@], double q_nex
   return stored(y, q_next, @NQ@) | (found ? @NAME@_INPUT_NOT_FINITE : @NAME@_OK);
 }
 
+//// remember
+/* what friction remembers, columns of u, after the joints went from q to q_next in dt seconds */
+int @NAME@_remember(const double z[@MEMORY@], const double q[@NQ@], const double q_next[@NQ@], double dt,
+                    double z_next[@MEMORY@]) {
+  double x[@MEMORY@ + 2 * @NQ@ + 1], y[@MEMORY@];
+  const int found = stored(z, x, @MEMORY@) | stored(q, x + @MEMORY@, @NQ@) | stored(q_next, x + @MEMORY@ + @NQ@, @NQ@) |
+                    stored(&dt, x + @MEMORY@ + 2 * @NQ@, 1);
+  remember(tables, 1, x, y);
+  return stored(y, z_next, @MEMORY@) | (found ? @NAME@_INPUT_NOT_FINITE : @NAME@_OK);
+}
+
 //// mean
 /* mean of the acceleration at (q, v) under u */
 int @NAME@_mean(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double a[@NV@]) {
