@@ -13,7 +13,7 @@ from tests.posterior.arm import arm_model
 from forcegp import Accelerations, Dataset, Torques, export_c, fit, score
 from forcegp.data import with_memory
 from forcegp.data.strokes import encoder_step, strokes, turning_points
-from forcegp.errors import InvalidInput
+from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
 from forcegp.forces.presliding import after_step, after_strokes, forgotten
@@ -245,3 +245,27 @@ def test_programs_carry_the_state_along(lugre_log, tmp_path):
     subprocess.run(words, check=True)
     printed = subprocess.run([str(tmp_path / "main")], check=True, capture_output=True, text=True).stdout
     np.testing.assert_allclose([float(x) for x in printed.split()], z, rtol=1e-12)
+
+
+def test_a_past_that_is_not_known_is_in_the_interval(lugre_log):
+    model = arm_model(0).with_forces(Coulomb(memory=True), Viscous(), noise=Noise(0.1))
+    posterior = fit(model, lugre_log.rows(slice(0, 4000)), Torques(), rows=1500)
+    test = lugre_log.rows(slice(4000, 6000, 10))
+    seen = with_memory(lugre_log, posterior.model).rows(slice(4000, 6000, 10))
+    known = posterior.predict(seen.q, seen.v, seen.u)
+    with pytest.warns(DataWarning, match="the past of friction counts as unknown"):
+        unknown = posterior.predict(test.q, test.v, test.u)
+    error = (unknown.mean - torch.tensor(test.a)).square().mean().sqrt()
+    assert float(error) > 2.0 * float((known.mean - torch.tensor(test.a)).square().mean().sqrt())
+    inside = (unknown.mean - torch.tensor(test.a)).abs() <= 1.96 * unknown.measurement.variance.sqrt()
+    assert float(inside.double().mean()) >= 0.9
+    # friction is linear in its state: the spread is that of predictions at states drawn from what was seen
+    z = posterior.training.u[:, 3:] * posterior.training.v.sign()
+    draws, chance = [], torch.Generator().manual_seed(0)
+    for _ in range(100):
+        drawn = z[torch.randint(len(z), (200,), generator=chance)].numpy() * np.sign(test.v)
+        draws.append(posterior.predict(test.q, test.v, np.concatenate([test.u, drawn], 1)).mean)
+    # joints are drawn together here, and apart in the prediction: variances of the diagonal agree
+    spread = torch.stack(draws).var(0)
+    added = unknown.variance - posterior.predict(seen.q, seen.v, seen.u).variance
+    assert float((added.sqrt() / spread.sqrt()).median()) == pytest.approx(1.0, abs=0.15)

@@ -225,6 +225,10 @@ class Law(Force):
         """Names of the numbers that it remembers from the motion before, columns of u; none for most laws."""
         return ()
 
+    def memory_joints(self, robot: Robot) -> Sequence[int] | None:
+        """The joints whose velocities tell the sign of each of these numbers; None where none does."""
+        return None
+
     def remembered(self, state: State) -> Float[Tensor, "*batch m"]:
         """What it remembers at these states."""
         names = self.memory_names(state.robot)
@@ -383,6 +387,22 @@ class Memory:
     def start(self) -> Float[Tensor, " m"]:
         """Before anything has moved."""
         return torch.cat([law.memory_start(self.robot) for law, _ in self._laws])
+
+    def likely(
+        self, v: Float[Tensor, "n nv"], seen: Float[Tensor, "N m"], seen_v: Float[Tensor, "N nv"]
+    ) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+        """Mean and variance of the memory at velocities whose past is not known, as it was in rows that were `seen`."""
+        signs, seen_signs = torch.ones(len(v), len(self.names)).to(v), torch.ones_like(seen)
+        first = 0
+        for law, size in self._laws:
+            if (joints := law.memory_joints(self.robot)) is not None:
+                own = slice(first, first + size)
+                signs[:, own], seen_signs[:, own] = v[:, list(joints)].sign(), seen_v[:, list(joints)].sign()
+            first += size
+        mean = (seen * seen_signs).mean(0)
+        at_rest = signs == 0.0
+        variance = torch.where(at_rest, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
+        return mean * signs, variance
 
     def after(self, memory: Float[Tensor, "*batch m"], step: Float[Tensor, "*batch nv"], dt: float) -> Tensor:
         """The memory after the joints have moved by `step` in dt."""

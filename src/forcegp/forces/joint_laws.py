@@ -122,6 +122,10 @@ class DryFriction(JointLaw):
         return tuple(f"presliding of {robot.joint_names[j]}" for j in self._places)
 
     @override
+    def memory_joints(self, robot: Robot) -> list[int]:
+        return self._places
+
+    @override
     def remember(self, memory: Tensor, step: Tensor, dt: float) -> Tensor:
         return after_step(memory, step[..., self._places], self._sigma(step)[self._places])
 

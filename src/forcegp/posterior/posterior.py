@@ -1,16 +1,19 @@
 """`Posterior`: what a fit knows of a model, as a value that predicts."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, overload
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
-from forcegp.errors import InvalidInput, NumericalError, require_type, usable_arguments
+from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
 from forcegp.evidence.likelihood import second_moments, shrunk
 from forcegp.forces import Force
@@ -37,6 +40,7 @@ from forcegp.posterior.prediction import (
     quantity_of,
     state_rows,
     state_tensor,
+    without_past,
 )
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
@@ -81,14 +85,22 @@ class Posterior(Fitted):
 
         A `Prediction`, or with `of` one `Gaussian` for each of `Accelerations()`, contacts of the model (the force on
         the robot there, (..., 3) in N) and its unknown forces (joint forces). States (..., nv) are in rad, rad/s and Nm
-        (m, m/s and N), arrays, lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u.
+        (m, m/s and N), arrays, lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u. Where
+        laws remember, u has columns for that (`forcegp.data.with_memory` makes them of a log); without these the past
+        counts as unknown, in the mean and in the covariance, and a DataWarning says so.
         InvalidInput for wrong shapes, values that are not finite, and inside `vmap`; NumericalError where the result is
         not finite.
         """
         require_type("covariance", covariance, bool)
-        states, batch = self.checked_states(q, v, u)
+        memory, width = self.model.memory.names, np.shape(u)[-1:]
+        past = not memory or width != (self.model.sizes[2] - len(memory),)
+        predict = self.predict_rows if past else partial(without_past, self)
+        if not past:
+            what = f"u has no columns {', '.join(memory)}, so that the past of friction counts as unknown"
+            warnings.warn(f"{what}; forcegp.data.with_memory adds them to a log.", DataWarning, stacklevel=2)
+        states, batch = state_rows(self.model, q, v, u, past)
         parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
-        blocks = [self.predict_rows(q, v, u, covariance) for q, v, u in parts]
+        blocks = [predict(q, v, u, covariance) for q, v, u in parts]
         predicted = join_predictions(blocks, batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance

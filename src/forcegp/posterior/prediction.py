@@ -1,6 +1,6 @@
 """Predictions as values: of accelerations, of every force by itself, and of the u that makes an acceleration."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -106,6 +106,39 @@ class Prediction(Gaussian):
         return Gaussian(self.mean, None if self.covariance is None else self.covariance + self.noise_covariance)
 
 
+def without_past(posterior: Any, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
+    """The prediction for one block of rows whose u lacks what laws remember, which then counts as unknown.
+
+    Its mean and variance are those of the training rows that moved the same way; a force is linear in it.
+    """
+    model, training = posterior.model, posterior.training
+    memory, first = model.memory, model.memory_column
+    columns = slice(first, first + len(memory.names))
+    mean, variance = memory.likely(v, training.u[:, columns], training.v)
+
+    def at(z: Float[Tensor, "rows m"], covariance: bool) -> Prediction:
+        given: Prediction = posterior.predict_rows(q, v, torch.cat([u[:, :first], z, u[:, first:]], dim=1), covariance)
+        return given
+
+    found = at(mean, covariance)
+    if not covariance:
+        return found
+    moved = [at(mean + unit, False) for unit in torch.eye(len(memory.names)).to(mean)]
+
+    def wider(of: Callable[[Prediction], Gaussian | None]) -> Gaussian | None:
+        here = of(found)
+        if here is None or here.covariance is None:
+            return here
+        slopes = torch.stack([of(each).mean - here.mean for each in moved], dim=-1)  # type: ignore[union-attr]  # as here
+        return Gaussian(here.mean, here.covariance + (slopes * variance[:, None]) @ slopes.mT)
+
+    names = ("multiplier", "contact_force", "unknown_force")
+    wide = {name: wider(lambda each, name=name: getattr(each, name)) for name in names}  # type: ignore[misc]  # bound
+    acceleration = wider(lambda each: Gaussian(each.mean, each.covariance))
+    assert acceleration is not None, "every model predicts it"
+    return Prediction(acceleration.mean, acceleration.covariance, **wide, noise_covariance=found.noise_covariance)
+
+
 def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Prediction:
     """One prediction from blocks of rows, with these batch dimensions."""
 
@@ -140,9 +173,10 @@ class JointForces(NamedTuple):
     b: Tensor
 
 
-def state_rows(model: Model, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
-    """What `Posterior.checked_states` documents."""
-    named = zip("qvu", (q, v, u), model.sizes, strict=True)
+def state_rows(model: Model, q: Array, v: Array, u: Array, past: bool = True) -> tuple[list[Tensor], torch.Size]:
+    """What `Posterior.checked_states` documents; without `past` u lacks what laws remember."""
+    nq, nv, nu = model.sizes
+    named = zip("qvu", (q, v, u), (nq, nv, nu if past else nu - len(model.memory.names)), strict=True)
     given = [state_tensor(name, values, size, model.robot.device) for name, values, size in named]
     batch = broadcast_batch(dict(zip("qvu", (x.shape[:-1] for x in given), strict=True)))
     return [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]) for x in given], batch
