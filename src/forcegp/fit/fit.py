@@ -18,6 +18,7 @@ from forcegp.evidence import Accelerations, Evidence, Motions, Torques, Training
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.doubts import check_forces, refuse_what_has_no_answer, warn_of_contacts
+from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import (
     CHANGE,
     MOST_ROUNDS,
@@ -108,6 +109,9 @@ def fit(
     progress: called as progress(restart, iteration, objective); the restart is `ALL_ROWS` while all rows are taken in,
         and while numbers of laws and bodies are sought.
 
+    Gear friction without a stated `memory` gets the parts that held-out stretches of the log show at each joint
+    (`settings["gear_friction"]`).
+
     Friction in proportion to the normal force, with no `expected` friction, is fitted again under the normal force that
     was found, until it settles.
 
@@ -123,6 +127,9 @@ def fit(
     require_type("model", model, Model, ", for example dataset.model")
     rest, refinement = _chosen(evidence, model, start)
     dataset = _checked(model, dataset, rest, refinement)
+    how = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
+    model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
+    dataset = dataset if choice is None else with_memory(dataset, model)
     logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
     if isinstance(start, Posterior):
         posterior: Any = start
@@ -140,6 +147,8 @@ def fit(
             )
         search = Search(checked_jobs(jobs), restarts, seed, options, start, progress)
         posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points)
+    if choice is not None:
+        posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if refinement is None:
         return posterior
     report = None if progress is None else partial(progress, ALL_ROWS)

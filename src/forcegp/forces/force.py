@@ -330,14 +330,14 @@ class JointLaw(Law):
             spread = getattr(given, second)
             parts = {first: self._numbers(name, getattr(given, first), robot, coefficient)}
             if spread is not None:
-                parts[second] = self._numbers(name, spread, robot, Coefficient("1"))
+                parts[second] = self._numbers(name, spread, robot, Coefficient("1"), weak=True)
             return replace(given, **parts)
         if given is None and name in self.learned:
             return None
         return self._numbers(name, coefficient.default if given is None else given, robot, coefficient)
 
-    def _numbers(self, name: str, given: Any, robot: Robot, coefficient: Coefficient) -> Tensor:
-        """One per joint, checked."""
+    def _numbers(self, name: str, given: Any, robot: Robot, coefficient: Coefficient, weak: bool = False) -> Tensor:
+        """One per joint, checked; those of weak priors may be nan."""
         what = f"{type(self).__name__} {name}"
         remedy = "a number, one per joint, or a mapping from joint names"
         values = as_numbers(what, by_joint(given, robot.joint_names, robot.name), robot, remedy)
@@ -351,11 +351,12 @@ class JointLaw(Law):
                 f"{', '.join(robot.joint_names)}"
             )
         least = "a finite number"
-        good = torch.isfinite(values)
+        checked = torch.where(values.isnan(), 1.0, values) if weak else values
+        good = torch.isfinite(checked)
         if coefficient.logarithm:
-            good, least = good & (values > 0), "a finite number > 0"
+            good, least = good & (checked > 0), "a finite number > 0"
         elif coefficient.lowest == 0.0:
-            good, least = good & (values >= 0), "a finite number >= 0"
+            good, least = good & (checked >= 0), "a finite number >= 0"
         if not bool(good.all()):
             raise InvalidInput(f"{what} is {values.tolist()}; every joint needs {least}.")
         return values

@@ -1,0 +1,253 @@
+"""Which parts of gear friction a log shows, joint by joint: memory, load, speed, direction, by stretches held out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from forcegp.data import Dataset, with_strokes
+from forcegp.evidence import Torques, motion_residuals
+from forcegp.fit.physical import fit_physical
+from forcegp.forces import Coulomb, DirectionalFriction, GearFriction, LogNormal, Normal, Viscous
+from forcegp.forces.presliding import after_strokes
+from forcegp.mechanics import State
+from forcegp.model import Model
+
+PARTS = ("memory", "factor", "root", "direction")
+"""Of `GearFriction`, and of the law beside it."""
+BLOCKS = 10
+"""Stretches of the log, each predicted from the others."""
+CLEARLY = 1.5
+"""Standard errors over the stretches by which a part must lower the squared residual."""
+LEAST = 0.01
+"""Share of it by which it must do so."""
+HIGHEST = 0.5
+"""Largest share of the load that friction takes: beyond it something else is explained."""
+REVERSALS = 6
+"""Fewest reversals of a joint that can show memory."""
+WIDTHS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+"""Of the smooth sign, over the root mean square velocity."""
+SEEN, RIDGE = 0.003, 1e-7
+"""Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
+PASSES = 2
+"""Over the joints."""
+FIRST_ROWS = 2000
+"""Rows of the first fit."""
+STIFFNESS = tuple(np.geomspace(10.0, 10000.0, 13).tolist())
+"""Of the memory, over the reciprocal root mean square position."""
+
+
+@dataclass(frozen=True)
+class FrictionChoice:
+    """The parts of friction that joints have, and what held-out squared residuals say of each."""
+
+    joints: tuple[str, ...]
+    parts: tuple[tuple[str, ...], ...]
+    ratios: tuple[float, ...]
+    """Root mean square of what is left at a joint, over that without any of these parts."""
+    few_reversals: tuple[str, ...]
+    sigma: tuple[float, ...]
+    """Stiffness of the memory of each joint in 1/rad or 1/m, roughly; 0 without."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the settings of a fit."""
+        found = {name: list(parts) for name, parts in zip(self.joints, self.parts, strict=True)}
+        return {"parts": found, "left": list(self.ratios), "few_reversals": list(self.few_reversals)}
+
+    def has(self, part: str) -> Bool[np.ndarray, " nv"]:
+        """By joint."""
+        return np.array([part in each for each in self.parts])
+
+
+def choose_friction(model: Model, log: Dataset, parts: Sequence[str] = PARTS) -> FrictionChoice:
+    """The parts of friction by which held-out stretches of the log are predicted better, joint by joint.
+
+    `model` is one whose other numbers are known; its friction is left out. The torque that is left is regressed on
+    viscous and dry friction of all joints, on parameters of bodies, which may be off, and on the parts. At each joint
+    the part that helps most is added while it helps by more than `CLEARLY` standard errors over the stretches.
+    """
+    friction = (Viscous, Coulomb, GearFriction, DirectionalFriction)
+    bare = replace(model, forces=tuple(force for force in model.forces if not isinstance(force, friction)))
+    torque = motion_residuals(replace(log, strokes=None), bare)[0]
+    state = bare.state(*(torch.as_tensor(np.array(x), device=bare.robot.device) for x in (log.q, log.v, log.u)))
+    strokes = with_strokes(log).strokes
+    regression = _Regression(model, log, state, torque)
+    single, few = np.isin(log.joint_names, bare.robot.single_joint_names), []
+    moving = [j for j in np.flatnonzero(single) if log.v[:, j].any()]
+    for j in moving:
+        turns = 0 if strokes is None else int((np.diff(np.sign(strokes[:, j, 0])) != 0).sum())
+        if strokes is not None and turns >= REVERSALS:
+            spread = max(float(state.positions[:, j].std()), 1e-9)
+            regression.remember(j, strokes[:, j], [each / spread for each in STIFFNESS])
+        else:
+            few.append(log.joint_names[j])
+    for _ in range(PASSES):
+        for j in moving:
+            regression.choose(j, parts)
+    chosen = [regression.parts.get(j, ()) for j in range(len(log.joint_names))]
+    return FrictionChoice(tuple(log.joint_names), tuple(chosen), tuple(regression.ratios), tuple(few), regression.sigma)
+
+
+def _folds(log: Dataset) -> np.ndarray:
+    """The stretch of every row: whole episodes where there are many, else equal parts of each."""
+    if len(log.episodes) >= BLOCKS:
+        return np.unique(log.episode, return_inverse=True)[1] % BLOCKS
+    out = np.zeros(len(log), dtype=int)
+    for episode in log.episodes:
+        rows = np.flatnonzero(log.episode == episode)
+        for number, part in enumerate(np.array_split(rows[np.argsort(log.time[rows])], BLOCKS)):
+            out[part] = number
+    return out
+
+
+Sums = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Of a joint under one sign, by stretch: its columns times those of bodies, times themselves, and times the torque."""
+
+
+class _Regression:
+    """Weighted normal equations of all joints by stretch: bodies together, friction of each joint by itself."""
+
+    def __init__(self, model: Model, log: Dataset, state: State, torque: Float[np.ndarray, "rows nv"]) -> None:
+        self.nv, self.fold = torque.shape[1], _folds(log)
+        self.count = int(self.fold.max()) + 1
+        noise = np.sqrt((motion_residuals(log, model)[0] ** 2).mean(0))
+        self.weight = 1.0 / np.maximum(noise, 1e-6 * max(float(noise.max()), 1e-12))
+        self.v, self.load = np.asarray(log.v), np.abs(state.delivered.cpu().numpy() - torque)  # of the model
+        a = torch.as_tensor(np.array(log.a), device=state.q.device)
+        Y = state.kinematics.torque_regressor(a).flatten(2).cpu().numpy() * self.weight[:, None]
+        sizes, vectors = np.linalg.eigh(np.tensordot(Y, Y, ((0, 1), (0, 1))))
+        kept = sizes > SEEN**2 * sizes.max()
+        self.bodies = Y @ (vectors[:, kept] / np.sqrt(sizes[kept] / len(Y)))
+        self.torque = torque * self.weight
+        rows = [self.fold == k for k in range(self.count)]
+        self.inner = np.stack([np.einsum("nji,njk->jik", self.bodies[k], self.bodies[k]) for k in rows])
+        self.target = np.stack([np.einsum("nji,nj->ji", self.bodies[k], self.torque[k]) for k in rows])
+        self.squares = np.stack([(self.torque[k] ** 2).sum(0) for k in rows])
+        self.rows = rows
+        self.signs: list[dict[float, Sums]] = []
+        for j in range(self.nv):
+            speed = float(np.sqrt((self.v[:, j] ** 2).mean())) or 1.0
+            self.signs.append({-width: self._sums(j, np.tanh(self.v[:, j] / (width * speed))) for width in WIDTHS})
+        self.at = [-WIDTHS[1]] * self.nv
+        """The sign of each joint: minus a width, or the stiffness of a memory."""
+        self.parts: dict[int, tuple[str, ...]] = {}
+        self.ratios = [1.0] * self.nv
+
+    @property
+    def sigma(self) -> tuple[float, ...]:
+        """Of the memory of each joint; 0 where there is none."""
+        return tuple(max(each, 0.0) for each in self.at)
+
+    def remember(self, j: int, strokes: Float[np.ndarray, "rows strokes"], stiffness: Sequence[float]) -> None:
+        """Let a joint have memory."""
+        past = torch.as_tensor(np.array(strokes))
+        for sigma in stiffness:
+            self.signs[j][sigma] = self._sums(j, after_strokes(past, torch.tensor(sigma)).numpy())
+
+    def _sums(self, j: int, s: Float[np.ndarray, " rows"]) -> Sums:
+        v = self.v[:, j]
+        columns = [v, s, self.load[:, j] * s, np.sqrt(np.abs(v)) * s, np.abs(v), np.ones_like(v)]
+        F, Z, y = np.stack(columns, axis=1) * self.weight[j], self.bodies[:, j], self.torque[:, j]
+        return (
+            np.stack([Z[k].T @ F[k] for k in self.rows]),
+            np.stack([F[k].T @ F[k] for k in self.rows]),
+            np.stack([F[k].T @ y[k] for k in self.rows]),
+        )
+
+    def choose(self, j: int, parts: Sequence[str]) -> None:
+        """Parts of one joint, those of the others being as they are."""
+        best, here = self._fitted(j, ()), ()
+        first = best
+        steps = [(part,) for part in parts] + [("memory", "root")]  # a level that rises with speed hides reversals
+        while True:
+            left = [(*here, *step) for step in steps if not set(step) & set(here)]
+            left = [each for each in left if "memory" not in each or max(self.signs[j]) > 0.0]
+            if not left:
+                break
+            tried = {each: self._fitted(j, each) for each in left}
+            there = min(left, key=lambda each: tried[each][1].sum())
+            gain = best[1] - tried[there][1]
+            if not np.isfinite(gain).all():
+                break
+            noise = CLEARLY * np.sqrt(self.count) * gain.std(ddof=1) if self.count > 1 else 0.0
+            if gain.sum() <= max(noise, LEAST * best[1].sum()):
+                break
+            best, here = tried[there], there
+        self.at[j], self.parts[j] = best[0], here
+        self.ratios[j] = float(np.sqrt(best[1].sum() / max(first[1].sum(), 1e-300)))
+
+    def _fitted(self, j: int, parts: tuple[str, ...]) -> tuple[float, Float[np.ndarray, " stretches"]]:
+        """The sign that fits all rows best, and squared residuals of the joint in every stretch by the others."""
+        signs = [each for each in self.signs[j] if (each > 0.0) == ("memory" in parts)]
+        at = min(signs, key=lambda sign: self._residuals(j, parts, sign, False).sum())
+        return at, self._residuals(j, parts, at, True)
+
+    def _residuals(self, j: int, parts: tuple[str, ...], sign: float, held_out: bool) -> np.ndarray:
+        """Squared residuals of a joint in every stretch, by numbers from all rows or from the other stretches."""
+        A, b = self._normal(j, parts, sign)
+        whole, right = A.sum((0, 1)), b.sum((0, 1))
+        scale = np.sqrt(whole.diagonal().clip(1e-300))
+        out, place = np.zeros(self.count), self.inner.shape[-1] + 6 * j
+        for k in range(self.count):
+            if k == 0 or held_out:
+                inner = (whole - A[k].sum(0) if held_out else whole) / np.outer(scale, scale)
+                given = right - b[k].sum(0) if held_out else right
+                numbers = np.linalg.solve(inner + RIDGE * np.eye(len(scale)), given / scale) / scale
+                if "factor" in parts and not 0.0 <= numbers[place + 2] <= HIGHEST:
+                    return np.full(self.count, np.inf)
+            out[k] = self.squares[k, j] - 2.0 * numbers @ b[k, j] + numbers @ A[k, j] @ numbers
+        return out
+
+    def _normal(self, j: int, parts: tuple[str, ...], sign: float) -> tuple[np.ndarray, np.ndarray]:
+        """Of the rows of every stretch and joint, in bodies and the open columns of every joint."""
+        first = self.inner.shape[-1]
+        size = first + 6 * self.nv
+        A, b = np.zeros((self.count, self.nv, size, size)), np.zeros((self.count, self.nv, size))
+        A[..., :first, :first], b[..., :first] = self.inner, self.target
+        for i in range(self.nv):
+            own, at = (parts, sign) if i == j else (self.parts.get(i, ()), self.at[i])
+            across, inner, right = self.signs[i][at]
+            open_ = np.array([True, True, *(part in own for part in PARTS[1:]), True])
+            place = slice(first + 6 * i, first + 6 * i + 6)
+            A[:, i, :first, place], A[:, i, place, place] = across * open_, inner * np.outer(open_, open_)
+            A[:, i, place, :first], b[:, i, place] = (across * open_).swapaxes(1, 2), right * open_
+        return A, b
+
+
+def with_friction_chosen(model: Model, log: Dataset, evidence: Torques) -> tuple[Model, FrictionChoice | None]:
+    """The model whose gear friction without a stated `memory` has the parts that the log shows; None for no such law.
+
+    Loads and what friction has to explain are those of a first fit with dry friction alone.
+    """
+    gears = [force for force in model.laws if isinstance(force, GearFriction)]
+    if not any(force.memory is None and force.level is None for force in gears):
+        return model, None
+    plain = tuple(Coulomb().bound_to(model.robot) if force in gears else force for force in model.laws)
+    found = fit_physical(replace(model, forces=plain), [log], evidence, rows=FIRST_ROWS).model
+    beside = any(isinstance(law, DirectionalFriction) and law.learned for law in model.laws)
+    choice = choose_friction(found, log, PARTS if beside else PARTS[:-1])
+    return with_choice(model, choice), choice
+
+
+def with_choice(model: Model, choice: FrictionChoice) -> Model:
+    """The model whose gear friction and directions have the parts that were chosen, each to be estimated."""
+
+    def only(part: str, start: float) -> Normal:
+        has = choice.has(part)
+        return Normal((start * has).tolist(), np.where(has, np.nan, 0.0).tolist())
+
+    made = []
+    for force in model.forces:
+        if isinstance(force, GearFriction) and force.memory is None:
+            names = tuple(name for name, has in zip(choice.joints, choice.has("memory"), strict=True) if has)
+            stiffness = LogNormal([each or 1.0 for each in choice.sigma])
+            force = replace(
+                force, memory=names or False, factor=only("factor", 0.05), root=only("root", 0.0), sigma=stiffness
+            )
+        elif isinstance(force, DirectionalFriction) and force.difference is None:
+            force = replace(force, difference=only("direction", 0.0))
+        made.append(force)
+    return replace(model, forces=tuple(made))
